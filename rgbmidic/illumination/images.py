@@ -1,0 +1,54 @@
+"""One image per illumination: what the demosaiced or 3-CCD channels become once the crosstalk is unmixed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import InputError
+
+__all__ = ["IlluminationImages"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IlluminationImages:
+    """The k illumination images of one mechanical state.
+
+    Attributes
+    ----------
+    values : ndarray, shape (k, H, W), float32
+        Grey level each light alone would give (DN above black in the channel the light is named after);
+        NaN where not valid.
+    valid : ndarray, shape (k, H, W), bool
+        False where the value is unknown, for instance because a saturated sample took part in it.
+    names : tuple of str, length k
+        The lights' names.
+    full_scale : float
+        Grey level of a just saturated camera sample (DN above black).
+    covariance : ndarray, shape (k, k), float64, or None
+        Covariance of the camera noise of the k values at one pixel (DN squared), at the median grey level of the
+        images; None where the camera noise is not known.
+    """
+
+    values: npt.NDArray[np.float32]
+    valid: npt.NDArray[np.bool_]
+    names: tuple[str, ...]
+    full_scale: float
+    covariance: npt.NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        values = np.ascontiguousarray(self.values, dtype=np.float32)
+        if values.ndim != 3:
+            raise InputError(f"illumination images have shape (k, H, W), not {values.shape}")
+        valid = np.asarray(self.valid, dtype=bool) & np.isfinite(values)
+        if len(self.names) != len(values):
+            raise InputError(f"{len(values)} illumination images cannot carry the {len(self.names)} names {self.names}")
+        object.__setattr__(self, "values", np.where(valid, values, np.float32(np.nan)))
+        object.__setattr__(self, "valid", valid)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Image size (H, W)."""
+        return self.values.shape[1], self.values.shape[2]
