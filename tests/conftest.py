@@ -1,0 +1,18 @@
+"""What all tests share: the folder of real data, where this machine has it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the shared real data: RGBMIDIC_SHARED_DATA, else ../shared/data beside the checkout, else skip."""
+    stated = os.environ.get("RGBMIDIC_SHARED_DATA")
+    folder = Path(stated) if stated else Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no shared data at {folder}; set RGBMIDIC_SHARED_DATA to its folder")
+    return folder
