@@ -1,0 +1,1 @@
+"""Raw mosaic to illumination images: linearise, demosaic, unmix, reflection index, weights."""

@@ -1,0 +1,63 @@
+"""Bilinear and Malvar demosaicing: against naive twins, against colour-demosaicing, at borders and saturation."""
+
+import naive_demosaic
+import numpy as np
+import pytest
+
+from rgbmidic.errors import InputError
+from rgbmidic.illumination.demosaic import BilinearDemosaicer, Demosaicer, MalvarDemosaicer
+from rgbmidic.illumination.mosaic import BAYER_PATTERNS, LinearMosaic
+
+METHODS = {"bilinear": BilinearDemosaicer(), "malvar": MalvarDemosaicer()}
+
+
+def make_mosaic(shape, cfa, seed=0, saturated_share=0.0):
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(0, 1000, shape).astype(np.float32)
+    return LinearMosaic(values=values, saturated=rng.random(shape) < saturated_share, cfa=cfa, full_scale=1000.0)
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+@pytest.mark.parametrize("shape", [(12, 14), (11, 13), (5, 2), (2, 2), (3, 6)])
+@pytest.mark.parametrize("name", METHODS)
+def test_kernel_equals_naive_twin_with_saturation(name, cfa, shape):
+    mosaic = make_mosaic(shape, cfa, seed=sum(shape), saturated_share=0.05)
+    channels = METHODS[name](mosaic)
+    expected = getattr(naive_demosaic, name)(np.where(mosaic.saturated, np.nan, mosaic.values), cfa)
+    np.testing.assert_allclose(channels.values, expected, rtol=1e-5, atol=1e-3)
+    np.testing.assert_array_equal(channels.valid, np.isfinite(expected))
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+@pytest.mark.parametrize("name", METHODS)
+def test_agrees_with_colour_demosaicing_inside(name, cfa):
+    oracles = pytest.importorskip("colour_demosaicing")
+    oracle = {
+        "bilinear": oracles.demosaicing_CFA_Bayer_bilinear,
+        "malvar": oracles.demosaicing_CFA_Bayer_Malvar2004,
+    }[name]
+    mosaic = make_mosaic((31, 28), cfa)
+    expected = np.moveaxis(oracle(mosaic.values.astype(float), cfa), -1, 0)
+    inside = np.s_[:, 2:-2, 2:-2]
+    np.testing.assert_allclose(METHODS[name](mosaic).values[inside], expected[inside], rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_linear_ramp_common_to_all_channels_is_reproduced_exactly(name):
+    rows, columns = np.mgrid[:20, :21].astype(np.float32)
+    mosaic = LinearMosaic(
+        values=3 * rows + 5 * columns, saturated=np.zeros((20, 21), bool), cfa="GBRG", full_scale=1000.0
+    )
+    inside = np.s_[:, 2:-2, 2:-2]
+    expected = np.broadcast_to(mosaic.values, (3, 20, 21))
+    np.testing.assert_allclose(METHODS[name](mosaic).values[inside], expected[inside], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_methods_follow_the_protocol_and_reject_bad_input(name):
+    assert isinstance(METHODS[name], Demosaicer)
+    with pytest.raises(InputError, match="at least 2 rows"):
+        METHODS[name](make_mosaic((1, 8), "RGGB"))
+    good = make_mosaic((4, 4), "RGGB")
+    with pytest.raises(InputError, match="saturation mask"):
+        METHODS[name](LinearMosaic(values=good.values, saturated=np.zeros((4, 5), bool), cfa="RGGB", full_scale=1.0))

@@ -1,0 +1,90 @@
+"""Unmixing and the entry `separate`."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rgbmidic.errors import InputError
+from rgbmidic.illumination.calibration import Crosstalk
+from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.separate import DEMOSAICERS, separate
+from rgbmidic.illumination.unmix import unmix
+
+A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
+LIGHTS = ("red", "green", "blue")
+
+
+def channels_of(lights, matrix, valid=None, noise=None):
+    values = np.tensordot(matrix, lights, axes=1)
+    valid = np.ones(values.shape, bool) if valid is None else valid
+    return LinearChannels(values=values.astype(np.float32), valid=valid, full_scale=4000.0, noise=noise)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    k=st.integers(1, 3),
+    seed=st.integers(0, 2**32 - 1),
+    neighbours=st.floats(0, 0.3),
+)
+def test_unmix_undoes_mix(k, seed, neighbours):
+    rng = np.random.default_rng(seed)
+    matrix = np.eye(3)[:, :k] + neighbours * rng.random((3, k)) * (1 - np.eye(3)[:, :k])
+    lights = rng.uniform(0, 4000, (k, 7, 9))
+    images = unmix(channels_of(lights, matrix), Crosstalk(matrix=matrix, lights=LIGHTS[:k]))
+    np.testing.assert_allclose(images.values, lights, rtol=1e-4, atol=0.05)
+    assert images.names == LIGHTS[:k]
+    assert images.valid.all()
+
+
+def test_an_invalid_channel_spoils_the_lights_it_enters_and_no_other():
+    matrix = np.array([[1.0, 0.1, 0], [0.1, 1.0, 0], [0, 0, 1.0]])
+    valid = np.ones((3, 4, 4), bool)
+    valid[0, 1, 2] = False
+    values = channels_of(np.full((3, 4, 4), 100.0), matrix, valid)
+    values.values[0, 1, 2] = np.nan
+    images = unmix(values, Crosstalk(matrix=matrix, lights=LIGHTS))
+    assert images.valid[:, 1, 2].tolist() == [False, False, True]
+    assert np.isnan(images.values[:2, 1, 2]).all()
+    assert images.values[2, 1, 2] == pytest.approx(100)
+    assert images.valid.sum() == 3 * 16 - 2
+
+
+def test_covariance_predicts_the_scatter_of_unmixed_noise():
+    rng = np.random.default_rng(5)
+    noise = NoiseModel(gain=4.0, read_noise=3.0)
+    clean = np.tensordot(A, np.array([400.0, 900.0, 1500.0]), axes=1)[:, None, None]
+    noisy = clean + np.sqrt(noise.variance(clean)) * rng.standard_normal((3, 400, 400))
+    channels = LinearChannels(
+        values=noisy.astype(np.float32), valid=np.ones(noisy.shape, bool), full_scale=4000.0, noise=noise
+    )
+    images = unmix(channels, Crosstalk(matrix=A, lights=LIGHTS))
+    np.testing.assert_allclose(images.covariance, np.cov(images.values.reshape(3, -1)), rtol=0.05, atol=2)
+
+
+def test_wrong_number_of_channels_is_an_error():
+    with pytest.raises(InputError, match="3 camera channels"):
+        unmix(channels_of(np.ones((3, 4, 4)), np.eye(3)[:2]), Crosstalk(matrix=A, lights=LIGHTS))
+
+
+@pytest.mark.parametrize("method", DEMOSAICERS)
+def test_separate_recovers_smooth_lights(method):
+    rows, columns = np.mgrid[:40, :40]
+    lights = np.stack([200 + 3 * rows, 300 + 2 * columns, 500 - rows - columns])
+    mixed = np.tensordot(A, lights, axes=1)
+    site = np.array([[0, 1], [1, 2]])[rows % 2, columns % 2]
+    values = np.take_along_axis(mixed, site[None], axis=0)[0].astype(np.float32)
+    mosaic = LinearMosaic(values=values, saturated=np.zeros(values.shape, bool), cfa="RGGB", full_scale=4000.0)
+    images = separate(mosaic, Crosstalk(matrix=A, lights=LIGHTS), method)
+    inside = np.s_[:, 8:-8, 8:-8]
+    np.testing.assert_allclose(images.values[inside], lights[inside], atol=4)
+
+
+def test_unknown_method_names_the_allowed_ones():
+    mosaic = LinearMosaic(
+        values=np.ones((4, 4), np.float32), saturated=np.zeros((4, 4), bool), cfa="RGGB", full_scale=1
+    )
+    with pytest.raises(InputError, match="malvar"):
+        separate(mosaic, Crosstalk(matrix=A, lights=LIGHTS), "nearest")
+    with pytest.raises(InputError, match="3 camera channels"):
+        separate(mosaic, Crosstalk.identity(("one",)), "malvar")
