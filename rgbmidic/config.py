@@ -15,6 +15,7 @@ from typing import Any, Literal
 from rgbmidic.errors import ConfigurationError
 
 __all__ = [
+    "FrameKind",
     "FrameSettings",
     "IlluminationSettings",
     "RegionSettings",

@@ -1,0 +1,177 @@
+"""The skeleton of TIFF files (DNG, NEF, ARW and other raws are TIFF inside): is all the image data there?
+
+LibRaw and tifffile both open some truncated files and fill what is missing with zeros, so the extents are checked
+first.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.sequence.contents import damaged
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile, TiffPage
+
+__all__ = [
+    "RawStructure",
+    "cfa_pattern",
+    "check_complete",
+    "full_pages",
+    "is_dng",
+    "is_stored_as_is",
+    "open_tiff",
+    "tag",
+]
+
+# A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+_UNCOMPRESSED = 1
+_REDUCED = 1
+_RAW_PHOTOMETRIC = (32803, 34892)
+_DNG_VERSION = 50706
+_CFA_REPEAT, _CFA_PATTERN = 33421, 33422
+_ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715, 50716)
+
+
+def open_tiff(path: Path) -> TiffFile | None:
+    """Open a TIFF file, or None where the file has another structure."""
+    import tifffile
+
+    try:
+        return tifffile.TiffFile(path)
+    except OSError:
+        raise
+    except Exception:  # tifffile meets damaged headers with many kinds of error
+        return None
+
+
+def is_dng(path: Path) -> bool:
+    """Whether the file is a DNG, whatever its name says."""
+    tiff = open_tiff(path)
+    if tiff is None:
+        return False
+    with tiff:
+        return _DNG_VERSION in tiff.pages.first.tags
+
+
+def full_pages(tiff: TiffFile, path: Path) -> list[TiffPage]:
+    """The images of the file in full resolution, neither thumbnails nor previews, checked by `check_complete`."""
+    try:
+        pages = [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
+    except Exception as error:  # see open_tiff
+        raise damaged(path, error) from None
+    for page in pages:
+        check_complete(page, path)
+    return pages
+
+
+def _pages(tiff: TiffFile) -> Iterator[TiffPage]:
+    for frame in tiff.pages:
+        page = frame.aspage()
+        yield page
+        yield from (child.aspage() for child in page.pages or ())
+
+
+def check_complete(page: TiffPage, path: Path) -> None:
+    """Raise where image data that the page announces lies outside the file or is empty."""
+    size = path.stat().st_size
+    parts = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+    end = max((offset + count for offset, count in parts), default=0)
+    if end > size:
+        raise damaged(path, f"the header announces image data up to byte {end}, the file has {size} bytes")
+    if any(count == 0 for _, count in parts):
+        raise damaged(path, "a part of its image data has the length zero")
+
+
+def is_stored_as_is(page: TiffPage) -> bool:
+    """Whether the page's samples are uncompressed and their bytes are all there."""
+    bits = page.bitspersample if isinstance(page.bitspersample, int) else page.bitspersample[0]
+    needed = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
+    return bool(page.compression == _UNCOMPRESSED and sum(page.databytecounts) >= needed)
+
+
+def tag(page: TiffPage, code: int) -> tuple[Any, ...] | None:
+    """Value of a tag as a tuple, or None where the page does not have it."""
+    if code not in page.tags:
+        return None
+    value = page.tags[code].value
+    return tuple(value) if isinstance(value, tuple | list | bytes) else (value,)
+
+
+def cfa_pattern(page: TiffPage) -> str | None:
+    """Name of the 2x2 colour filter array in the page's tags, or None where there is none."""
+    pattern = tag(page, _CFA_PATTERN)
+    if pattern is None or tag(page, _CFA_REPEAT) != (2, 2) or not set(pattern) <= {0, 1, 2}:
+        return None
+    return "".join("RGB"[channel] for channel in pattern)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawStructure:
+    """What the TIFF skeleton of a camera raw tells beyond LibRaw.
+
+    Attributes
+    ----------
+    stored_as_is
+        Whether the samples are uncompressed and all there, so that zeros in them are real.
+    black_cell : ndarray, shape (2, 2), or None
+        DNG black level by position at `origin`; None where no tag says it or says more than a 2x2 cell can hold.
+    origin
+        First row and column of the DNG's active area on the sensor.
+    """
+
+    stored_as_is: bool
+    black_cell: npt.NDArray[np.float64] | None
+    origin: tuple[int, int]
+
+    @classmethod
+    def read(cls, path: Path) -> RawStructure | None:
+        """Read and check the skeleton; None for files that are not TIFF inside.
+
+        Raises
+        ------
+        FrameError
+            Image data that the header announces is not in the file.
+        """
+        tiff = open_tiff(path)
+        if tiff is None:
+            return None
+        with tiff:
+            pages = full_pages(tiff, path)
+            raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
+            if not raw:
+                return None
+            page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
+            area = tag(page, _ACTIVE_AREA) or (0, 0)
+            return cls(stored_as_is=is_stored_as_is(page), black_cell=_black_cell(page), origin=(area[0], area[1]))
+
+    def black_level(self, top: int, left: int) -> npt.NDArray[np.float64] | None:
+        """Black level of each position of the 2x2 cell that starts at row `top`, column `left` of the sensor.
+
+        LibRaw moves odd margins to the next even row and column without moving the black levels along.
+        """
+        if self.black_cell is None:
+            return None
+        return np.roll(self.black_cell, (self.origin[0] - top, self.origin[1] - left), axis=(0, 1))
+
+
+def _black_cell(page: TiffPage) -> npt.NDArray[np.float64] | None:
+    levels, repeat = tag(page, _BLACK), tag(page, _BLACK_REPEAT) or (1, 1)
+    if levels is None or any(delta in page.tags for delta in _BLACK_DELTAS) or not set(repeat) <= {1, 2}:
+        return None
+    numbers = np.array(levels, dtype=np.float64)
+    if len(numbers) == 2 * math.prod(repeat):  # rationals come as numerator, denominator
+        numbers = numbers[::2] / numbers[1::2]
+    if len(numbers) != math.prod(repeat):
+        return None
+    return np.tile(numbers.reshape(repeat), (2 // repeat[0], 2 // repeat[1]))
