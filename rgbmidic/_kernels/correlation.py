@@ -1,0 +1,306 @@
+"""The sums of the MIDIC minimisation over the pixels of each element (paper, eq. 3).
+
+Pixels are stored element by element: element e owns the slots ``offsets[e]:offsets[e + 1]``. Each element writes its
+own row of the output, so the sums are the same bits on any number of threads. Positions are kept relative to the
+element's origin pixel: float32 then resolves 1e-5 px on images of any size.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from rgbmidic._kernels.interpolation import _FAST, PAD
+
+__all__ = ["element_hessian", "element_moments", "element_right_side", "pull_back", "warp"]
+
+_SIXTH = np.float32(1.0 / 6.0)
+_ONE = np.float32(1.0)
+_ZERO = np.float32(0.0)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _spline(coefficients, row, column, tx, ty):
+    """Cubic B-spline value at pixel (row, column) plus the fraction (tx, ty); `coefficients` carry the padding."""
+    t2 = tx * tx
+    t3 = t2 * tx
+    x3 = t3 * _SIXTH
+    x0 = _SIXTH - np.float32(0.5) * (tx - t2) - x3
+    x1 = np.float32(2.0 / 3.0) - t2 + np.float32(0.5) * t3
+    x2 = _ONE - x0 - x1 - x3
+    t2 = ty * ty
+    t3 = t2 * ty
+    y3 = t3 * _SIXTH
+    y0 = _SIXTH - np.float32(0.5) * (ty - t2) - y3
+    y1 = np.float32(2.0 / 3.0) - t2 + np.float32(0.5) * t3
+    y2 = _ONE - y0 - y1 - y3
+    r = row + (PAD - 1)
+    c = column + (PAD - 1)
+    return (
+        y0
+        * (
+            x0 * coefficients[r, c]
+            + x1 * coefficients[r, c + 1]
+            + x2 * coefficients[r, c + 2]
+            + x3 * coefficients[r, c + 3]
+        )
+        + y1
+        * (
+            x0 * coefficients[r + 1, c]
+            + x1 * coefficients[r + 1, c + 1]
+            + x2 * coefficients[r + 1, c + 2]
+            + x3 * coefficients[r + 1, c + 3]
+        )
+        + y2
+        * (
+            x0 * coefficients[r + 2, c]
+            + x1 * coefficients[r + 2, c + 1]
+            + x2 * coefficients[r + 2, c + 2]
+            + x3 * coefficients[r + 2, c + 3]
+        )
+        + y3
+        * (
+            x0 * coefficients[r + 3, c]
+            + x1 * coefficients[r + 3, c + 1]
+            + x2 * coefficients[r + 3, c + 2]
+            + x3 * coefficients[r + 3, c + 3]
+        )
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _element_motion(displacement, elements, barycentric, origin, e):
+    """Affine displacement of element e about its origin pixel: whole-pixel part, constant rest and slopes."""
+    ux = uy = uxx = uxy = uyx = uyy = 0.0
+    for a in range(3):
+        node = elements[e, a]
+        u = displacement[node, 0]
+        v = displacement[node, 1]
+        ux += barycentric[e, a, 0] * u
+        uy += barycentric[e, a, 0] * v
+        uxx += barycentric[e, a, 1] * u
+        uxy += barycentric[e, a, 2] * u
+        uyx += barycentric[e, a, 1] * v
+        uyy += barycentric[e, a, 2] * v
+    whole_x = np.floor(ux)
+    whole_y = np.floor(uy)
+    return (
+        np.int64(whole_x) + origin[e, 0],
+        np.int64(whole_y) + origin[e, 1],
+        np.float32(ux - whole_x),
+        np.float32(uy - whole_y),
+        np.float32(1.0 + uxx),
+        np.float32(uxy),
+        np.float32(uyx),
+        np.float32(1.0 + uyy),
+    )
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
+def element_right_side(
+    coefficients, reference, gradient_x, gradient_y, weight, local_x, local_y, offsets, origin, elements, barycentric,
+    displacement, out, sums,
+):  # fmt: skip
+    """Right-hand side of one light, element by element.
+
+    `coefficients` of the deformed image; `reference`, `gradient_x`, `gradient_y`, `weight` (P,) float32 and `local_x`,
+    `local_y` (P,) float32 per owned pixel; `origin` (E, 2) int64; `barycentric` (E, 3, 3) float64 with the shape
+    function ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2) float64.
+    `out` (E, 3, 2) receives ``sum w (f - g(x + u)) grad f phi``; `sums` (E, 3) receives ``sum w r^2``, ``sum w`` and
+    the number of pixels with weight whose position has left the image.
+    """
+    height = coefficients.shape[0] - 2 * PAD
+    width = coefficients.shape[1] - 2 * PAD
+    for e in prange(elements.shape[0]):
+        base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
+        low_x = np.float32(-base_x)
+        low_y = np.float32(-base_y)
+        high_x = np.float32(width - 1 - base_x)
+        high_y = np.float32(height - 1 - base_y)
+        b00 = np.float32(barycentric[e, 0, 0])
+        b01 = np.float32(barycentric[e, 0, 1])
+        b02 = np.float32(barycentric[e, 0, 2])
+        b10 = np.float32(barycentric[e, 1, 0])
+        b11 = np.float32(barycentric[e, 1, 1])
+        b12 = np.float32(barycentric[e, 1, 2])
+        s00 = s01 = s02 = s10 = s11 = s12 = _ZERO
+        rest = total = lost = _ZERO
+        for i in range(offsets[e], offsets[e + 1]):
+            lx = local_x[i]
+            ly = local_y[i]
+            px = ux + fxx * lx + fxy * ly
+            py = uy + fyx * lx + fyy * ly
+            w = weight[i]
+            inside = (px >= low_x) & (px <= high_x) & (py >= low_y) & (py <= high_y)
+            lost += _ZERO if inside or w == _ZERO else _ONE
+            w = w if inside else _ZERO
+            px = min(max(px, low_x), high_x)
+            py = min(max(py, low_y), high_y)
+            cx = np.floor(px)
+            cy = np.floor(py)
+            g = _spline(coefficients, base_y + np.int64(cy), base_x + np.int64(cx), px - cx, py - cy)
+            r = reference[i] - g
+            wr = w * r
+            rest += wr * r
+            total += w
+            wx = wr * gradient_x[i]
+            wy = wr * gradient_y[i]
+            l0 = b00 + b01 * lx + b02 * ly
+            l1 = b10 + b11 * lx + b12 * ly
+            s00 += wx * l0
+            s10 += wy * l0
+            s01 += wx * l1
+            s11 += wy * l1
+            s02 += wx
+            s12 += wy
+        out[e, 0, 0] = s00
+        out[e, 0, 1] = s10
+        out[e, 1, 0] = s01
+        out[e, 1, 1] = s11
+        out[e, 2, 0] = s02 - s00 - s01
+        out[e, 2, 1] = s12 - s10 - s11
+        sums[e, 0] = rest
+        sums[e, 1] = total
+        sums[e, 2] = lost
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
+def element_hessian(gradient_x, gradient_y, weight, local_x, local_y, offsets, barycentric, out):
+    """Hessian (correlation matrix) of one light: ``out`` (E, 3, 3, 3) receives ``sum w D phi_a phi_b``.
+
+    The last axis of `out` holds D = (gx gx, gx gy, gy gy).
+    """
+    for e in prange(offsets.size - 1):
+        b00 = np.float32(barycentric[e, 0, 0])
+        b01 = np.float32(barycentric[e, 0, 1])
+        b02 = np.float32(barycentric[e, 0, 2])
+        b10 = np.float32(barycentric[e, 1, 0])
+        b11 = np.float32(barycentric[e, 1, 1])
+        b12 = np.float32(barycentric[e, 1, 2])
+        x00 = x01 = x11 = x02 = x12 = x22 = _ZERO
+        m00 = m01 = m11 = m02 = m12 = m22 = _ZERO
+        y00 = y01 = y11 = y02 = y12 = y22 = _ZERO
+        for i in range(offsets[e], offsets[e + 1]):
+            lx = local_x[i]
+            ly = local_y[i]
+            l0 = b00 + b01 * lx + b02 * ly
+            l1 = b10 + b11 * lx + b12 * ly
+            l2 = _ONE - l0 - l1
+            wgx = weight[i] * gradient_x[i]
+            xx = wgx * gradient_x[i]
+            xy = wgx * gradient_y[i]
+            yy = weight[i] * gradient_y[i] * gradient_y[i]
+            p00 = l0 * l0
+            p01 = l0 * l1
+            p11 = l1 * l1
+            p02 = l0 * l2
+            p12 = l1 * l2
+            p22 = l2 * l2
+            x00 += xx * p00
+            x01 += xx * p01
+            x11 += xx * p11
+            x02 += xx * p02
+            x12 += xx * p12
+            x22 += xx * p22
+            m00 += xy * p00
+            m01 += xy * p01
+            m11 += xy * p11
+            m02 += xy * p02
+            m12 += xy * p12
+            m22 += xy * p22
+            y00 += yy * p00
+            y01 += yy * p01
+            y11 += yy * p11
+            y02 += yy * p02
+            y12 += yy * p12
+            y22 += yy * p22
+        h = out[e]
+        h[0, 0, 0], h[0, 0, 1], h[0, 0, 2] = x00, m00, y00
+        h[1, 1, 0], h[1, 1, 1], h[1, 1, 2] = x11, m11, y11
+        h[2, 2, 0], h[2, 2, 1], h[2, 2, 2] = x22, m22, y22
+        h[0, 1, 0], h[0, 1, 1], h[0, 1, 2] = x01, m01, y01
+        h[0, 2, 0], h[0, 2, 1], h[0, 2, 2] = x02, m02, y02
+        h[1, 2, 0], h[1, 2, 1], h[1, 2, 2] = x12, m12, y12
+        h[1, 0] = h[0, 1]
+        h[2, 0] = h[0, 2]
+        h[2, 1] = h[1, 2]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def warp(coefficients, local_x, local_y, offsets, origin, elements, barycentric, displacement, out):
+    """Deformed image brought back to the reference: ``out`` (P,) float32 receives g(x + u), NaN outside the image."""
+    height = coefficients.shape[0] - 2 * PAD
+    width = coefficients.shape[1] - 2 * PAD
+    for e in prange(elements.shape[0]):
+        base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
+        for i in range(offsets[e], offsets[e + 1]):
+            px = ux + fxx * local_x[i] + fxy * local_y[i]
+            py = uy + fyx * local_x[i] + fyy * local_y[i]
+            cx = np.floor(px)
+            cy = np.floor(py)
+            column = base_x + np.int64(cx)
+            row = base_y + np.int64(cy)
+            tx = px - cx
+            ty = py - cy
+            outside = column < 0 or row < 0 or column > width - 1 or row > height - 1
+            if outside or (column == width - 1 and tx > _ZERO) or (row == height - 1 and ty > _ZERO):
+                out[i] = np.nan
+            else:
+                out[i] = _spline(coefficients, row, column, tx, ty)
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
+def element_moments(reference, warped, weight, offsets, out):
+    """Weighted moments of reference and warped deformed image: ``out`` (E, 6) receives the sums of
+    w, w f, w g, w f f, w f g, w g g over the pixels with weight and a finite g."""
+    for e in prange(offsets.size - 1):
+        total = f1 = g1 = f2 = fg = g2 = 0.0
+        for i in range(offsets[e], offsets[e + 1]):
+            g = warped[i]
+            w = weight[i]
+            if w == _ZERO or not np.isfinite(g):
+                continue
+            f = reference[i]
+            total += w
+            f1 += w * f
+            g1 += w * g
+            f2 += w * f * f
+            fg += w * f * g
+            g2 += w * g * g
+        out[e, 0], out[e, 1], out[e, 2], out[e, 3], out[e, 4], out[e, 5] = total, f1, g1, f2, fg, g2
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def pull_back(deformed_weight, reference_weight, local_x, local_y, offsets, origin, elements, barycentric,
+              displacement, out):  # fmt: skip
+    """Weight of each owned pixel: the reference's times the deformed image's at the displaced position (bilinear).
+
+    `deformed_weight` (H, W) float32, `reference_weight` (P,) float32; positions outside the image give 0.
+    """
+    height, width = deformed_weight.shape
+    for e in prange(elements.shape[0]):
+        base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
+        for i in range(offsets[e], offsets[e + 1]):
+            px = ux + fxx * local_x[i] + fxy * local_y[i]
+            py = uy + fyx * local_x[i] + fyy * local_y[i]
+            cx = np.floor(px)
+            cy = np.floor(py)
+            column = base_x + np.int64(cx)
+            row = base_y + np.int64(cy)
+            tx = px - cx
+            ty = py - cy
+            if column < 0 or row < 0 or column > width - 1 or row > height - 1:
+                out[i] = _ZERO
+                continue
+            if (column == width - 1 and tx > _ZERO) or (row == height - 1 and ty > _ZERO):
+                out[i] = _ZERO
+                continue
+            right = min(column + 1, width - 1)
+            below = min(row + 1, height - 1)
+            a = deformed_weight[row, column]
+            b = deformed_weight[row, right]
+            c = deformed_weight[below, column]
+            d = deformed_weight[below, right]
+            value = (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
+            # a pixel next to an excluded one would borrow from it through the interpolation
+            out[i] = reference_weight[i] * value if min(a, b, c, d) > _ZERO else _ZERO

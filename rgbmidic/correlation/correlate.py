@@ -1,0 +1,116 @@
+"""Arrays in, arrays out: the MIDIC solve of one pair of states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.correlation.images import as_light_stack
+from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.solution import Solution
+from rgbmidic.correlation.solve import solve
+from rgbmidic.correlation.start import coarse_start
+from rgbmidic.errors import InputError
+from rgbmidic.mesh import Region, Tri3Mesh
+
+__all__ = ["as_weights", "correlate", "initial_displacement"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def correlate(
+    reference: npt.ArrayLike,
+    deformed: npt.ArrayLike,
+    *,
+    region: Sequence[float] | Region | None = None,
+    element_size: float = 25.0,
+    weights: npt.ArrayLike | None = None,
+    initial: npt.ArrayLike | None = None,
+    deformed_weights: npt.ArrayLike | None = None,
+    prefilter: str = "gaussian",
+    rigid: str = "none",
+    search_radius: float = 64.0,
+    tolerance: float = 1e-3,
+    max_iterations: int = 50,
+) -> Solution:
+    """Measure the displacement between two states seen under k lights (k = 1: plain DIC).
+
+    Parameters
+    ----------
+    reference, deformed : array_like, shape (H, W) or (k, H, W)
+        Grey levels; NaN marks an invalid pixel.
+    region
+        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None takes the whole image.
+    element_size
+        Side of the triangles in px.
+    weights : array_like, shape (H, W) or (k, H, W), optional
+        Weight of each light at each pixel of the reference, finite and not negative; 0 excludes.
+    initial : array_like, shape (2,) or (N, 2), optional
+        Displacement (u, v) in px to start from; None looks for it within `search_radius`.
+    deformed_weights
+        Like `weights`, on the deformed images.
+    prefilter, rigid, tolerance, max_iterations, search_radius
+        See `rgbmidic.config.SolverSettings`.
+
+    Returns
+    -------
+    Solution
+        With `nodes` (N, 2), `elements` (E, 3), `displacement` (N, 2) in px, `displacement_std` (N, 2) in px,
+        `status`, and more.
+
+    Raises
+    ------
+    InputError
+        Images of different shapes, a weight or start that does not fit, an unknown setting.
+    RegionError
+        The region is empty, too small or outside the image.
+    """
+    f, g = as_light_stack(reference, "reference"), as_light_stack(deformed, "deformed")
+    if f.shape != g.shape:
+        raise InputError(f"reference and deformed images must have one shape; given are {f.shape} and {g.shape}")
+    height, width = f.shape[1:]
+    if not isinstance(region, Region):
+        region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
+    mesh = Tri3Mesh.from_region(region, element_size)
+    first = Reference.prepare(f, region, as_weights(weights, f.shape, "weights"), mesh=mesh, prefilter=prefilter)
+    second = Deformed.prepare(g, as_weights(deformed_weights, f.shape, "deformed_weights"), prefilter=prefilter)
+    start = initial_displacement(initial, len(mesh.nodes))
+    if start is None:
+        start = coarse_start(first, second, search_radius)
+    return solve(first, second, start, rigid=rigid, tolerance=tolerance, max_iterations=max_iterations)
+
+
+def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str) -> npt.NDArray[np.float32] | None:
+    """Weights (H, W) or (k, H, W) as a float32 stack of `shape` (k, H, W).
+
+    Raises
+    ------
+    InputError
+        Another shape, negative or not finite.
+    """
+    if weights is None:
+        return None
+    values = np.asarray(weights)
+    if values.shape not in (shape, shape[1:]) or values.dtype.kind not in "buif":
+        raise InputError(f"{name} must have shape {shape[1:]} or {shape}; given is {values.dtype} {values.shape}")
+    if not np.isfinite(values).all() or values.min() < 0:
+        raise InputError(f"{name} must be finite and not negative")
+    return np.ascontiguousarray(np.broadcast_to(values, shape), dtype=np.float32)
+
+
+def initial_displacement(initial: npt.ArrayLike | None, nodes: int) -> FloatArray | None:
+    """A start as an array (N, 2), or None where none is given.
+
+    Raises
+    ------
+    InputError
+        Not (2,) or (N, 2), or not finite.
+    """
+    if initial is None:
+        return None
+    values = np.asarray(initial, dtype=np.float64)
+    if values.shape not in ((2,), (nodes, 2)) or not np.isfinite(values).all():
+        raise InputError(f"initial must be finite with shape (2,) or ({nodes}, 2); given is shape {values.shape}")
+    return np.broadcast_to(values, (nodes, 2)).copy()

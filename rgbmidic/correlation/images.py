@@ -1,0 +1,87 @@
+"""Images made ready for correlation: holes filled, prefiltered, usable pixels marked."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.interpolation import PAD, bspline_coefficients
+from rgbmidic.errors import InputError
+
+__all__ = ["PREFILTERS", "apply_prefilter", "as_light_stack", "fill_holes", "spline_coefficients", "usable_pixels"]
+
+FloatImage = npt.NDArray[np.float32]
+
+_GAUSSIAN = np.exp(-(np.arange(-3, 4) ** 2) / 2)
+PREFILTERS: dict[str, npt.NDArray[np.float64]] = {
+    "none": np.ones(1),
+    # zeros at the carriers (pi, 0), (0, pi), (pi, pi) of the Bayer mosaic
+    "binomial": np.array([0.25, 0.5, 0.25]),
+    "gaussian": _GAUSSIAN / _GAUSSIAN.sum(),
+}
+"""One-dimensional prefilters, applied along both axes; ``"gaussian"`` has a standard deviation of 1 px."""
+
+
+def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
+    """Images (H, W) or (k, H, W) as a float32 stack (k, H, W).
+
+    Raises
+    ------
+    InputError
+        Another number of axes, not real numbers, or under 8 px in height or width.
+    """
+    stack = np.asarray(images)
+    if stack.ndim not in (2, 3) or stack.dtype.kind not in "buif":
+        raise InputError(f"{name} must be a real image (H, W) or (k, H, W), not {stack.dtype} of shape {stack.shape}")
+    stack = np.atleast_3d(stack) if stack.ndim == 3 else stack[None]
+    if stack.shape[0] == 0 or min(stack.shape[1:]) < 8:
+        raise InputError(f"{name} must have at least one image of at least 8 x 8 px; given is shape {stack.shape}")
+    return np.ascontiguousarray(stack, dtype=np.float32)
+
+
+def fill_holes(image: FloatImage, valid: npt.NDArray[np.bool_], sigma: float = 3.0) -> FloatImage:
+    """Replace invalid pixels by the Gaussian mean of the valid ones around, and by the overall mean farther away.
+
+    The values carry no weight in the solve; they only keep the spline's recursion finite and quiet.
+    """
+    if valid.all():
+        return image
+    known = np.where(valid, image, np.float32(0))
+    weight = cv2.GaussianBlur(valid.astype(np.float32), (0, 0), sigma)
+    mean = np.float32(known.sum(dtype=np.float64) / max(int(valid.sum()), 1))
+    local = cv2.GaussianBlur(known, (0, 0), sigma) / np.maximum(weight, np.float32(1e-3))
+    return np.where(valid, image, np.where(weight > 1e-3, local, mean)).astype(np.float32)
+
+
+def apply_prefilter(image: FloatImage, prefilter: str) -> FloatImage:
+    """Filter an image (H, W) along both axes with one of `PREFILTERS`.
+
+    Raises
+    ------
+    InputError
+        Unknown filter name.
+    """
+    if prefilter not in PREFILTERS:
+        raise InputError(f"unknown prefilter {prefilter!r}; allowed are {', '.join(PREFILTERS)}")
+    if prefilter == "none":
+        return image
+    taps = PREFILTERS[prefilter].astype(np.float32)
+    return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
+
+
+def usable_pixels(valid: npt.NDArray[np.bool_], prefilter: str) -> npt.NDArray[np.bool_]:
+    """Pixels whose filtered value and spline neighbourhood use valid pixels only."""
+    if valid.all():
+        return valid
+    reach = len(PREFILTERS[prefilter]) // 2 + 1
+    element = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
+    # outside the image counts as valid: the spline is mirrored there
+    return cv2.erode(valid.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=1).astype(bool)
+
+
+def spline_coefficients(image: FloatImage) -> FloatImage:
+    """Cubic B-spline coefficients of an image (H, W), padded by `PAD` on every side."""
+    out = np.empty((image.shape[0] + 2 * PAD, image.shape[1] + 2 * PAD), dtype=np.float32)
+    bspline_coefficients(np.ascontiguousarray(image), out)
+    return out

@@ -1,0 +1,127 @@
+"""The two sides of the minimisation: the reference state, prepared once, and a deformed state, prepared per frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.interpolation import sample_with_gradient
+from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
+from rgbmidic.correlation.system import NormalEquations
+from rgbmidic.correlation.uncertainty import Probing
+from rgbmidic.errors import InputError
+from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+
+__all__ = ["Deformed", "Reference"]
+
+FloatImage = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Deformed:
+    """The k images of a deformed state, ready to be interpolated.
+
+    Attributes
+    ----------
+    images : ndarray, shape (k, H, W), float32
+        Holes filled, prefiltered.
+    coefficients : ndarray, shape (k, H + 2 PAD, W + 2 PAD), float32
+        Cubic B-spline coefficients of `images`.
+    weights : ndarray, shape (k, H, W), float32
+        0 where a pixel is excluded or must not be interpolated.
+    """
+
+    images: FloatImage
+    coefficients: FloatImage
+    weights: FloatImage
+
+    @classmethod
+    def prepare(cls, images: FloatImage, weights: FloatImage | None = None, *, prefilter: str = "none") -> Deformed:
+        """Fill, filter and prefilter images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]."""
+        ready, usable = _prepare(images, weights, prefilter)
+        return cls(images=ready, coefficients=np.stack([spline_coefficients(i) for i in ready]), weights=usable)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reference:
+    """The reference state with its mesh; everything a frame needs and no frame changes.
+
+    Attributes
+    ----------
+    mesh, pixels, equations, probing
+        TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
+    images, weights : ndarray, shape (k, H, W), float32
+        Holes filled and prefiltered; 0 where excluded.
+    values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
+        The same at the owned pixels, with the gradient in grey levels per px.
+    prefilter : str
+    """
+
+    mesh: Tri3Mesh
+    pixels: PixelMap
+    equations: NormalEquations
+    probing: Probing
+    images: FloatImage
+    weights: FloatImage
+    values: FloatImage
+    gradient_x: FloatImage
+    gradient_y: FloatImage
+    pixel_weights: FloatImage
+    prefilter: str
+
+    @classmethod
+    def prepare(
+        cls,
+        images: FloatImage,
+        region: Region,
+        weights: FloatImage | None = None,
+        *,
+        mesh: Tri3Mesh,
+        prefilter: str = "none",
+    ) -> Reference:
+        """Prepare reference images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1].
+
+        Raises
+        ------
+        InputError
+            The region belongs to images of another size.
+        """
+        if region.mask.shape != images.shape[1:]:
+            raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
+        ready, usable = _prepare(images, weights, prefilter)
+        pixels = PixelMap.from_mesh(mesh, region)
+        samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
+        return cls(
+            mesh=mesh,
+            pixels=pixels,
+            equations=NormalEquations.from_mesh(mesh),
+            probing=Probing.from_mesh(mesh),
+            images=ready,
+            weights=usable,
+            values=samples[0],
+            gradient_x=samples[1],
+            gradient_y=samples[2],
+            pixel_weights=pixels.gather(usable),
+            prefilter=prefilter,
+        )
+
+
+def _prepare(images: FloatImage, weights: FloatImage | None, prefilter: str) -> tuple[FloatImage, FloatImage]:
+    """Filtered images without holes, and the weight of each pixel, 0 where it or its neighbourhood is invalid."""
+    valid = np.isfinite(images)
+    ready = np.stack(
+        [apply_prefilter(fill_holes(image, known), prefilter) for image, known in zip(images, valid, strict=True)]
+    )
+    usable = np.stack([usable_pixels(known, prefilter) for known in valid]).astype(np.float32)
+    return ready, usable if weights is None else usable * weights
+
+
+def _values_and_gradient(image: FloatImage, pixels: PixelMap) -> FloatImage:
+    """Value and spline gradient (3, P) of an image at the owned pixels."""
+    coefficients = spline_coefficients(image)
+    out = np.empty((3, pixels.rows.size), dtype=np.float32)
+    x, y = pixels.columns.astype(np.float64), pixels.rows.astype(np.float64)
+    sample_with_gradient(coefficients, x, y, out[0], out[1], out[2])
+    return out

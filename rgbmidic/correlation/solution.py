@@ -1,0 +1,84 @@
+"""What the solve gives: a displacement field with its uncertainty, and how it was reached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["NodeStatus", "Solution", "Status"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class Status(IntEnum):
+    """How a frame ended."""
+
+    CONVERGED = 0
+    NOT_CONVERGED = 1
+    FAILED = 2
+
+
+class NodeStatus(IntEnum):
+    """How a node ended."""
+
+    MEASURED = 0
+    NOT_SEEN = 1
+    """No light sees enough texture around the node, in the reference or in the deformed image."""
+    DECORRELATED = 2
+    """The images around the node do not match at the displacement found."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Solution:
+    """Displacement field of one frame.
+
+    Attributes
+    ----------
+    nodes : ndarray, shape (N, 2), float64
+        Node positions (x, y) in px on the reference image.
+    elements : ndarray, shape (E, 3), int32
+    displacement : ndarray, shape (N, 2), float64
+        (u, v) in px; NaN where not measured.
+    displacement_std : ndarray, shape (N, 2), float64
+        Standard uncertainty in px; NaN where not measured.
+    node_status : ndarray, shape (N,), uint8
+        See `NodeStatus`.
+    status : Status
+    reason : str
+        Why the frame is not converged; empty otherwise.
+    rigid : ndarray, shape (k, m), float64
+        Coefficients beta of the rigid functions of each light (0 for the first): shift in x and y in px, then
+        rotation in rad about the middle of the mesh.
+    residual : ndarray, shape (k,), float64
+        Weighted rms of ``f - g(x + u)`` of each light, in grey levels of the filtered images; NaN where a light has
+        no weight.
+    weight_share : ndarray, shape (k,), float64
+        Mean weight of each light over the pixels of the region.
+    history : ndarray, shape (iterations,), float64
+        Largest motion of a measured node in each iteration, px.
+    """
+
+    nodes: FloatArray
+    elements: npt.NDArray[np.int32]
+    displacement: FloatArray
+    displacement_std: FloatArray
+    node_status: npt.NDArray[np.uint8]
+    status: Status
+    reason: str
+    rigid: FloatArray
+    residual: FloatArray
+    weight_share: FloatArray
+    history: FloatArray
+
+    @property
+    def iterations(self) -> int:
+        """Number of Gauss-Newton iterations."""
+        return len(self.history)
+
+    @property
+    def measured(self) -> npt.NDArray[np.bool_]:
+        """True for each measured node, shape (N,)."""
+        return self.node_status == NodeStatus.MEASURED

@@ -1,0 +1,93 @@
+"""The sparse normal equations of the Gauss-Newton step: structure, assembly and solution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from rgbmidic.mesh import Tri3Mesh
+
+__all__ = ["NormalEquations", "factorise"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NormalEquations:
+    """Sparse structure shared by all frames: the unknowns are (u, v) of node 0, (u, v) of node 1, and so on.
+
+    Attributes
+    ----------
+    unknowns : ndarray, shape (E, 6), int64
+        Unknowns of each element.
+    slots : ndarray, shape (36 E,), int64
+        Position of each entry of the element matrices in the data of the assembled matrix.
+    indices, indptr : ndarray
+        Structure of the assembled matrix (compressed columns).
+    smoothness : csc_matrix, shape (2 N, 2 N)
+        Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal.
+    nodal_area : ndarray, shape (N,), float64
+        A third of the area of the elements around each node, square px.
+    """
+
+    unknowns: npt.NDArray[np.int64]
+    slots: npt.NDArray[np.int64]
+    indices: npt.NDArray[np.int32]
+    indptr: npt.NDArray[np.int32]
+    smoothness: sp.csc_matrix
+    nodal_area: FloatArray
+
+    @classmethod
+    def from_mesh(cls, mesh: Tri3Mesh) -> NormalEquations:
+        """Structure of the equations of a mesh."""
+        unknowns = (2 * mesh.elements.astype(np.int64)[:, :, None] + np.arange(2)).reshape(-1, 6)
+        size = 2 * len(mesh.nodes)
+        rows = np.repeat(unknowns, 6, axis=1).ravel()
+        columns = np.tile(unknowns, 6).ravel()
+        keys, slots = np.unique(columns * size + rows, return_inverse=True)
+        indptr = np.searchsorted(keys, np.arange(size + 1) * size)
+        area = np.bincount(mesh.elements.ravel(), np.repeat(mesh.areas / 3, 3), minlength=len(mesh.nodes))
+        return cls(
+            unknowns=unknowns,
+            slots=slots.ravel(),
+            indices=(keys % size).astype(np.int32),
+            indptr=indptr.astype(np.int32),
+            smoothness=_laplacian(mesh),
+            nodal_area=area,
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns, twice the number of nodes."""
+        return len(self.indptr) - 1
+
+    def matrix(self, blocks: FloatArray) -> sp.csc_matrix:
+        """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N)."""
+        full = blocks[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
+        data = np.bincount(self.slots, full.ravel(), minlength=len(self.indices))
+        return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
+
+    def vector(self, parts: FloatArray) -> FloatArray:
+        """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""
+        return np.bincount(self.unknowns.ravel(), parts.ravel(), minlength=self.size)
+
+
+def factorise(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
+    """Factorise a symmetric positive definite matrix; gives the function that solves for right-hand sides."""
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return factors.solve
+
+
+def _laplacian(mesh: Tri3Mesh) -> sp.csc_matrix:
+    count = len(mesh.nodes)
+    i, j = mesh.neighbours.T
+    adjacency = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
+    adjacency = adjacency + adjacency.T
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    laplacian = (sp.diags(degree) - adjacency) / degree.mean()
+    return sp.csc_matrix(sp.kron(laplacian, sp.eye(2)))

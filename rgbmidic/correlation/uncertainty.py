@@ -1,0 +1,94 @@
+"""Standard uncertainty of every node without inverting the Hessian.
+
+The covariance is the sandwich ``M^-1 S M^-1`` with S the covariance of the right-hand side. Columns of M^-1 decay
+within a few elements, so many of them are found with one solve: unit vectors of nodes far apart are summed (probing),
+and each node of the result belongs to the nearest of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from rgbmidic.mesh import Tri3Mesh
+
+__all__ = ["Probing", "nodal_std"]
+
+FloatArray = npt.NDArray[np.float64]
+
+_RINGS = 4
+"""Nodes of one colour are at least this many edges apart."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Probing:
+    """Colouring of the nodes so that nodes of one colour are far apart.
+
+    Attributes
+    ----------
+    colour : ndarray, shape (N,), int64
+    nearest : ndarray, shape (C, N), int64
+        For every colour, the node of that colour nearest to each node.
+    """
+
+    colour: npt.NDArray[np.int64]
+    nearest: npt.NDArray[np.int64]
+
+    @classmethod
+    def from_mesh(cls, mesh: Tri3Mesh) -> Probing:
+        """Greedy colouring of the graph of nodes closer than `_RINGS` edges."""
+        from scipy.spatial import cKDTree
+
+        count = len(mesh.nodes)
+        i, j = mesh.neighbours.T
+        ring = sp.coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
+        ring = sp.csr_matrix(ring + ring.T + sp.eye(count, dtype=np.int8))
+        reach = ring
+        for _ in range(_RINGS - 2):
+            reach = sp.csr_matrix((reach @ ring) > 0)
+        colour = _greedy_colours(reach.indptr, reach.indices)
+        nearest = np.empty((colour.max() + 1, count), dtype=np.int64)
+        for c in range(len(nearest)):
+            centres = np.flatnonzero(colour == c)
+            nearest[c] = centres[cKDTree(mesh.nodes[centres]).query(mesh.nodes)[1]]
+        return cls(colour=colour, nearest=nearest)
+
+
+def _greedy_colours(indptr: npt.NDArray[np.int32], indices: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+    colour = np.full(len(indptr) - 1, -1, dtype=np.int64)
+    for node in range(len(colour)):
+        taken = np.unique(colour[indices[indptr[node] : indptr[node + 1]]])
+        taken = taken[taken >= 0]
+        gaps = np.flatnonzero(taken != np.arange(len(taken)))
+        colour[node] = gaps[0] if len(gaps) else len(taken)
+    return colour
+
+
+def nodal_std(
+    solve: Callable[[FloatArray], FloatArray], right_side_covariance: sp.csc_matrix, probing: Probing
+) -> FloatArray:
+    """Standard uncertainty (N, 2) of u and v: the root of the diagonal of ``M^-1 S M^-1``.
+
+    Parameters
+    ----------
+    solve
+        Solves ``M x = b`` for b of shape (2 N, R).
+    right_side_covariance
+        S, shape (2 N, 2 N).
+    probing
+        Colouring of the mesh.
+    """
+    count, colours = len(probing.colour), len(probing.nearest)
+    nodes = np.arange(count)
+    variance = np.empty((count, 2))
+    for axis in range(2):
+        unit = np.zeros((2 * count, colours))
+        unit[2 * nodes + axis, probing.colour] = 1.0
+        columns = solve(unit)
+        energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
+        variance[:, axis] = np.bincount(probing.nearest.ravel(), energy.T.ravel(), minlength=count)
+    return np.sqrt(np.maximum(variance, 0))

@@ -1,0 +1,93 @@
+"""The pixel map: each pixel of the region is owned by exactly one element, and stored with its element."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.mesh import claim_pixels, list_pixels
+from rgbmidic.errors import RegionError
+from rgbmidic.mesh.region import Region
+from rgbmidic.mesh.tri3 import Tri3Mesh
+
+__all__ = ["PixelMap"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PixelMap:
+    """The P owned pixels, element after element.
+
+    Attributes
+    ----------
+    rows, columns : ndarray, shape (P,), int32
+        Image position of each pixel.
+    offsets : ndarray, shape (E + 1,), int64
+        Element e owns the slots ``offsets[e]:offsets[e + 1]``.
+    origin : ndarray, shape (E, 2), int64
+        Pixel (x, y) to which the local positions of an element refer.
+    local_x, local_y : ndarray, shape (P,), float32
+        Position of each pixel relative to its element's origin, px.
+    barycentric : ndarray, shape (E, 3, 3), float64
+        Shape function a of element e at a local position: ``b[e, a, 0] + b[e, a, 1] x + b[e, a, 2] y``.
+    shape : tuple of int
+        Image size (H, W).
+    """
+
+    rows: npt.NDArray[np.int32]
+    columns: npt.NDArray[np.int32]
+    offsets: npt.NDArray[np.int64]
+    origin: npt.NDArray[np.int64]
+    local_x: npt.NDArray[np.float32]
+    local_y: npt.NDArray[np.float32]
+    barycentric: npt.NDArray[np.float64]
+    shape: tuple[int, int]
+
+    @classmethod
+    def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
+        """Give every pixel of `region` that a triangle covers to the first such triangle.
+
+        Raises
+        ------
+        RegionError
+            No pixel of the region lies in the mesh.
+        """
+        owner = np.where(region.mask, np.int32(-1), np.int32(-2))
+        counts = np.zeros(len(mesh.elements), dtype=np.int64)
+        claim_pixels(mesh.nodes, mesh.elements, owner, counts)
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        if offsets[-1] == 0:
+            raise RegionError("no pixel of the region of interest lies in the mesh")
+        rows = np.empty(offsets[-1], dtype=np.int32)
+        columns = np.empty_like(rows)
+        list_pixels(owner, offsets[:-1].copy(), rows, columns)
+        corners = mesh.nodes[mesh.elements]
+        origin = np.round(corners.mean(axis=1)).astype(np.int64)
+        per_pixel = np.repeat(np.arange(len(counts)), counts)
+        return cls(
+            rows=rows,
+            columns=columns,
+            offsets=offsets,
+            origin=origin,
+            local_x=(columns - origin[per_pixel, 0]).astype(np.float32),
+            local_y=(rows - origin[per_pixel, 1]).astype(np.float32),
+            barycentric=_shape_functions(corners - origin[:, None]),
+            shape=region.mask.shape,
+        )
+
+    def gather(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
+        return np.ascontiguousarray(image[..., self.rows, self.columns])
+
+    def scatter(self, values: npt.NDArray[np.float32], fill: float = 0.0) -> npt.NDArray[np.float32]:
+        """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""
+        image = np.full(self.shape, fill, dtype=np.float32)
+        image[self.rows, self.columns] = values
+        return image
+
+
+def _shape_functions(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Coefficients of the linear shape functions of triangles (E, 3, 2): 1 at their own corner, 0 at the others."""
+    system = np.concatenate([np.ones((len(corners), 3, 1)), corners], axis=2)
+    return np.ascontiguousarray(np.linalg.inv(system).transpose(0, 2, 1))

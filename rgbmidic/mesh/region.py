@@ -1,0 +1,99 @@
+"""The region of interest: which pixels of the reference image are measured."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import RegionError
+
+__all__ = ["Region"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Region:
+    """The pixels to measure.
+
+    Attributes
+    ----------
+    mask : ndarray, shape (H, W), bool
+    rectangle : tuple (x0, y0, x1, y1) in px, or None
+        Set where the region is a rectangle with sides along the axes; the pixels whose centres lie on it belong to it.
+    """
+
+    mask: npt.NDArray[np.bool_]
+    rectangle: tuple[float, float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        mask = np.ascontiguousarray(self.mask, dtype=bool)
+        if mask.ndim != 2:
+            raise RegionError(f"a region mask is one (H, W) image, not an array of shape {mask.shape}")
+        if not mask.any():
+            raise RegionError("the region of interest is empty: no pixel of the image lies in it")
+        object.__setattr__(self, "mask", mask)
+
+    @classmethod
+    def from_rectangle(cls, rectangle: Sequence[float], shape: tuple[int, int]) -> Region:
+        """Rectangle (x0, y0, x1, y1) in px, clipped to the image of `shape` (H, W).
+
+        Raises
+        ------
+        RegionError
+            Not four finite numbers with x0 < x1 and y0 < y1, or no overlap with the image.
+        """
+        corners = np.asarray(rectangle, dtype=np.float64)
+        if corners.shape != (4,) or not np.isfinite(corners).all():
+            raise RegionError(f"a rectangle is four finite numbers (x0, y0, x1, y1) in px; given is {rectangle!r}")
+        x0, y0, x1, y1 = corners.tolist()
+        height, width = shape
+        if not (x0 < x1 and y0 < y1):
+            raise RegionError(f"a rectangle (x0, y0, x1, y1) needs x0 < x1 and y0 < y1; given is {rectangle!r}")
+        clipped = (max(x0, 0.0), max(y0, 0.0), min(x1, width - 1.0), min(y1, height - 1.0))
+        if clipped[0] >= clipped[2] or clipped[1] >= clipped[3]:
+            raise RegionError(f"the rectangle {rectangle!r} does not overlap the image of {width} x {height} px")
+        if max(abs(a - b) for a, b in zip(clipped, (x0, y0, x1, y1), strict=True)) > 1:
+            logger.warning("the rectangle %s is clipped to the image: %s", rectangle, clipped)
+        mask = np.zeros(shape, dtype=bool)
+        left, top = (int(np.ceil(value)) for value in clipped[:2])
+        mask[top : int(clipped[3]) + 1, left : int(clipped[2]) + 1] = True
+        return cls(mask=mask, rectangle=clipped)
+
+    @classmethod
+    def from_polygon(cls, corners: npt.ArrayLike, shape: tuple[int, int]) -> Region:
+        """Polygon with corners (x, y) in px, shape (M, 2), on an image of `shape` (H, W).
+
+        Raises
+        ------
+        RegionError
+            Fewer than three finite corners, or no overlap with the image.
+        """
+        points = np.asarray(corners, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
+            raise RegionError(f"a polygon is at least three finite corners (x, y) in px; given is {corners!r}")
+        mask = np.zeros(shape, dtype=np.uint8)
+        shift = 8  # fixed-point bits of OpenCV's coordinates
+        cv2.fillPoly(mask, [np.round(points * 2**shift).astype(np.int32)], 1, shift=shift)
+        if not mask.any():
+            raise RegionError(f"the polygon {points.tolist()} does not overlap the image of {shape[1]} x {shape[0]} px")
+        return cls(mask=mask.astype(bool))
+
+    @classmethod
+    def from_mask(cls, mask: npt.ArrayLike, shape: tuple[int, int] | None = None) -> Region:
+        """Non-zero pixels of a mask image (H, W); `shape`, where given, is the size it must have.
+
+        Raises
+        ------
+        RegionError
+            The mask is empty or of another size.
+        """
+        pixels = np.asarray(mask)
+        if shape is not None and pixels.shape != shape:
+            raise RegionError(f"the mask is {pixels.shape[::-1]} px (width, height), the images are {shape[::-1]}")
+        return cls(mask=pixels != 0)
