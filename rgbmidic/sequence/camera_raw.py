@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["MAXIMUM_FLAT_ROWS", "camera_raw_shape", "read_camera_raw"]
 
 MAXIMUM_FLAT_ROWS = 0.01
-"""Share of rows without any noise above which a camera raw counts as not decoded."""
+"""Share of rows without any noise above which a camera raw counts as not decoded: defective rows may exist."""
 
 _CAMERA_HEADERS = (
     *(b"II*\0", b"MM\0*"),  # TIFF: DNG, NEF, CR2, ARW, PEF, KDC, ...
@@ -44,7 +46,7 @@ def read_camera_raw(path: Path) -> FileContents:
     structure = RawStructure.read(path)
     with _open(path) as raw:
         cell = _colour_cell(raw, path)
-        values = _decoded(raw, path)
+        values = np.array(raw.raw_image_visible, dtype=np.uint16)
         black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
         white, margins, names = float(raw.white_level), raw.sizes, _names(raw, cell)
         monochrome = raw.num_colors == 1
@@ -62,13 +64,16 @@ def camera_raw_shape(path: Path) -> tuple[int, int]:
         return int(raw.sizes.height), int(raw.sizes.width)
 
 
-def _open(path: Path) -> rawpy.RawPy:
+@contextmanager
+def _open(path: Path) -> Iterator[rawpy.RawPy]:
+    """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError."""
     import rawpy
 
     if not _has_camera_header(path):
         raise _unsupported(path)
     try:
-        return rawpy.imread(str(path))
+        with rawpy.imread(str(path)) as raw:
+            yield raw
     except rawpy.LibRawFileUnsupportedError:
         raise _unsupported(path) from None
     except rawpy.LibRawError as error:
@@ -92,15 +97,6 @@ def _unsupported(path: Path) -> FrameError:
 def _undecodable(path: Path, error: Exception) -> FrameError:
     text = error.args[0] if error.args else type(error).__name__
     return damaged(path, f"LibRaw says: {text.decode(errors='replace') if isinstance(text, bytes) else text}")
-
-
-def _decoded(raw: rawpy.RawPy, path: Path) -> npt.NDArray[np.uint16]:
-    import rawpy
-
-    try:
-        return np.array(raw.raw_image_visible, dtype=np.uint16)
-    except rawpy.LibRawError as error:
-        raise _undecodable(path, error) from None
 
 
 def _colour_cell(raw: rawpy.RawPy, path: Path) -> npt.NDArray[Any]:
@@ -140,5 +136,5 @@ def _check_filled(
     if stored_as_is:
         flat &= (highest == 0) & (black.min() > 0)
     share = float(flat.mean())
-    if share > MAXIMUM_FLAT_ROWS:
-        raise damaged(path, f"{share:.0%} of its rows are empty (one single value, {highest[flat][-1]} in the last)")
+    if flat[-1] or share > MAXIMUM_FLAT_ROWS:
+        raise damaged(path, f"{share:.1%} of its rows are empty (one single value, {highest[flat][-1]} in the last)")

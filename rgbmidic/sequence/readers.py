@@ -13,7 +13,7 @@ from rgbmidic.config import FrameKind
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.illumination.mosaic import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.sequence.camera_raw import camera_raw_shape, read_camera_raw
-from rgbmidic.sequence.contents import FileContents
+from rgbmidic.sequence.contents import FileContents, damaged
 from rgbmidic.sequence.pictures import png_shape, read_headerless, read_png, read_tiff, tiff_shape
 from rgbmidic.sequence.tiff_structure import is_dng
 
@@ -119,7 +119,9 @@ def _is_headerless(path: Path, shape: tuple[int, int] | None) -> bool:
 
 def _check_exists(path: Path) -> None:
     if not path.is_file():
-        raise FrameError(f"frame file not found: {path}" if not path.exists() else f"not a file but a folder: {path}")
+        raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
+    if path.stat().st_size == 0:
+        raise damaged(path, "it is empty")
 
 
 def _from_disk(read: Callable[[Path], _T], path: Path) -> _T:
