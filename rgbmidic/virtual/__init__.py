@@ -1,0 +1,33 @@
+"""Virtual experiments: ray-traced painted bodies under coloured lights, seen by a colour camera, with exact truth."""
+
+from rgbmidic.virtual.camera import Camera, record
+from rgbmidic.virtual.light import Light
+from rgbmidic.virtual.rendering import material_points, render, truth
+from rgbmidic.virtual.scene import AffineField, Cylinder, Plate, Scene, Sphere, State
+from rgbmidic.virtual.scenes import plate_scene, sphere_scene, strained_plate, turned
+from rgbmidic.virtual.spectra import Led, Sensitivities
+from rgbmidic.virtual.surface import Finish, Surface, height_map
+
+__all__ = [
+    "AffineField",
+    "Camera",
+    "Cylinder",
+    "Finish",
+    "Led",
+    "Light",
+    "Plate",
+    "Scene",
+    "Sensitivities",
+    "Sphere",
+    "State",
+    "Surface",
+    "height_map",
+    "material_points",
+    "plate_scene",
+    "record",
+    "render",
+    "sphere_scene",
+    "strained_plate",
+    "truth",
+    "turned",
+]

@@ -1,0 +1,230 @@
+"""Images of a scene: every pixel traced back to the paint, so that a deformed image is exact and never a warped one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import erf
+
+from rgbmidic._kernels.render import filter_columns, trace_rows
+from rgbmidic.errors import InputError
+from rgbmidic.virtual.light import NOMINAL_DISTANCE, Light
+from rgbmidic.virtual.scene import AffineField, InPlaneField, Plate, Scene, State
+
+__all__ = ["material_points", "render", "truth"]
+
+Array = npt.NDArray[np.float64]
+BAND = 64
+"""Pixel rows traced at a time: bounds the memory."""
+LONGEST_STEP = 0.25
+"""Motion (px) between two of the poses over which a moving body is averaged."""
+INVERSION_TOLERANCE = 1e-8
+"""Accuracy (mm) of the material point found from a spatial one."""
+
+
+def render(scene: Scene, state: State | None = None) -> npt.NDArray[np.float32]:
+    """What each light alone gives, without noise.
+
+    Parameters
+    ----------
+    scene
+        Body, paint, lights and camera.
+    state
+        Where the body is; None: the reference.
+
+    Returns
+    -------
+    ndarray, shape (k, H, W)
+        DN above black in the channel that sees the light best, neither quantised nor clipped; 0 off the body.
+    """
+    state = state or State()
+    poses = _poses_during_exposure(scene, state)
+    out = _trace(scene, poses[0])
+    for pose in poses[1:]:
+        out += _trace(scene, pose)
+    return out * np.float32(1 / len(poses))
+
+
+def material_points(scene: Scene, state: State | None = None) -> Array:
+    """Material point (mm, body axes) seen at the centre of every pixel by an ideal lens, shape (3, H, W); NaN off it."""
+    state = state or State()
+    x, y = np.meshgrid(np.arange(scene.camera.shape[1], dtype=float), np.arange(scene.camera.shape[0], dtype=float))
+    spatial = _intersect(scene, state, x, y)
+    if isinstance(scene.body, Plate):
+        spatial[:2] = _to_material(spatial[:2], state.displacement)
+        spatial[2] = np.where(np.isfinite(spatial[0]), 0.0, np.nan)
+        outside = (abs(spatial[0]) > scene.body.width / 2) | (abs(spatial[1]) > scene.body.height / 2)
+        spatial[:, outside] = np.nan
+    return spatial
+
+
+def truth(scene: Scene, state: State, reference: State | None = None) -> Array:
+    """Exact displacement of the material point seen at every pixel of the reference image.
+
+    Parameters
+    ----------
+    scene
+        Body, paint, lights and camera.
+    state
+        The deformed state.
+    reference
+        State of the reference image; None: the scene's rest.
+
+    Returns
+    -------
+    ndarray, shape (2, H, W)
+        (u, v) in px; NaN where the pixel is not on the body or the point is hidden in `state`. Points that leave the
+        frame keep their displacement.
+    """
+    material = material_points(scene, reference)
+    position = material.copy()
+    if isinstance(scene.body, Plate) and state.displacement is not None:
+        ux, uy = state.displacement(material[0], material[1])
+        position[0] += ux
+        position[1] += uy
+    turn, origin = state.pose(scene.body)
+    point = np.einsum("ij,jyx->iyx", turn, position) + origin[:, None, None]
+    normal = np.einsum("ij,jyx->iyx", turn, _normals(scene, material))
+    hidden = ~((normal * point).sum(axis=0) < 0)
+    camera = scene.camera
+    x = camera.focal_px * point[0] / point[2] + camera.centre[0] - np.arange(camera.shape[1])
+    y = camera.focal_px * point[1] / point[2] + camera.centre[1] - np.arange(camera.shape[0])[:, None]
+    return np.where(hidden, np.nan, np.stack([x, y]))
+
+
+def _poses_during_exposure(scene: Scene, state: State) -> list[State]:
+    """States at the middles of equal parts of the exposure, each shorter than `LONGEST_STEP` px of motion."""
+    duration = scene.camera.exposure_time
+    if duration == 0 or not state.moves:
+        return [state]
+    swept = truth(scene, state.after(duration / 2), state.after(-duration / 2))
+    finite = np.isfinite(swept[0])
+    length = float(np.hypot(swept[0], swept[1])[finite].max()) if finite.any() else 0.0
+    parts = max(1, math.ceil(length / LONGEST_STEP))
+    return [state.after(duration * ((i + 0.5) / parts - 0.5)) for i in range(parts)]
+
+
+def _trace(scene: Scene, state: State) -> npt.NDArray[np.float32]:
+    """One pose: lights that the lens images alike are traced together."""
+    out = np.empty((len(scene.lights), *scene.camera.shape), dtype=np.float32)
+    groups: dict[tuple[float, float, float], list[int]] = {}
+    for index, light in enumerate(scene.lights):
+        groups.setdefault((light.magnification, *light.shift), []).append(index)
+    for indices in groups.values():
+        out[indices] = _trace_together(scene, state, tuple(scene.lights[index] for index in indices))
+    camera = scene.camera
+    levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
+    out *= levels.astype(np.float32)[:, None, None]
+    return out
+
+
+def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> npt.NDArray[np.float32]:
+    camera, n = scene.camera, scene.camera.samples
+    turn, origin = state.pose(scene.body)
+    frame = np.concatenate([-turn.T @ origin, turn.T.ravel()])
+    positions = np.array([[*(turn.T @ (np.array(li.position) - origin)), li.power * NOMINAL_DISTANCE**2] for li in lights])
+    lens = np.array([camera.focal_px, *camera.centre, lights[0].magnification, *lights[0].shift])
+    affine = _affine(state.displacement)
+    pad, taps = _aperture(camera.lens_blur, n)
+    height, width = camera.shape
+    out = np.empty((len(lights), height, width), dtype=np.float32)
+    for top in range(0, height, BAND):
+        bottom = min(top + BAND, height)
+        rows = np.empty((len(lights), n * (bottom - top + 2 * pad), width), dtype=np.float32)
+        first = n * (top - pad)
+        material = np.empty((0, 0, 2))
+        if affine is None:
+            material = _subpixel_material(scene, state, lights[0], first, rows.shape[1], pad)
+        body, identity = scene.body._parameters(), np.array([1.0, 0, 0, 1, 0, 0])
+        trace_rows(
+            rows, first, n, taps, pad, lens, frame, body, identity if affine is None else affine, material, positions,
+            *scene.surface.parameters(),
+        )  # fmt: skip
+        filter_columns(out[:, top:bottom], rows, n, taps)
+    return out
+
+
+def _affine(field: InPlaneField | None) -> Array | None:
+    """The inverse of an affine in-plane displacement; None for any other field."""
+    field = AffineField() if field is None else field
+    return field.inverse() if isinstance(field, AffineField) else None
+
+
+def _aperture(blur: float, samples: int) -> tuple[int, Array]:
+    """Pixels of margin and weights of the sub-pixel samples: square pixel aperture convolved with the lens blur."""
+    pad = math.ceil(4 * blur)
+    offset = (np.arange(samples * (2 * pad + 1)) + 0.5) / samples - 0.5 - pad
+    if blur == 0:
+        weights = np.ones(offset.size)
+    else:
+        scale = 1 / (math.sqrt(2) * blur)
+        weights = erf((offset + 0.5) * scale) - erf((offset - 0.5) * scale)
+    return pad, weights / weights.sum()
+
+
+def _subpixel_material(scene: Scene, state: State, light: Light, first: int, rows: int, pad: int) -> Array:
+    """Material point (rows, columns, 2) of every sub-pixel sample; NaN off the plate."""
+    n, camera = scene.camera.samples, scene.camera
+    zoom = 1 + light.magnification
+    x = (np.arange(n * (camera.shape[1] + 2 * pad)) + 0.5) / n - 0.5 - pad
+    y = (np.arange(first, first + rows) + 0.5) / n - 0.5
+    x = (x - camera.centre[0] - light.shift[0]) / zoom + camera.centre[0]
+    y = (y - camera.centre[1] - light.shift[1]) / zoom + camera.centre[1]
+    spatial = _intersect(scene, state, *np.meshgrid(x, y))
+    return np.ascontiguousarray(np.moveaxis(_to_material(spatial[:2], state.displacement), 0, -1))
+
+
+def _intersect(scene: Scene, state: State, x: Array, y: Array) -> Array:
+    """Point (3, ...) in body axes where the rays through image points (px) meet the body's front; NaN beside it."""
+    camera, (turn, origin) = scene.camera, state.pose(scene.body)
+    rays = np.stack([(x - camera.centre[0]) / camera.focal_px, (y - camera.centre[1]) / camera.focal_px, np.ones_like(x)])
+    direction = np.einsum("ji,j...->i...", turn, rays)
+    start = -turn.T @ origin
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if isinstance(scene.body, Plate):
+            distance = -start[2] / direction[2]
+        else:
+            axes = [0, 1, 2] if scene.body._parameters()[0] == 2 else [0, 2]
+            a = (direction[axes] ** 2).sum(axis=0)
+            b = np.einsum("i,i...->...", start[axes], direction[axes])
+            c = (start[axes] ** 2).sum() - scene.body.radius**2
+            distance = (-b - np.sqrt(b * b - a * c)) / a
+        distance = np.where(distance > 0, distance, np.nan)
+    point = start.reshape(3, *[1] * x.ndim) + distance * direction
+    limits = scene.body._parameters()[2:]
+    if not isinstance(scene.body, Plate):
+        point[:, abs(point[1]) > limits[1]] = np.nan
+    return np.asarray(point)
+
+
+def _to_material(spatial: Array, field: InPlaneField | None) -> Array:
+    """Material points X of a plate with X + u(X) = x, by fixed-point iteration (a contraction: strains are < 1)."""
+    if field is None:
+        return spatial
+    if isinstance(field, AffineField):
+        m = field.inverse()
+        return np.stack([m[0] * spatial[0] + m[1] * spatial[1] + m[4], m[2] * spatial[0] + m[3] * spatial[1] + m[5]])
+    material = spatial
+    for _ in range(100):
+        following = spatial - np.stack(field(material[0], material[1]))
+        change = np.abs(following - material)
+        material = following
+        if not (change > INVERSION_TOLERANCE).any():
+            return material
+    raise InputError("the plate's displacement field cannot be inverted: its gradient must stay below 1 everywhere")
+
+
+def _normals(scene: Scene, material: Array) -> Array:
+    """Outward unit normals (3, H, W) in body axes."""
+    normal = np.zeros_like(material)
+    if isinstance(scene.body, Plate):
+        normal[2] = -1.0
+        return normal
+    normal = material / scene.body.radius
+    if scene.body._parameters()[0] == 1:
+        normal[1] = 0.0
+    return normal
+
+
