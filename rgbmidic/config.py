@@ -6,15 +6,19 @@ Paths in the file are relative to the file. Only ``frames.path``, a region and, 
 
 from __future__ import annotations
 
+import difflib
+import math
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from rgbmidic.errors import ConfigurationError
 
 __all__ = [
+    "BAYER_PATTERNS",
     "FrameKind",
     "FrameSettings",
     "IlluminationSettings",
@@ -23,9 +27,18 @@ __all__ = [
     "SolverSettings",
     "TestSettings",
     "WeightSettings",
+    "read_test",
 ]
 
 FrameKind = Literal["bayer", "rgb", "monochrome"]
+
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+"""The four phases of the Bayer colour filter array, named by the top-left 2x2 cell read row by row."""
+
+
+def _bounded(default: Any, **bounds: float) -> Any:
+    """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`."""
+    return field(default=default, metadata={"bounds": bounds})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,11 +62,29 @@ class FrameSettings:
     path: tuple[str, ...]
     kind: FrameKind | None = None
     cfa: str | None = None
-    black_level: float | None = None
-    white_level: float | None = None
-    reference: tuple[int, ...] = (0,)
-    shape: tuple[int, int] | None = None
+    black_level: float | None = _bounded(None, at_least=0)
+    white_level: float | None = _bounded(None, above=0)
+    reference: tuple[int, ...] = _bounded((0,), at_least=0)
+    shape: tuple[int, int] | None = _bounded(None, at_least=1)
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
+
+    def __post_init__(self) -> None:
+        _check_bounds(self, "frames")
+        if not self.path or not all(self.path):
+            raise ConfigurationError("frames.path must name the frame files")
+        if len(self.path) > 1 and self.kind != "monochrome":
+            raise ConfigurationError(
+                f"frames.path with {len(self.path)} entries means as many lights fired in succession before a "
+                'monochrome camera: state kind = "monochrome", or give a single path'
+            )
+        if not self.reference or len(set(self.reference)) < len(self.reference):
+            raise ConfigurationError(f"frames.reference must name different frames, not {list(self.reference)}")
+        if self.cfa is not None and self.cfa.upper() not in BAYER_PATTERNS:
+            raise ConfigurationError(f'frames.cfa must be one of {", ".join(BAYER_PATTERNS)}, not "{self.cfa}"')
+        if self.black_level is not None and self.white_level is not None and self.white_level <= self.black_level:
+            raise ConfigurationError(
+                f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,6 +112,20 @@ class RegionSettings:
     polygon: tuple[tuple[float, float], ...] | None = None
     mask: Path | None = None
 
+    def __post_init__(self) -> None:
+        _check_bounds(self, "region")
+        kinds = [entry.name for entry in fields(self)]
+        if (stated := sum(getattr(self, kind) is not None for kind in kinds)) != 1:
+            raise ConfigurationError(f"[region] needs exactly one of {', '.join(kinds)}; given are {stated}")
+        if self.rectangle is not None and not (
+            self.rectangle[0] < self.rectangle[2] and self.rectangle[1] < self.rectangle[3]
+        ):
+            raise ConfigurationError(
+                f"region.rectangle is [x0, y0, x1, y1] with x0 < x1 and y0 < y1, not {list(self.rectangle)}"
+            )
+        if self.polygon is not None and len(self.polygon) < 3:
+            raise ConfigurationError(f"region.polygon needs at least three corners [x, y], not {len(self.polygon)}")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeightSettings:
@@ -97,8 +142,11 @@ class WeightSettings:
     """
 
     method: Literal["threshold", "none"] = "threshold"
-    threshold: float = 2 / 3
-    blur: float = 10.0
+    threshold: float = _bounded(2 / 3, above=0, at_most=1)
+    blur: float = _bounded(10.0, at_least=0)
+
+    def __post_init__(self) -> None:
+        _check_bounds(self, "weights")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,31 +170,228 @@ class SolverSettings:
 
     prefilter: Literal["none", "binomial", "gaussian"] | None = None
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
-    search_radius: float = 64.0
-    tolerance: float = 1e-3
-    max_iterations: int = 50
+    search_radius: float = _bounded(64.0, at_least=0)
+    tolerance: float = _bounded(1e-3, above=0)
+    max_iterations: int = _bounded(50, at_least=1)
+
+    def __post_init__(self) -> None:
+        _check_bounds(self, "solver")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleSettings:
-    """Physical units (``[scale]``)."""
+    """Physical units (``[scale]``): millimetres per pixel, frames per second; None where not known."""
 
-    mm_per_pixel: float | None = None
-    frame_rate: float | None = None
+    mm_per_pixel: float | None = _bounded(None, above=0)
+    frame_rate: float | None = _bounded(None, above=0)
+
+    def __post_init__(self) -> None:
+        _check_bounds(self, "scale")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TestSettings:
-    """Everything `rgbmidic.pipeline.measure` needs to know about a test."""
+    """Everything `rgbmidic.pipeline.measure` needs to know about a test.
+
+    Attributes
+    ----------
+    frames, region, illumination, weights, solver, scale
+        The sections of the same name.
+    calibration_file
+        ``file`` in ``[calibration]``; needed for colour frames.
+    element_size
+        ``element_size`` in ``[mesh]``: side of the elements in px.
+    base
+        Folder that relative paths start from.
+    """
 
     __test__ = False
 
     frames: FrameSettings
     region: RegionSettings
-    calibration_file: Path | None = None
-    element_size: float = 25.0
+    calibration_file: Path | None = field(default=None, metadata={"key": "calibration.file"})
+    element_size: float = field(default=25.0, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
     illumination: IlluminationSettings = field(default_factory=IlluminationSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
     scale: ScaleSettings = field(default_factory=ScaleSettings)
-    base: Path = field(default_factory=Path)
+    base: Path = field(default_factory=Path, metadata={"key": ""})
+
+    def __post_init__(self) -> None:
+        _check_bounds(self, "")
+        if self.frames.kind in ("bayer", "rgb") and self.calibration_file is None:
+            raise ConfigurationError(
+                f'frames.kind = "{self.frames.kind}" needs the lights\' crosstalk: state calibration.file, a file that '
+                "rgbmidic-calibrate writes"
+            )
+
+    @classmethod
+    def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:
+        """Build the settings from sections of plain values, as TOML gives them.
+
+        Parameters
+        ----------
+        document
+            Section name to its keys and values.
+        base
+            Folder that relative paths start from.
+
+        Raises
+        ------
+        ConfigurationError
+            A section or key is unknown, missing, of the wrong type, out of range, or contradicts another.
+        """
+        base = Path(base).resolve()
+        sections = _sections(cls)
+        _check_names(document, sections, "section", "the file")
+        values: dict[str, Any] = {"base": base}
+        for name, content in document.items():
+            if not isinstance(content, Mapping):
+                raise ConfigurationError(f"[{name}] must be a section with keys, not {content!r}")
+            _check_names(content, sections[name], "key", f"[{name}]")
+            given = {key: _convert(content[key], sections[name][key], f"{name}.{key}", base) for key in content}
+            values |= _placed(cls, name, given)
+        missing = [entry.name for entry in fields(cls) if _is_required(entry) and entry.name not in values]
+        if missing:
+            raise ConfigurationError(f"the section [{missing[0]}] is missing")
+        return cls(**values)
+
+    def to_mapping(self) -> dict[str, dict[str, Any]]:
+        """The settings as sections of plain values, defaults included, without `base` and what is not known.
+
+        ``TestSettings.from_mapping(settings.to_mapping(), settings.base)`` gives the settings back.
+        """
+        document: dict[str, dict[str, Any]] = {}
+        for entry in fields(self):
+            section, key = _place(entry)
+            value = getattr(self, entry.name)
+            if is_dataclass(value):
+                plain = {part.name: _plain(getattr(value, part.name)) for part in fields(value)}
+                document[section] = {name: content for name, content in plain.items() if content is not None}
+            elif section and value is not None:
+                document.setdefault(section, {})[key] = _plain(value)
+        return document
+
+
+def read_test(path: Path | str) -> TestSettings:
+    """Read the settings of a test from a TOML file; paths in it are relative to it.
+
+    Raises
+    ------
+    ConfigurationError
+        The file is missing, not TOML, or has an entry that `TestSettings.from_mapping` refuses; the file is named.
+    """
+    path = Path(path)
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise ConfigurationError(f"settings file not found: {path}") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigurationError(f"{path} is not a readable settings file (TOML): {error}") from None
+    try:
+        return TestSettings.from_mapping(document, path.parent)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{path}: {error}") from None
+
+
+def _place(entry: Field[Any]) -> tuple[str, str]:
+    """Section and key that a field of `TestSettings` comes from; a whole section has no key, `base` has neither."""
+    section, _, key = entry.metadata.get("key", entry.name).partition(".")
+    return section, key
+
+
+def _is_required(entry: Field[Any]) -> bool:
+    return entry.default is MISSING and entry.default_factory is MISSING
+
+
+def _sections(settings: type[TestSettings]) -> dict[str, dict[str, Any]]:
+    """For every section its keys with the types of their values."""
+    hints = get_type_hints(settings)
+    sections: dict[str, dict[str, Any]] = {}
+    for entry in fields(settings):
+        section, key = _place(entry)
+        if key:
+            sections.setdefault(section, {})[key] = hints[entry.name]
+        elif section:
+            sections[section] = get_type_hints(hints[entry.name])
+    return sections
+
+
+def _placed(settings: type[TestSettings], section: str, given: dict[str, Any]) -> dict[str, Any]:
+    """Values of a section as arguments of `TestSettings`: one settings object, or the fields that the keys name."""
+    hints = get_type_hints(settings)
+    if section not in hints:
+        places = {_place(entry): entry.name for entry in fields(settings)}
+        return {places[section, key]: value for key, value in given.items()}
+    missing = [entry.name for entry in fields(hints[section]) if _is_required(entry) and entry.name not in given]
+    if missing:
+        raise ConfigurationError(f"{section}.{missing[0]} is missing")
+    return {section: hints[section](**given)}
+
+
+def _check_names(given: Iterable[str], allowed: Iterable[str], what: str, where: str) -> None:
+    allowed = list(allowed)
+    for name in given:
+        if name not in allowed:
+            close = difflib.get_close_matches(name, allowed, n=1)
+            hint = f' (did you mean "{close[0]}"?)' if close else ""
+            raise ConfigurationError(f'unknown {what} "{name}" in {where}{hint}; allowed are {", ".join(allowed)}')
+
+
+_WORDS = {float: "a number", int: "a whole number", str: "a text in quotes", Path: "a file name in quotes"}
+
+
+def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
+    """A value of the file as the type that the field states; what does not fit is an error that names the key."""
+    origin, kinds = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):  # X | None: a file states no None
+        return _convert(value, kinds[0], where, base)
+    if origin is tuple:
+        return _convert_list(value, kinds, where, base)
+    if origin is Literal:
+        if value in kinds:
+            return value
+        raise ConfigurationError(f"{where} must be one of {', '.join(map(_quoted, kinds))}, not {_quoted(value)}")
+    if hint is Path and isinstance(value, str):
+        return base / value
+    if (hint is float and type(value) is int) or type(value) is hint:
+        return hint(value)
+    raise ConfigurationError(f"{where} must be {_WORDS[hint]}, not {_quoted(value)}")
+
+
+def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path) -> tuple[Any, ...]:
+    if len(kinds) == 2 and kinds[1] is Ellipsis:
+        entries = value if isinstance(value, list | tuple) else [value]  # a single one needs no brackets
+        return tuple(_convert(entry, kinds[0], where, base) for entry in entries)
+    if not isinstance(value, list | tuple) or len(value) != len(kinds):
+        raise ConfigurationError(f"{where} must be {len(kinds)} values in brackets, not {_quoted(value)}")
+    return tuple(_convert(entry, kind, where, base) for entry, kind in zip(value, kinds, strict=True))
+
+
+def _quoted(value: Any) -> str:
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _check_bounds(settings: Any, section: str) -> None:
+    for entry in fields(settings):
+        value = getattr(settings, entry.name)
+        where = entry.metadata.get("key", f"{section}.{entry.name}")
+        for number in _numbers(value):
+            if not math.isfinite(number):
+                raise ConfigurationError(f"{where} must be finite, not {number}")
+            for bound, limit in entry.metadata.get("bounds", {}).items():
+                kept = {"above": number > limit, "at_least": number >= limit, "at_most": number <= limit}[bound]
+                if not kept:
+                    raise ConfigurationError(f"{where} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, tuple):
+        return [number for entry in value for number in _numbers(entry)]
+    return [value] if isinstance(value, int | float) else []

@@ -1,4 +1,4 @@
-"""Raw frames as the camera recorded them, and their linearised form (first step of the chain in docs/conventions.md)."""
+"""Raw frames as the camera recorded them, and their linearised form: the first step of docs/conventions.md."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.config import BAYER_PATTERNS
 from rgbmidic.errors import InputError
 
 __all__ = [
@@ -20,9 +21,6 @@ __all__ = [
     "linearise",
     "shift_cfa",
 ]
-
-BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-"""The four phases of the Bayer colour filter array, named by the top-left 2x2 cell read row by row."""
 
 
 def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
@@ -72,7 +70,8 @@ class NoiseModel:
 
     def variance(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
         """Variance (DN squared) of samples whose linearised values (DN above black) are `values`."""
-        return self.read_noise**2 + np.maximum(values, 0) / self.gain
+        variance: npt.NDArray[np.floating] = self.read_noise**2 + np.maximum(values, 0) / self.gain
+        return variance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
