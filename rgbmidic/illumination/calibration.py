@@ -35,13 +35,16 @@ class Crosstalk:
     matrix : ndarray, shape (C, k)
         A in ``channels = A @ lights``; the largest entry of every column is 1.
     lights : tuple of str, length k
+    covariance : ndarray, shape (C k, C k), or None
+        Covariance of the entries, taken row by row (``matrix.ravel()``).
     std : ndarray, shape (C, k), or None
-        Standard uncertainty of every entry.
+        Standard uncertainty of every entry; from the covariance where that is given.
     """
 
     matrix: npt.NDArray[np.float64]
     lights: tuple[str, ...]
     std: npt.NDArray[np.float64] | None = None
+    covariance: npt.NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         matrix = np.asarray(self.matrix, dtype=np.float64)
@@ -59,8 +62,13 @@ class Crosstalk:
                 "two lights look the same to the camera"
             )
         object.__setattr__(self, "matrix", matrix)
-        if self.std is not None:
-            object.__setattr__(self, "std", np.asarray(self.std, dtype=np.float64).reshape(matrix.shape))
+        std = self.std
+        if self.covariance is not None:
+            covariance = _square(self.covariance, matrix.size, "the covariance of the crosstalk matrix")
+            object.__setattr__(self, "covariance", covariance)
+            std = np.sqrt(np.diag(covariance))
+        if std is not None:
+            object.__setattr__(self, "std", np.asarray(std, dtype=np.float64).reshape(matrix.shape))
 
     @classmethod
     def identity(cls, lights: tuple[str, ...]) -> Crosstalk:
@@ -70,7 +78,7 @@ class Crosstalk:
     @property
     def unmixing(self) -> npt.NDArray[np.float64]:
         """The matrix (k, C) that turns channels into lights: the (pseudo-)inverse of A."""
-        return np.linalg.pinv(self.matrix)
+        return np.asarray(np.linalg.pinv(self.matrix), dtype=np.float64)
 
     @property
     def condition_number(self) -> float:
@@ -80,7 +88,7 @@ class Crosstalk:
     @property
     def noise_amplification(self) -> npt.NDArray[np.float64]:
         """Noise of each light's image over the noise of one camera channel, shape (k,)."""
-        return np.sqrt((self.unmixing**2).sum(axis=1))
+        return np.asarray(np.sqrt((self.unmixing**2).sum(axis=1)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,7 +154,12 @@ class Calibration:
         noise = document.get("noise")
         return cls(
             crosstalk=crosstalk
-            and Crosstalk(matrix=crosstalk["matrix"], lights=tuple(crosstalk["lights"]), std=crosstalk.get("std")),
+            and Crosstalk(
+                matrix=crosstalk["matrix"],
+                lights=tuple(crosstalk["lights"]),
+                std=crosstalk.get("std"),
+                covariance=crosstalk.get("covariance"),
+            ),
             noise=noise and NoiseModel(gain=_positive(noise, "gain"), read_noise=_positive(noise, "read_noise")),
             cfa=cfa,
             black_level=camera.get("black_level"),
@@ -165,6 +178,7 @@ class Calibration:
                 "lights": list(crosstalk.lights),
                 "matrix": crosstalk.matrix.tolist(),
                 "std": None if crosstalk.std is None else crosstalk.std.tolist(),
+                "covariance": None if crosstalk.covariance is None else crosstalk.covariance.tolist(),
                 "condition_number": crosstalk.condition_number,
                 "noise_amplification": crosstalk.noise_amplification.tolist(),
             }
@@ -178,6 +192,13 @@ class Calibration:
         temporary = path.with_name(path.name + ".part")
         temporary.write_text(json.dumps(self.to_document(), indent=2) + "\n", encoding="utf-8")
         temporary.replace(path)
+
+
+def _square(values: npt.ArrayLike, size: int, name: str) -> npt.NDArray[np.float64]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (size, size) or not np.isfinite(array).all() or (np.diag(array) < 0).any():
+        raise CalibrationError(f"{name} must be {size} x {size} finite numbers with no negative variance")
+    return array
 
 
 def _positive(section: dict[str, Any], key: str) -> float:

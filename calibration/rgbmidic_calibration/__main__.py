@@ -1,0 +1,5 @@
+"""``python -m rgbmidic_calibration``: the same as the command `rgbmidic-calibrate`."""
+
+from rgbmidic_calibration.cli import main
+
+main()

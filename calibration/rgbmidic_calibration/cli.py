@@ -1,0 +1,84 @@
+"""The command `rgbmidic-calibrate`: thin, the science is in the library."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rgbmidic.errors import RgbmidicError
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    help="Calibrate a colour camera and its lamps for rgbmidic. The laboratory procedure: calibration/README.md.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Cfa = Annotated[
+    str | None, typer.Option(help="Bayer pattern RGGB, BGGR, GRBG or GBRG, where the files do not tell it.")
+]
+Black = Annotated[float | None, typer.Option(help="Black level in DN, where the files do not tell it.")]
+White = Annotated[float | None, typer.Option(help="Saturation level in DN, where the files do not tell it.")]
+Kind = Annotated[str | None, typer.Option(help="bayer (default unless the files tell), or rgb for a 3-CCD camera.")]
+Shape = Annotated[str | None, typer.Option(help="ROWSxCOLUMNS of headerless files.")]
+Dtype = Annotated[str | None, typer.Option(help="Sample type of headerless files: uint8, uint16 or >u2.")]
+Out = Annotated[Path, typer.Option(help="Calibration file to write (JSON).")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing --out.")]
+Light = Annotated[list[str], typer.Option(help="NAME=FILES: captures with this light alone on. Once per light.")]
+Dark = Annotated[str | None, typer.Option(help="Captures with every lamp off (and the same ambient light).")]
+Allow = Annotated[list[str] | None, typer.Option(help="Waive a plausibility check by its name. May be repeated.")]
+
+
+def main() -> None:
+    """Run the command; an error of ours is one line and exit status 2, never a traceback."""
+    from rich.console import Console
+
+    try:
+        app(prog_name="rgbmidic-calibrate")
+    except RgbmidicError as error:
+        Console(stderr=True, soft_wrap=True).print(f"[bold red]error:[/] {_plain(str(error))}", highlight=False)
+        raise SystemExit(2) from None
+
+
+@app.callback()
+def _root() -> None:
+    """Calibrate a colour camera and its lamps for rgbmidic."""
+
+
+@app.command()
+def crosstalk(
+    light: Light,
+    out: Out = Path("calibration.json"),
+    dark: Dark = None,
+    cfa: Cfa = None,
+    black_level: Black = None,
+    white_level: White = None,
+    kind: Kind = None,
+    shape: Shape = None,
+    dtype: Dtype = None,
+    block: Annotated[int, typer.Option(help="Side of the blocks that are averaged, px.")] = 16,
+    allow: Allow = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """How strongly each camera channel sees each light: the matrix A in channels = A . lights."""
+    from rgbmidic_calibration import display, jobs
+    from rgbmidic_calibration.captures import check_output, named_patterns
+
+    check_output(out, overwrite=overwrite)
+    statement = jobs.statement(kind, cfa, black_level, white_level, shape, dtype)
+    calibration, estimate = jobs.calibrate_crosstalk(
+        named_patterns(light, "--light"), dark, statement, block=block, allow=tuple(allow or ())
+    )
+    calibration.write(out)
+    display.crosstalk(estimate, out)
+
+
+def _plain(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)

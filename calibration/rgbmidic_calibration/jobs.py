@@ -1,0 +1,107 @@
+"""From capture files to sections of a calibration: what the sub-commands do, without the printing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+from rgbmidic.config import FrameSettings
+from rgbmidic.errors import ConfigurationError
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic
+from rgbmidic_calibration.blocks import BlockMeans, block_means
+from rgbmidic_calibration.captures import CaptureFiles, provenance
+from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
+
+__all__ = ["calibrate_crosstalk", "find_groups", "statement"]
+
+KINDS = ("bayer", "rgb", "monochrome")
+DTYPES = ("uint8", "uint16", ">u2")
+
+
+def statement(
+    kind: str | None,
+    cfa: str | None,
+    black_level: float | None,
+    white_level: float | None,
+    shape: str | None = None,
+    dtype: str | None = None,
+) -> FrameSettings:
+    """What the options say about the files.
+
+    Raises
+    ------
+    ConfigurationError
+        An option has a value that is not allowed.
+    """
+    for option, value, allowed in (("--kind", kind, KINDS), ("--dtype", dtype, DTYPES)):
+        if value is not None and value not in allowed:
+            raise ConfigurationError(f"{option} is one of {', '.join(allowed)}, not {value!r}")
+    size = re.fullmatch(r"(\d+)[x,](\d+)", shape) if shape else None
+    if shape and not size:
+        raise ConfigurationError(f"--shape is ROWSxCOLUMNS, for instance 512x768, not {shape!r}")
+    rows_columns = (int(size[1]), int(size[2])) if size else None
+    try:
+        return FrameSettings(
+            path=("captures",),
+            kind=cast(Any, kind),
+            cfa=cfa,
+            black_level=black_level,
+            white_level=white_level,
+            shape=rows_columns,
+            dtype=cast(Any, dtype),
+        )
+    except ConfigurationError as error:
+        raise ConfigurationError(re.sub(r"frames\.(\w+)", _as_option, str(error))) from None
+
+
+def _as_option(key: re.Match[str]) -> str:
+    return "--" + key[1].replace("_", "-")
+
+
+def find_groups(
+    lights: Mapping[str, str], dark: str | None, told: FrameSettings
+) -> tuple[dict[str, CaptureFiles], CaptureFiles | None]:
+    """Files of every light and of the dark frames."""
+    found = {name: CaptureFiles.find(f"light {name}", pattern, told) for name, pattern in lights.items()}
+    return found, None if dark is None else CaptureFiles.find("dark", dark, told)
+
+
+def calibrate_crosstalk(
+    lights: Mapping[str, str],
+    dark: str | None,
+    told: FrameSettings,
+    *,
+    block: int = 16,
+    allow: Sequence[str] = (),
+) -> tuple[Calibration, CrosstalkEstimate]:
+    """Crosstalk section from capture files: patterns by light, pattern of the dark frames, what is stated of them."""
+    found, dark_files = find_groups(lights, dark, told)
+    first: list[Mosaic | ChannelFrame] = []
+    means = {name: _reduce(files, block, first) for name, files in found.items()}
+    dark_means = _reduce(dark_files, block, first) if dark_files else []
+    groups = [*found.values(), *([dark_files] if dark_files else [])]
+    estimate = estimate_crosstalk(
+        means, dark_means, allow=allow, labels={group.role.removeprefix("light "): group.labels for group in groups}
+    )
+    details = {"block": block, "waived_checks": list(allow), "warnings": list(estimate.warnings)}
+    frame = first[0]
+    calibration = Calibration(
+        crosstalk=estimate.crosstalk,
+        cfa=frame.cfa if isinstance(frame, Mosaic) else None,
+        black_level=float(frame.black_level.mean()),
+        white_level=frame.white_level,
+        provenance={"crosstalk": provenance("crosstalk", groups, details)},
+    )
+    return calibration, estimate
+
+
+def _reduce(files: CaptureFiles, block: int, first: list[Mosaic | ChannelFrame]) -> list[BlockMeans]:
+    """Block averages of every file; the first frame of all is kept for its levels."""
+    means = []
+    for frame in files.frames():
+        if not first:
+            first.append(frame)
+        means.append(block_means(frame, block=block))
+    return means

@@ -1,0 +1,315 @@
+"""Checks that keep a mistake with lamps, files or settings from becoming a wrong crosstalk matrix.
+
+A check that fails is an error; the user who knows better waives it by name. What is merely worth knowing is a warning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import CalibrationError
+from rgbmidic_calibration.blocks import BlockMeans
+
+if TYPE_CHECKING:
+    from rgbmidic_calibration.crosstalk import LightFit
+
+__all__ = ["CHECKS", "check_captures", "check_matrix"]
+
+Floats = npt.NDArray[np.float64]
+Labels = Mapping[str, Sequence[str]]
+
+CHECKS = {
+    "name": "a light named red, green or blue is seen best by the channel of that colour",
+    "same-channel": "no two lights are seen best by the same channel",
+    "ambient": "the dark frames are dark",
+    "greens": "the two green planes of the mosaic agree",
+    "weak": "every light gives enough signal",
+    "captures": "the captures of one light agree in colour",
+    "dark-frames": "the dark frames agree with each other",
+    "white-level": "no samples pile up below the white level",
+}
+
+COLOURS = ("red", "green", "blue")
+
+DARK_SHARE_LIMIT = 0.10
+"""Dark frames brighter than this share of the weakest light's own signal are not dark."""
+DARK_SCALE_LIMIT = 0.05
+"""Dark frames brighter than this share of the full scale are not dark."""
+DARK_WARNING = 0.005
+GREENS_LIMIT, GREENS_WARNING = 0.08, 0.03
+WEAK_LIMIT, WEAK_WARNING = 0.01, 0.10
+COLOUR_LIMIT = 0.02
+"""A capture whose entry departs by more than this from the median of its light is another picture."""
+DETAIL_LIMIT = 0.6
+INTENSITY_WARNING = 0.05
+COLOUR_DRIFT_WARNING = 5e-4
+CONDITION_WARNING = 6.0
+
+
+def check_captures(
+    lights: Mapping[str, Sequence[BlockMeans]],
+    dark: Sequence[BlockMeans],
+    *,
+    allow: Sequence[str],
+    labels: Labels,
+) -> list[str]:
+    """Check the captures before anything is fitted.
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    CalibrationError
+        A check that is not waived by `allow` fails.
+    """
+    _check_presence(lights)
+    _check_sizes({**lights, "dark": dark}, labels)
+    warnings: list[str] = []
+
+    def report(check: str, message: str) -> None:
+        if check not in allow:
+            raise CalibrationError(f"{message} (--allow {check} goes on all the same)")
+        warnings.append(message)
+
+    warnings += _check_dark(lights, dark, labels, report)
+    level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
+    for name, captures in lights.items():
+        warnings += _check_signal(name, captures, level, report)
+        warnings += _check_greens(name, captures, level, report)
+        warnings += _check_agreement(name, captures, level, labels.get(name, ()), report)
+    return warnings
+
+
+def check_matrix(fits: Sequence[LightFit], *, allow: Sequence[str]) -> list[str]:
+    """Check the fitted columns: the right channel for each light's name, one light per channel, quiet lamps.
+
+    Returns
+    -------
+    list of str
+        Warnings.
+
+    Raises
+    ------
+    CalibrationError
+        A light is seen best by another channel than its name says, or two by the same, and that is not waived.
+    """
+    for fit, expected in zip(fits, _expected_channels([fit.name for fit in fits]), strict=True):
+        if "name" not in allow and expected not in (None, fit.reference):
+            raise CalibrationError(
+                f"light {fit.name} is seen best by the {COLOURS[fit.reference]} channel: are the captures of two "
+                "lights swapped, or is the colour filter array (--cfa) another one? (--allow name goes on all the same)"
+            )
+    for index, fit in enumerate(fits):
+        twin = next((other for other in fits[:index] if other.reference == fit.reference), None)
+        if twin is not None and "same-channel" not in allow:
+            raise CalibrationError(
+                f"lights {twin.name} and {fit.name} are both seen best by the {COLOURS[fit.reference]} channel: did "
+                "the same lamp shine in both captures? (--allow same-channel goes on all the same)"
+            )
+    warnings = [message for fit in fits for message in _fit_warnings(fit)]
+    condition = float(np.linalg.cond(np.column_stack([fit.column for fit in fits])))
+    if condition > CONDITION_WARNING:
+        warnings.append(
+            f"the matrix has condition number {condition:.1f}: unmixing amplifies noise strongly. Are two lamps close "
+            "in colour, or did a second lamp or daylight shine in the captures of one?"
+        )
+    unseen = [COLOURS[c] for c in range(3) if c not in {fit.reference for fit in fits}]
+    if len(fits) < 3 and unseen:
+        warnings.append(
+            f"no light is seen best by the {' and '.join(unseen)} channel: if such a lamp shines during the test it "
+            "must be calibrated too"
+        )
+    return warnings
+
+
+def _expected_channels(names: Sequence[str]) -> list[int | None]:
+    """Channel that each name promises; single letters count only where all names are colours."""
+    lower = [name.lower() for name in names]
+    if all(name in (*COLOURS, "r", "g", "b") for name in lower):
+        return ["rgb".index(name[0]) for name in lower]
+    return [COLOURS.index(name) if name in COLOURS else None for name in lower]
+
+
+def _check_presence(lights: Mapping[str, Sequence[BlockMeans]]) -> None:
+    if not lights:
+        raise CalibrationError("no light is given: state each with --light NAME=FILES")
+    if len(lights) > 3:
+        raise CalibrationError(f"a camera with three channels separates at most three lights, not {len(lights)}")
+    for name, captures in lights.items():
+        if not captures:
+            raise CalibrationError(f"light {name} has no captures")
+
+
+def _check_sizes(groups: Mapping[str, Sequence[BlockMeans]], labels: Labels) -> None:
+    first: BlockMeans | None = None
+    for name, captures in groups.items():
+        for index, frame in enumerate(captures):
+            first = first or frame
+            if frame.shape != first.shape or frame.names != first.names:
+                raise CalibrationError(
+                    f"{_label(name, index, labels)} is {_size(frame)}, the first capture is {_size(first)}: "
+                    "all captures must come from the same camera with the same settings"
+                )
+            if frame.full_scale != first.full_scale:
+                raise CalibrationError(
+                    f"{_label(name, index, labels)} has a range of {frame.full_scale:g} DN from black to white level, "
+                    f"the first capture {first.full_scale:g} DN"
+                )
+
+
+def _size(frame: BlockMeans) -> str:
+    return f"{frame.shape[1]} x {frame.shape[0]} px with planes {' '.join(frame.names)}"
+
+
+def _label(name: str, index: int, labels: Labels) -> str:
+    named = labels.get(name, ())
+    file = f" ({named[index]})" if index < len(named) else ""
+    return f"capture {index + 1} of {'the dark frames' if name == 'dark' else 'light ' + name}{file}"
+
+
+def _check_dark(
+    lights: Mapping[str, Sequence[BlockMeans]],
+    dark: Sequence[BlockMeans],
+    labels: Labels,
+    report: Callable[[str, str], None],
+) -> list[str]:
+    if not dark:
+        return ["no dark frames: the stated black level is taken for the dark level, and any ambient light goes unseen"]
+    scale = dark[0].full_scale
+    means = np.array([frame.channels.mean(axis=(1, 2)) for frame in dark])
+    median = np.median(means, axis=0)
+    for index, mean in enumerate(means):
+        if np.abs(mean - median).max() > DARK_WARNING * scale:
+            report(
+                "dark-frames",
+                f"{_label('dark', index, labels)} is {mean.max():.1f} DN above the black level, the median of the dark "
+                f"frames {median.max():.1f} DN: was a lamp on, or did daylight change?",
+            )
+    brightest = [
+        max(0.0, float(np.mean([f.channels.mean(axis=(1, 2)) for f in captures], axis=0).max()))
+        for captures in lights.values()
+    ]
+    level = float(median.max())
+    if level > DARK_SCALE_LIMIT * scale or level > max(DARK_WARNING * scale, DARK_SHARE_LIMIT * min(brightest)):
+        report(
+            "ambient",
+            f"the dark frames are not dark: {level:.1f} DN above the black level, where the weakest light with its "
+            f"surroundings gives {min(brightest):.1f} DN: was a lamp on, or does daylight reach the target?",
+        )
+    elif np.abs(median).max() > DARK_WARNING * scale:
+        return [
+            f"the dark frames are {median[np.abs(median).argmax()]:+.1f} DN from the stated black level: right only if "
+            "the same ambient light (or black level) holds in all captures and in the test"
+        ]
+    return []
+
+
+def _check_signal(
+    name: str,
+    captures: Sequence[BlockMeans],
+    level: npt.NDArray[np.floating] | np.float64,
+    report: Callable[[str, str], None],
+) -> list[str]:
+    clipped = float(np.mean([frame.saturated.mean() for frame in captures]))
+    if clipped == 1:
+        raise CalibrationError(
+            f"light {name}: every block of every capture holds saturated samples; shorten the exposure until none does"
+        )
+    if (piled := next((frame.piled_at for frame in captures if frame.piled_at is not None), None)) is not None:
+        report(
+            "white-level",
+            f"light {name}: samples pile up at {piled:.0f} DN, below the stated white level: the camera saturates "
+            f"there; state --white-level {piled:.0f}",
+        )
+    scale = captures[0].full_scale
+    signal = float(np.mean([(frame.channels - level).mean(axis=(1, 2)) for frame in captures], axis=0).max())
+    message = (
+        f"light {name} gives {signal:.1f} DN above dark, {100 * signal / scale:.1f} % of the full scale: was the lamp "
+        "on? 30 to 70 % is best"
+    )
+    warnings = []
+    if signal < WEAK_LIMIT * scale:
+        report("weak", message)
+    elif signal < WEAK_WARNING * scale:
+        warnings.append(message)
+    if clipped > 0.2:
+        warnings.append(f"light {name}: {100 * clipped:.0f} % of the blocks hold saturated samples and are left out")
+    return warnings
+
+
+def _check_greens(
+    name: str,
+    captures: Sequence[BlockMeans],
+    level: npt.NDArray[np.floating] | np.float64,
+    report: Callable[[str, str], None],
+) -> list[str]:
+    if len(captures[0].names) == 3:
+        return []
+    clear = [~frame.saturated for frame in captures]
+    brightest = np.mean([(f.channels - level)[:, c].mean(axis=1).max() for f, c in zip(captures, clear, strict=True)])
+    gap = np.mean([(f.planes[1] - f.planes[2])[c].mean() for f, c in zip(captures, clear, strict=True)])
+    share = abs(float(gap / max(brightest, 1e-9)))
+    message = (
+        f"light {name}: the two green planes differ by {100 * share:.1f} % of the strongest channel: "
+        "is the colour filter array (--cfa) right?"
+    )
+    if share > GREENS_LIMIT:
+        report("greens", message)
+        return []
+    return [message] if share > GREENS_WARNING else []
+
+
+def _check_agreement(
+    name: str,
+    captures: Sequence[BlockMeans],
+    level: npt.NDArray[np.floating] | np.float64,
+    files: Sequence[str],
+    report: Callable[[str, str], None],
+) -> list[str]:
+    if len(captures) < 2:
+        return []
+    clear = np.all([~frame.saturated for frame in captures], axis=0)
+    clear = clear if clear.any() else np.ones_like(clear)
+    sums = np.array([(frame.channels - level)[:, clear].sum(axis=1) for frame in captures])
+    strength = sums.max(axis=1)
+    colour = sums / np.maximum(strength, 1e-9)[:, None]
+    departure = np.abs(colour - np.median(colour, axis=0)).max(axis=1)
+    for index in np.flatnonzero(departure > COLOUR_LIMIT):
+        report(
+            "captures",
+            f"{_label(name, int(index), {name: files})} has another colour than the others (a channel departs by "
+            f"{100 * departure[index]:.1f} % of the strongest): another lamp, daylight, or a file of another light",
+        )
+    detail = np.array([frame.detail for frame in captures])
+    return [
+        f"{_label(name, int(index), {name: files})} is less sharp than the others: out of focus, or moved? The "
+        "matrix does not suffer, a registration would"
+        for index in np.flatnonzero(detail < DETAIL_LIMIT * np.median(detail))
+    ]
+
+
+def _fit_warnings(fit: LightFit) -> list[str]:
+    warnings = []
+    if fit.intensity_drift > INTENSITY_WARNING:
+        warnings.append(
+            f"light {fit.name}: its strength differs by {100 * fit.intensity_drift:.1f} % between captures: let the "
+            "lamp warm up (the matrix does not suffer)"
+        )
+    if fit.colour_drift > COLOUR_DRIFT_WARNING:
+        warnings.append(
+            f"light {fit.name}: its colour drifts between captures (entries scatter by {fit.colour_drift:.2g} beyond "
+            "noise); the stated uncertainty covers it"
+        )
+    if fit.rejected > 0.05:
+        warnings.append(
+            f"light {fit.name}: {100 * fit.rejected:.0f} % of the blocks are outliers: coloured or fluorescent "
+            "spots on the target?"
+        )
+    return warnings

@@ -1,0 +1,59 @@
+"""Single-light captures with known truth for the calibration tests: target x lamp x A, shot and read noise, 12 bit."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic, cfa_channels
+
+GAIN, READ, BLACK, WHITE = 4.0, 3.0, 64.0, 4095.0
+
+MATRICES = {
+    1.5: np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]]),
+    3.0: np.array([[1, 0.27, 0.09], [0.04, 1, 0.39], [0.01, 0.39, 1]]),
+    6.0: np.array([[1, 0.55, 0.12], [0.30, 1, 0.62], [0.06, 0.50, 1]]),
+}
+
+
+def white_target(shape, rng):
+    """White card under a lamp from one side: a smooth slope and vignetting, between about 0.5 and 1."""
+    y, x = np.mgrid[-1 : 1 : shape[0] * 1j, -1 : 1 : shape[1] * 1j]
+    a, b = rng.uniform(-0.12, 0.12, 2)
+    return 0.8 * (1 + a * x + b * y - 0.15 * (x**2 + y**2))
+
+
+def speckle_target(shape, rng, size=4.2):
+    """Black droplets on white paint (albedo 0.1 and 0.8), soft edges, 45 % covered."""
+    field = ndimage.gaussian_filter(rng.standard_normal(shape), size / 2.2)
+    field = (field - np.quantile(field, 0.45)) / field.std()
+    return ndimage.gaussian_filter(0.1 + 0.7 / (1 + np.exp(-12 * field)), 0.5)
+
+
+def expose(picture, column, rng, cfa="RGGB", *, gain=GAIN, read=READ, black=BLACK, white=WHITE, kind="bayer"):
+    """One raw frame of a light whose picture (H, W), or (C, H, W) for one per channel, is in DN of its best channel."""
+    channels = np.asarray(column, float).reshape(3, *([1] * (picture.ndim if picture.ndim == 2 else 2))) * picture
+    if kind == "bayer":
+        cell = cfa_channels(cfa)
+        y, x = np.indices(channels.shape[1:])
+        channels = np.take_along_axis(channels, cell[y % 2, x % 2][None], axis=0)[0]
+    electrons = rng.poisson(np.maximum(channels, 0) * gain) + rng.normal(0, read * gain, channels.shape)
+    values = np.clip(np.rint(electrons / gain + black), 0, white).astype(np.uint16)
+    if kind == "bayer":
+        return Mosaic(values=values, cfa=cfa, black_level=black, white_level=white)
+    return ChannelFrame(values=values, black_level=black, white_level=white)
+
+
+def captures(
+    matrix, rng, *, shape=(256, 256), count=4, target=white_target, level=2500.0, darks=4, cfa="RGGB", **camera
+):
+    """Captures of every light and dark frames: ({name: frames}, frames)."""
+    names = ("red", "green", "blue")[: matrix.shape[1]]
+    albedo = target(shape, rng)
+    lights = {}
+    for index, name in enumerate(names):
+        lamp = white_target(shape, rng) / 0.8 if target is not white_target else 1.0
+        picture = level * albedo * lamp
+        lights[name] = [expose(picture, matrix[:, index], rng, cfa, **camera) for _ in range(count)]
+    dark = [expose(np.zeros(shape), matrix[:, 0], rng, cfa, **camera) for _ in range(darks)]
+    return lights, dark

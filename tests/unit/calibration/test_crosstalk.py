@@ -1,0 +1,246 @@
+"""Crosstalk from single-light captures: the matrix, its uncertainty, and mistakes that must not pass."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from calibration_scene import BLACK, MATRICES, WHITE, captures, expose, speckle_target, white_target
+
+from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.mosaic import BAYER_PATTERNS, ChannelFrame, Mosaic
+from rgbmidic_calibration.blocks import block_centres, block_means
+from rgbmidic_calibration.crosstalk import estimate_crosstalk
+
+MATRIX = MATRICES[1.5]
+
+
+def reduce(frames):
+    return [block_means(frame) for frame in frames]
+
+
+def estimate(lights, dark=(), **options):
+    return estimate_crosstalk({name: reduce(frames) for name, frames in lights.items()}, reduce(dark), **options)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return captures(MATRIX, np.random.default_rng(7), target=speckle_target, shape=(160, 192), count=2, darks=2)
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+def test_planes_of_a_smooth_picture_have_the_same_block_mean(cfa):
+    y, x = np.mgrid[0:101, 0:120]
+    picture = (1000 + 10 * x + 4 * y + 0.05 * x * y).astype(np.uint16)
+    exact = 1000 + 10 * x + 4 * y + 0.05 * x * y
+    means = block_means(Mosaic(values=picture, cfa=cfa, black_level=0, white_level=65535))
+    centres = block_centres(picture.shape, 16)
+    expected = 1000 + 10 * centres[..., 0] + 4 * centres[..., 1] + 0.05 * centres[..., 0] * centres[..., 1]
+    assert means.planes.shape[1:] == expected.shape
+    rounding = np.abs(exact - picture).max()
+    assert np.abs(means.planes - expected).max() < rounding
+
+
+def test_block_is_saturated_when_a_single_sample_of_it_is():
+    values = np.full((64, 64), 100, dtype=np.uint16)
+    values[30, 40] = 4095
+    marked = block_means(Mosaic(values=values, cfa="RGGB", black_level=0, white_level=4095)).saturated
+    assert marked.sum() == 1
+    assert marked[(30 - 2) // 16, (40 - 2) // 16]
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+@pytest.mark.parametrize("target", [white_target, speckle_target])
+def test_matrix_is_found_on_white_and_speckled_targets(cfa, target):
+    lights, dark = captures(MATRIX, np.random.default_rng(3), target=target, cfa=cfa)
+    found = estimate(lights, dark)
+    assert np.linalg.norm(found.crosstalk.matrix - MATRIX) < 0.002 * np.linalg.norm(MATRIX)
+    assert found.warnings == ()
+    assert (found.crosstalk.matrix.max(axis=0) == 1).all()
+
+
+def test_matrix_of_a_three_chip_camera():
+    rng = np.random.default_rng(5)
+    picture = 2000 * speckle_target((128, 128), rng)
+    lights = {n: [expose(picture, MATRIX[:, i], rng, kind="rgb")] for i, n in enumerate(("red", "green", "blue"))}
+    dark = [expose(0 * picture, MATRIX[:, 0], rng, kind="rgb") for _ in range(2)]
+    found = estimate(lights, dark).crosstalk
+    assert np.abs(found.matrix - MATRIX).max() < 5 * found.std.max() < 0.002
+
+
+def test_two_lights_and_other_names():
+    lights, dark = captures(MATRIX[:, [0, 2]], np.random.default_rng(5), shape=(128, 128))
+    found = estimate({"far red": lights["red"], "ultraviolet": lights["green"]}, dark)
+    assert found.crosstalk.lights == ("far red", "ultraviolet")
+    assert found.crosstalk.matrix == pytest.approx(MATRIX[:, [0, 2]], abs=1e-3)
+    assert "green" in found.warnings[0]
+
+
+def test_noise_does_not_attenuate_the_ratio():
+    rng = np.random.default_rng(11)
+    picture = np.full((256, 256), 40.0)
+    lights = {"red": [expose(picture, MATRIX[:, 0], rng, read=30.0) for _ in range(8)]}
+    dark = [expose(0 * picture, MATRIX[:, 0], rng, read=30.0) for _ in range(8)]
+    found = estimate(lights, dark, allow=["weak"]).crosstalk
+    assert np.abs(found.matrix - MATRIX[:, :1]).max() < 4 * found.std.max() < 0.02
+    first = block_means(lights["red"][0]).channels
+    slope = np.polyfit(first[0].ravel(), first[1].ravel(), 1)[0]
+    assert abs(slope - MATRIX[1, 0]) > 0.05
+
+
+def test_saturated_blocks_are_left_out(scene):
+    lights, dark = scene
+    rng = np.random.default_rng(2)
+    picture = 3000 * speckle_target((160, 192), rng) / 0.8
+    picture[:60, :80] *= 2.2
+    found = estimate({**lights, "red": [expose(picture, MATRIX[:, 0], rng) for _ in range(4)]}, dark)
+    assert found.lights[0].saturated > 0.1
+    assert np.abs(found.crosstalk.matrix - MATRIX).max() < 1.5e-3
+
+
+def test_coloured_spots_on_the_target_are_rejected():
+    rng = np.random.default_rng(4)
+    picture = 2000 * white_target((256, 256), rng)
+    channels = MATRIX[:, 0, None, None] * picture
+    channels[1, 40:80, 100:140] *= 2.5
+    lights = {"red": [expose(channels, np.ones(3), rng) for _ in range(2)]}
+    found = estimate(lights, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(2)])
+    assert found.lights[0].rejected > 0.02
+    assert np.abs(found.crosstalk.matrix - MATRIX[:, :1]).max() < 2e-4
+
+
+def test_without_dark_frames_the_black_level_is_used_and_said(scene):
+    lights, _ = scene
+    found = estimate(lights)
+    assert "no dark frames" in found.warnings[0]
+    assert found.crosstalk.std[1, 0] > 2e-4
+    assert np.abs(found.crosstalk.matrix - MATRIX).max() < 2e-3
+
+
+def test_ambient_light_is_taken_out_by_the_dark_frames():
+    rng = np.random.default_rng(9)
+    lights, _ = captures(MATRIX, rng, shape=(160, 160), black=100.0)
+    as_stated = {n: [relevel(f, 64.0) for f in fs] for n, fs in lights.items()}
+    dark = [relevel(expose(np.zeros((160, 160)), MATRIX[:, 0], rng, black=100.0), 64.0) for _ in range(4)]
+    found = estimate(as_stated, dark)
+    assert np.abs(found.crosstalk.matrix - MATRIX).max() < 5e-4
+    assert "ambient" in found.warnings[0]
+
+
+def relevel(frame, black):
+    return Mosaic(values=frame.values, cfa=frame.cfa, black_level=black, white_level=frame.white_level)
+
+
+def swap(lights, first, second):
+    return {**lights, first: lights[second], second: lights[first]}
+
+
+def wrong_cfa(frames, cfa):
+    return [Mosaic(values=f.values, cfa=cfa, black_level=BLACK, white_level=WHITE) for f in frames]
+
+
+def test_swapped_lights_are_an_error(scene):
+    lights, dark = scene
+    with pytest.raises(CalibrationError, match="light red is seen best by the green channel"):
+        estimate(swap(lights, "red", "green"), dark)
+    assert estimate(swap(lights, "red", "green"), dark, allow=["name"]).crosstalk.matrix[1, 0] == 1
+
+
+@pytest.mark.parametrize("cfa", ["GRBG", "GBRG", "BGGR"])
+def test_wrong_pattern_is_an_error(scene, cfa):
+    lights, dark = scene
+    with pytest.raises(CalibrationError, match="colour filter array"):
+        estimate({n: wrong_cfa(f, cfa) for n, f in lights.items()}, wrong_cfa(dark, cfa))
+
+
+def test_one_light_twice_is_an_error(scene):
+    lights, dark = scene
+    with pytest.raises(CalibrationError, match="both seen best by the red channel"):
+        estimate({"one": lights["red"], "two": lights["red"]}, dark)
+
+
+def test_lit_dark_frames_are_an_error(scene):
+    lights, _ = scene
+    with pytest.raises(CalibrationError, match="dark frames are not dark"):
+        estimate(lights, lights["red"])
+
+
+def test_one_lit_dark_frame_is_an_error(scene):
+    lights, dark = scene
+    with pytest.raises(CalibrationError, match="capture 3 of the dark frames"):
+        estimate(lights, [*dark, lights["red"][0]])
+
+
+def test_lamp_that_was_off_is_an_error(scene):
+    lights, dark = scene
+    with pytest.raises(CalibrationError, match=r"light green gives .* was the lamp on"):
+        estimate({**lights, "green": dark}, dark)
+
+
+def test_saturated_captures_are_an_error(scene):
+    lights, dark = scene
+    white = Mosaic(values=np.full((160, 192), WHITE), cfa="RGGB", black_level=BLACK, white_level=WHITE)
+    with pytest.raises(CalibrationError, match=r"light blue: every block .* saturated"):
+        estimate({**lights, "blue": [white]}, dark)
+
+
+def test_clipping_below_the_stated_white_level_is_an_error():
+    rng = np.random.default_rng(1)
+    frame = expose(np.full((160, 192), 6000.0), MATRIX[:, 0], rng)
+    stated = Mosaic(values=frame.values, cfa="RGGB", black_level=BLACK, white_level=5000)
+    with pytest.raises(CalibrationError, match="pile up at 4095"):
+        estimate({"red": [stated]})
+
+
+def test_captures_of_different_sizes_are_an_error(scene):
+    lights, dark = scene
+    small = [Mosaic(values=f.values[:128], cfa=f.cfa, black_level=BLACK, white_level=WHITE) for f in lights["blue"]]
+    with pytest.raises(CalibrationError, match=r"capture 1 of light blue \(b0.tif\) is 192 x 128 px"):
+        estimate({**lights, "blue": small}, dark, labels={"blue": ["b0.tif", "b1.tif"]})
+
+
+def test_a_file_of_another_light_among_the_captures_is_an_error(scene):
+    lights, dark = scene
+    mixed = [*lights["red"], lights["green"][0]]
+    with pytest.raises(CalibrationError, match="capture 3 of light red has another colour"):
+        estimate({**lights, "red": mixed}, dark)
+
+
+def test_a_blurred_capture_is_reported(scene):
+    from scipy import ndimage
+
+    rng = np.random.default_rng(7)
+    picture = 2000 * speckle_target((160, 192), rng)
+    blurred = ndimage.gaussian_filter(picture, 3)
+    frames = [expose(p, MATRIX[:, 0], rng) for p in (picture, picture, blurred)]
+    found = estimate({"red": frames}, scene[1])
+    assert any("capture 3 of light red is less sharp" in text for text in found.warnings)
+    assert np.abs(found.crosstalk.matrix - MATRIX[:, :1]).max() < 1e-3
+
+
+def test_monochrome_and_unknown_checks_are_errors(scene):
+    lights, dark = scene
+    with pytest.raises(CalibrationError, match="no colour channels"):
+        block_means(ChannelFrame(values=np.zeros((1, 99, 99), np.uint16), black_level=0, white_level=255))
+    with pytest.raises(CalibrationError, match="unknown check nonsense"):
+        estimate(lights, dark, allow=["nonsense"])
+
+
+def test_drifting_colour_is_covered_by_the_uncertainty():
+    rng = np.random.default_rng(8)
+    picture = 2000 * white_target((128, 128), rng)
+    greens = MATRIX[1, 0] + rng.normal(0, 0.003, 4)
+    frames = [expose(picture, (MATRIX[0, 0], green, MATRIX[2, 0]), rng) for green in greens]
+    found = estimate({"red": frames}, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(3)])
+    assert any("colour drifts" in text for text in found.warnings)
+    assert 5e-4 < found.crosstalk.std[1, 0] < 5e-3
+
+
+def test_file_keeps_matrix_and_covariance(scene, tmp_path):
+    lights, dark = scene
+    found = estimate(lights, dark).crosstalk
+    Calibration(crosstalk=found).write(tmp_path / "c.json")
+    again = Calibration.read(tmp_path / "c.json").crosstalk
+    assert (again.matrix == found.matrix).all()
+    assert (again.covariance == found.covariance).all()
+    assert again.std == pytest.approx(found.std)
