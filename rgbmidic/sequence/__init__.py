@@ -1,0 +1,1 @@
+"""Frames in (`readers`, `frames`, `writers`) and results out (`store`)."""
