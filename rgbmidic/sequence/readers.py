@@ -17,7 +17,7 @@ from rgbmidic.sequence.contents import FileContents, damaged
 from rgbmidic.sequence.pictures import png_shape, read_headerless, read_png, read_tiff, tiff_shape
 from rgbmidic.sequence.tiff_structure import is_dng
 
-__all__ = ["FRAME_SUFFIXES", "frame_shape", "read_frame"]
+__all__ = ["FRAME_SUFFIXES", "frame_shape", "read_frame", "tells_camera"]
 
 SampleType = Literal["uint8", "uint16", ">u2"]
 _T = TypeVar("_T")
@@ -94,6 +94,12 @@ def frame_shape(path: Path | str, shape: tuple[int, int] | None = None) -> tuple
     if _is_headerless(path, shape) and shape is not None:
         return shape
     return _from_disk({"tiff": tiff_shape, "png": png_shape, "camera raw": camera_raw_shape}[_format(path)], path)
+
+
+def tells_camera(path: Path | str) -> bool:
+    """Whether a frame file states its pattern and its black and white level itself (camera raws do)."""
+    path = Path(path)
+    return path.suffix.lower() not in _HEADERLESS and _format(path) == "camera raw"
 
 
 def _read(path: Path, kind: FrameKind | None, shape: tuple[int, int] | None, dtype: SampleType | None) -> FileContents:

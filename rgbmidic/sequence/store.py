@@ -99,8 +99,9 @@ class ResultStore:
         }
         provenance = _provenance(settings, names, lights, notes or {})
         _make_room(path, overwrite=overwrite)
-        write_complete(path / _MESH, lambda file: np.savez(file, **mesh))
         _write_json(path / _PROVENANCE, provenance)
+        _frame_path(path, 0).parent.mkdir(exist_ok=True)
+        write_complete(path / _MESH, lambda file: np.savez(file, **mesh))
         return cls(path=path, frame_count=len(names), node_count=len(mesh["nodes"]), light_count=len(lights))
 
     def write_frame(self, index: int, record: FrameRecord) -> None:
@@ -288,8 +289,8 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
     elif (path / _MESH).exists() or frames.exists():
         raise ResultError(f"{path} holds {_MESH} or {_FRAMES}/ of something else; give another folder")
     try:
-        frames.mkdir(parents=True, exist_ok=True)
-        for file in frames.iterdir():
+        path.mkdir(parents=True, exist_ok=True)
+        for file in frames.glob("*"):
             if _FRAME_FILE.fullmatch(file.name):
                 file.unlink()
     except OSError as error:
