@@ -5,12 +5,14 @@ Paint is a function of the material point alone. Droplets are discs hashed from 
 on a rotated three-dimensional lattice: plate, cylinder and sphere carry the same paint, without chart or seam.
 
 Parameter vectors (float64)
-    camera  [focal length px, centre x, centre y, magnification, shift x, shift y]
+    lens    [focal length px, centre x, centre y, magnification, shift x, shift y]
     frame   [camera centre in the body's frame (3), rotation camera -> body row by row (9)]
     body    [kind, radius, half width, half height]; limits are material, along x and y
     affine  [m00, m01, m10, m11, t0, t1], spatial -> material point of a plate
     paint   [cell, half shell, reach, median radius, size spread, softness, dome height,
              then for white and for black: albedo, slope scale, wrinkle lattice, gloss, lobe variance]
+
+The samples of a tile lie in the rows of a work array, so that the compiler can vectorise the loops over them.
 """
 
 from __future__ import annotations
@@ -23,192 +25,347 @@ from numba import njit, prange
 __all__ = ["CYLINDER", "PLATE", "SPHERE", "filter_columns", "sample_paint", "trace_rows"]
 
 PLATE, CYLINDER, SPHERE = 0, 1, 2
-MAX_CANDIDATES = 512
+TILE = 8
+MAX_CANDIDATES = 1024
 _SQRT6 = math.sqrt(6.0)
+
+# Rows of the work array: spatial point, material point, normal, direction to the camera, micro-normal, paint, pixel.
+_X, _Y, _Z, _MX, _MY, _MZ, _NX, _NY, _NZ, _VX, _VY, _VZ, _FX, _FY, _FZ = range(15)
+_SEEN, _COVER, _HEIGHT, _DX, _DY, _DZ, _ALBEDO, _GLOSS, _VARIANCE, _ENERGY, _EXPONENT = range(15, 26)
+_CX, _CY = 26, 27
+_FIELDS = 28
 
 # A rotation about (1, 1, 1): no axis of the body lies near a plane of the wrinkle lattice.
 _A, _B, _C = 0.80473785, -0.31061722, 0.50587936
 
 
 @njit(cache=True, nogil=True)
-def _mix(h):
-    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return h ^ (h >> np.uint64(31))
-
-
-@njit(cache=True, nogil=True)
 def _hash(i, j, k, seed):
-    h = np.uint64(i) * np.uint64(0x9E3779B97F4A7C15)
-    h += np.uint64(j) * np.uint64(0xC2B2AE3D27D4EB4F)
-    h += np.uint64(k) * np.uint64(0x165667B19E3779F9)
-    return _mix(h ^ seed)
+    """32 random bits of a lattice point (finaliser: "lowbias32" of C. Wellons)."""
+    h = np.uint32(np.uint32(i) * np.uint32(0x8DA6B343))
+    h = np.uint32(h + np.uint32(np.uint32(j) * np.uint32(0xD8163841)))
+    h = np.uint32(h + np.uint32(np.uint32(k) * np.uint32(0xCB1AB31F)))
+    return _mix(np.uint32(h ^ seed))
 
 
 @njit(cache=True, nogil=True)
-def _unit(h, shift):
-    """21 bits of a hash as a number in [0, 1)."""
-    return np.float64(np.int64((h >> np.uint64(shift)) & np.uint64(0x1FFFFF))) * (1.0 / 2097152.0)
+def _mix(h):
+    h = np.uint32(np.uint32(h ^ np.uint32(h >> np.uint32(16))) * np.uint32(0x7FEB352D))
+    h = np.uint32(np.uint32(h ^ np.uint32(h >> np.uint32(15))) * np.uint32(0x846CA68B))
+    return np.uint32(h ^ np.uint32(h >> np.uint32(16)))
+
+
+@njit(cache=True, nogil=True)
+def _unit(h):
+    """A hash as a number in [0, 1)."""
+    return np.float64(h) * (1.0 / 4294967296.0)
 
 
 @njit(cache=True, nogil=True)
 def _fade(t):
-    return t * t * t * (t * (t * 6 - 15) + 10)
+    return t * t * t * (t * (t * np.float32(6.0) - np.float32(15.0)) + np.float32(10.0))
 
 
 @njit(cache=True, nogil=True)
 def _fade_slope(t):
-    return 30 * t * t * (t - 1) * (t - 1)
+    rest = t * (t - np.float32(1.0))
+    return np.float32(30.0) * rest * rest
 
 
 @njit(cache=True, nogil=True)
-def wrinkle(x, y, z, seed):
-    """Gradient noise and its gradient at a point in lattice units."""
-    u = _A * x + _B * y + _C * z
-    v = _C * x + _A * y + _B * z
-    w = _B * x + _C * y + _A * z
-    fi, fj, fk = math.floor(u), math.floor(v), math.floor(w)
-    i, j, k = np.int64(fi), np.int64(fj), np.int64(fk)
-    u -= fi
-    v -= fj
-    w -= fk
-    su, sv, sw = _fade(u), _fade(v), _fade(w)
-    tu, tv, tw = _fade_slope(u), _fade_slope(v), _fade_slope(w)
-    value = gu = gv = gw = 0.0
-    for c in range(8):
-        a, b, d = c & 1, (c >> 1) & 1, c >> 2
-        h = _hash(i + a, j + b, k + d, seed)
-        p, q, r = 2 * _unit(h, 0) - 1, 2 * _unit(h, 21) - 1, 2 * _unit(h, 42) - 1
-        wu, du = (su, tu) if a else (1 - su, -tu)
-        wv, dv = (sv, tv) if b else (1 - sv, -tv)
-        ww, dw = (sw, tw) if d else (1 - sw, -tw)
-        dot = p * (u - a) + q * (v - b) + r * (w - d)
-        weight = wu * wv * ww
-        value += weight * dot
-        gu += weight * p + dot * du * wv * ww
-        gv += weight * q + dot * wu * dv * ww
-        gw += weight * r + dot * wu * wv * dw
-    return value, _A * gu + _C * gv + _B * gw, _B * gu + _A * gv + _C * gw, _C * gu + _B * gv + _A * gw
+def _corner(h, u, v, w, wu, wv, ww, du, dv, dw):
+    """One lattice corner's share of the noise and of its gradient."""
+    scale, one = np.float32(2.0 / 1023.0), np.float32(1.0)
+    p = np.float32(np.int32(h & np.uint32(1023))) * scale - one
+    q = np.float32(np.int32((h >> np.uint32(10)) & np.uint32(1023))) * scale - one
+    r = np.float32(np.int32((h >> np.uint32(20)) & np.uint32(1023))) * scale - one
+    dot = p * u + q * v + r * w
+    vw, weight = wv * ww, wu * wv * ww
+    return weight * dot, weight * p + dot * du * vw, weight * q + dot * wu * dv * ww, weight * r + dot * wu * wv * dw
 
 
 @njit(cache=True, nogil=True)
-def gather(found, x, y, z, nx, ny, nz, slack, paint, counts, seed):
-    """Droplets (centre, radius) that can touch a point within `slack` of the given one; returns how many."""
-    cell, shell, reach = paint[0], paint[1] + 0.1 * slack, paint[2] + slack
+def _enter_lattice(work, grid, cells, paint):
+    """Position of the samples in the wrinkle lattice: cell and place within it."""
+    for s in range(work.shape[1]):
+        inverse = 1.0 / (paint[9] if work[_COVER, s] < 0.5 else paint[14])
+        x, y, z = work[_MX, s] * inverse, work[_MY, s] * inverse, work[_MZ, s] * inverse
+        u, v, w = _A * x + _B * y + _C * z, _C * x + _A * y + _B * z, _B * x + _C * y + _A * z
+        i, j, k = math.floor(u), math.floor(v), math.floor(w)
+        cells[0, s], cells[1, s], cells[2, s] = np.int32(i), np.int32(j), np.int32(k)
+        grid[0, s], grid[1, s], grid[2, s] = np.float32(u - i), np.float32(v - j), np.float32(w - k)
+
+
+@njit(cache=True, nogil=True)
+def _noise(grid, cells, seed):
+    """Gradient noise (row 3 of `grid`) and its gradient (rows 4 to 6), in lattice units and axes."""
+    one = np.float32(1.0)
+    for s in range(grid.shape[1]):
+        u, v, w = grid[0, s], grid[1, s], grid[2, s]
+        u1, v1, w1 = u - one, v - one, w - one
+        a, b, c, d, e, f = _fade(u), _fade(v), _fade(w), _fade_slope(u), _fade_slope(v), _fade_slope(w)
+        a0, b0, c0 = one - a, one - b, one - c
+        i, j, k = cells[0, s], cells[1, s], cells[2, s]
+        i1, j1, k1 = np.int32(i + 1), np.int32(j + 1), np.int32(k + 1)
+        n0, p0, q0, r0 = _corner(_hash(i, j, k, seed), u, v, w, a0, b0, c0, -d, -e, -f)
+        n1, p1, q1, r1 = _corner(_hash(i1, j, k, seed), u1, v, w, a, b0, c0, d, -e, -f)
+        n2, p2, q2, r2 = _corner(_hash(i, j1, k, seed), u, v1, w, a0, b, c0, -d, e, -f)
+        n3, p3, q3, r3 = _corner(_hash(i1, j1, k, seed), u1, v1, w, a, b, c0, d, e, -f)
+        n4, p4, q4, r4 = _corner(_hash(i, j, k1, seed), u, v, w1, a0, b0, c, -d, -e, f)
+        n5, p5, q5, r5 = _corner(_hash(i1, j, k1, seed), u1, v, w1, a, b0, c, d, -e, f)
+        n6, p6, q6, r6 = _corner(_hash(i, j1, k1, seed), u, v1, w1, a0, b, c, -d, e, f)
+        n7, p7, q7, r7 = _corner(_hash(i1, j1, k1, seed), u1, v1, w1, a, b, c, d, e, f)
+        grid[3, s] = ((n0 + n1) + (n2 + n3)) + ((n4 + n5) + (n6 + n7))
+        grid[4, s] = ((p0 + p1) + (p2 + p3)) + ((p4 + p5) + (p6 + p7))
+        grid[5, s] = ((q0 + q1) + (q2 + q3)) + ((q4 + q5) + (q6 + q7))
+        grid[6, s] = ((r0 + r1) + (r2 + r3)) + ((r4 + r5) + (r6 + r7))
+
+
+@njit(cache=True, nogil=True)
+def _gather(found, x, y, z, slack, body, paint, counts, seed):
+    """Droplets (centre on the surface, radius) that can touch a point within `slack` of the given one; their number."""
+    cell, reach = paint[0], paint[2] + slack
+    margin = 0.87 * cell + paint[1]
     n = 0
     for i in range(math.floor((x - reach) / cell), math.floor((x + reach) / cell) + 1):
         for j in range(math.floor((y - reach) / cell), math.floor((y + reach) / cell) + 1):
             for k in range(math.floor((z - reach) / cell), math.floor((z + reach) / cell) + 1):
-                middle = ((i + 0.5) * cell - x) * nx + ((j + 0.5) * cell - y) * ny + ((k + 0.5) * cell - z) * nz
-                if abs(middle) > 0.5 * cell * (abs(nx) + abs(ny) + abs(nz)) + shell:
-                    continue
-                h = _hash(i, j, k, seed)
-                u = _unit(h, 0)
-                number = 0
-                while number < counts.size and u >= counts[number]:
-                    number += 1
-                for _ in range(number):
-                    h = _mix(h + np.uint64(0x9E3779B97F4A7C15))
-                    dx, dy = (i + _unit(h, 0)) * cell - x, (j + _unit(h, 21)) * cell - y
-                    dz = (k + _unit(h, 42)) * cell - z
-                    h = _mix(h + np.uint64(0x9E3779B97F4A7C15))
-                    # two uniforms: a triangular law of unit variance, so that radii are bounded
-                    radius = paint[3] * math.exp(paint[4] * _SQRT6 * (_unit(h, 0) + _unit(h, 21) - 1.0))
-                    normal = dx * nx + dy * ny + dz * nz
-                    far = radius + 0.5 * paint[5] + slack
-                    if abs(normal) > shell or dx * dx + dy * dy + dz * dz - normal * normal > far * far:
-                        continue
-                    if n < found.shape[0]:
-                        found[n, 0], found[n, 1], found[n, 2], found[n, 3] = x + dx, y + dy, z + dz, radius
-                        n += 1
+                height, _, _, _ = _to_surface((i + 0.5) * cell, (j + 0.5) * cell, (k + 0.5) * cell, body)
+                if abs(height) <= margin:
+                    h = _hash(np.int32(i), np.int32(j), np.int32(k), seed)
+                    n = _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts)
     return n
 
 
 @njit(cache=True, nogil=True)
-def coat(found, n, x, y, z, nx, ny, nz, paint):
-    """Cover by black paint (0 to 1) at a point, with the height and the slope of the droplet on top."""
-    cover = height = sx = sy = sz = 0.0
-    soft, dome = paint[5], paint[6]
-    for c in range(n):
-        dx, dy, dz = x - found[c, 0], y - found[c, 1], z - found[c, 2]
-        normal = dx * nx + dy * ny + dz * nz
-        radius = found[c, 3]
-        square = dx * dx + dy * dy + dz * dz - normal * normal
-        far = radius + 0.5 * soft
-        if abs(normal) > paint[1] or square >= far * far:
+def _to_surface(x, y, z, body):
+    """Height of a point above the body's surface, and the surface point below it."""
+    if body[0] == PLATE:
+        return z, x, y, 0.0
+    length = math.sqrt(x * x + z * z + (y * y if body[0] == SPHERE else 0.0))
+    scale = body[1] / max(length, 1e-12)
+    return length - body[1], x * scale, y * scale if body[0] == SPHERE else y, z * scale
+
+
+@njit(cache=True, nogil=True)
+def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
+    """Append the droplets of one cell that lie near enough."""
+    cell, chance, number = paint[0], _unit(h), 0
+    while number < counts.size and chance >= counts[number]:
+        number += 1
+    step = np.uint32(0x9E3779B9)
+    for _ in range(number):
+        h = _mix(np.uint32(h + step))
+        cz = (k + _unit(h)) * cell
+        h = _mix(np.uint32(h + step))
+        cx = (i + _unit(h)) * cell
+        h = _mix(np.uint32(h + step))
+        cy = (j + _unit(h)) * cell
+        h = _mix(np.uint32(h + step))
+        height, cx, cy, cz = _to_surface(cx, cy, cz, body)
+        if abs(height) > paint[1]:
             continue
-        s = 1.0 if soft == 0.0 else min(1.0, (radius - math.sqrt(max(square, 0.0))) / soft + 0.5)
-        cover = max(cover, s * s * (3.0 - 2.0 * s))
-        relative = square / (radius * radius)
-        if dome > 0.0 and relative < 1.0 and dome * (1.0 - relative) ** 2 > height:
-            height = dome * (1.0 - relative) ** 2
-            slope = -4.0 * dome * (1.0 - relative) / (radius * radius)
-            sx, sy, sz = slope * (dx - normal * nx), slope * (dy - normal * ny), slope * (dz - normal * nz)
-    return cover, height, sx, sy, sz
+        # two uniforms: a triangular law of unit variance, so that radii are bounded
+        size = np.float64(h & np.uint32(65535)) / 65536.0 + np.float64(h >> np.uint32(16)) / 65536.0 - 1.0
+        radius = paint[3] * math.exp(paint[4] * _SQRT6 * size)
+        far = radius + 0.5 * paint[5] + slack
+        if (cx - x) ** 2 + (cy - y) ** 2 + (cz - z) ** 2 <= far * far and n < found.shape[0]:
+            found[n, 0], found[n, 1], found[n, 2], found[n, 3] = cx, cy, cz, radius
+            n += 1
+    return n
 
 
 @njit(cache=True, nogil=True)
-def relief(cover, x, y, z, nx, ny, nz, paint, seed):
-    """Height and tangential slope of the wrinkles at a point."""
-    lattice = paint[9] if cover < 0.5 else paint[14]
-    scale = (1.0 - cover) * paint[8] + cover * paint[13]
-    if scale == 0.0:
-        return 0.0, 0.0, 0.0, 0.0
-    value, gx, gy, gz = wrinkle(x / lattice, y / lattice, z / lattice, seed)
-    normal = gx * nx + gy * ny + gz * nz
-    return scale * lattice * value, scale * (gx - normal * nx), scale * (gy - normal * ny), scale * (gz - normal * nz)
+def _coat(work, found, n, paint):
+    """Cover by black paint (0 to 1) of the samples, with height and slope of the droplet on top."""
+    inverse, dome = 1.0 / max(paint[5], 1e-9), paint[6]
+    for s in range(work.shape[1]):
+        work[_COVER, s] = work[_HEIGHT, s] = work[_DX, s] = work[_DY, s] = work[_DZ, s] = 0.0
+    for c in range(n):
+        x, y, z, radius = found[c, 0], found[c, 1], found[c, 2], found[c, 3]
+        for s in range(work.shape[1]):
+            dx, dy, dz = work[_MX, s] - x, work[_MY, s] - y, work[_MZ, s] - z
+            inside = (radius - math.sqrt(dx * dx + dy * dy + dz * dz)) * inverse + 0.5
+            work[_COVER, s] = max(work[_COVER, s], inside)
+        if dome > 0.0:
+            _dome(work, x, y, z, radius, dome)
+    for s in range(work.shape[1]):
+        t = min(work[_COVER, s], 1.0)
+        work[_COVER, s] = t * t * (3.0 - 2.0 * t)
 
 
 @njit(cache=True, nogil=True)
-def radiance(light, x, y, z, n, m, v, albedo, gloss, variance):
+def _dome(work, x, y, z, radius, dome):
+    """Height dome (1 - r**2)**2 of one droplet, where it is the highest."""
+    for s in range(work.shape[1]):
+        dx, dy, dz = work[_MX, s] - x, work[_MY, s] - y, work[_MZ, s] - z
+        rest = 1.0 - (dx * dx + dy * dy + dz * dz) / (radius * radius)
+        if rest > 0.0 and dome * rest * rest > work[_HEIGHT, s]:
+            normal = dx * work[_NX, s] + dy * work[_NY, s] + dz * work[_NZ, s]
+            slope = -4.0 * dome * rest / (radius * radius)
+            work[_HEIGHT, s] = dome * rest * rest
+            work[_DX, s] = slope * (dx - normal * work[_NX, s])
+            work[_DY, s] = slope * (dy - normal * work[_NY, s])
+            work[_DZ, s] = slope * (dz - normal * work[_NZ, s])
+
+
+@njit(cache=True, nogil=True)
+def _relief(work, grid, cells, paint, seed):
+    """Add the wrinkles to height and slope."""
+    _enter_lattice(work, grid, cells, paint)
+    _noise(grid, cells, seed)
+    for s in range(work.shape[1]):
+        cover = work[_COVER, s]
+        scale = (1.0 - cover) * paint[8] + cover * paint[13]
+        work[_HEIGHT, s] += scale * (paint[9] if cover < 0.5 else paint[14]) * grid[3, s]
+        p, q, r = scale * grid[4, s], scale * grid[5, s], scale * grid[6, s]
+        gx, gy, gz = _A * p + _C * q + _B * r, _B * p + _A * q + _C * r, _C * p + _B * q + _A * r
+        normal = gx * work[_NX, s] + gy * work[_NY, s] + gz * work[_NZ, s]
+        work[_DX, s] += gx - normal * work[_NX, s]
+        work[_DY, s] += gy - normal * work[_NY, s]
+        work[_DZ, s] += gz - normal * work[_NZ, s]
+
+
+@njit(cache=True, nogil=True)
+def _finish(work, paint):
+    """Micro-normal and reflection properties of the samples."""
+    for s in range(work.shape[1]):
+        fx, fy, fz = work[_NX, s] - work[_DX, s], work[_NY, s] - work[_DY, s], work[_NZ, s] - work[_DZ, s]
+        inverse = 1.0 / math.sqrt(fx * fx + fy * fy + fz * fz)
+        work[_FX, s], work[_FY, s], work[_FZ, s] = fx * inverse, fy * inverse, fz * inverse
+        cover = work[_COVER, s]
+        work[_ALBEDO, s] = (1.0 - cover) * paint[7] + cover * paint[12]
+        work[_GLOSS, s] = (1.0 - cover) * paint[10] + cover * paint[15]
+        work[_VARIANCE, s] = (1.0 - cover) * paint[11] + cover * paint[16]
+
+
+@njit(cache=True, nogil=True)
+def _locate(work, x0, y0, lens, frame, body, affine):
+    """Where the rays through the pixels (x0 + `_CX`, y0 + `_CY`) meet the body; `_SEEN` is 1 or 0."""
+    scale = 1.0 / (lens[0] * (1.0 + lens[3]))
+    x0, y0 = x0 - lens[1] - lens[4], y0 - lens[2] - lens[5]
+    # axes that the surface curves about: 0 for the plate, x and z for the cylinder, all for the sphere
+    plate, round_y = body[0] == PLATE, 1.0 if body[0] == SPHERE else 0.0
+    curvature = 0.0 if plate else 1.0 / body[1]
+    ox, oy, oz = frame[0], frame[1], frame[2]
+    rest = ox * ox + oz * oz + round_y * oy * oy - body[1] * body[1]
+    for s in range(work.shape[1]):
+        cx, cy = (x0 + work[_CX, s]) * scale, (y0 + work[_CY, s]) * scale
+        dx = frame[3] * cx + frame[4] * cy + frame[5]
+        dy = frame[6] * cx + frame[7] * cy + frame[8]
+        dz = frame[9] * cx + frame[10] * cy + frame[11]
+        inverse = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
+        square = dx * dx + dz * dz + round_y * dy * dy
+        half = ox * dx + oz * dz + round_y * oy * dy
+        root = half * half - square * rest
+        t = -oz / dz if plate else (-half - math.sqrt(max(root, 0.0))) / square
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        nx, ny, nz = curvature * x, curvature * round_y * y, -1.0 if plate else curvature * z
+        mx = affine[0] * x + affine[1] * y + affine[4]
+        my = affine[2] * x + affine[3] * y + affine[5]
+        facing = -(nx * dx + ny * dy + nz * dz)
+        seen = t > 0.0 and (plate or root > 0.0) and facing > 0.0
+        work[_SEEN, s] = 1.0 if seen else 0.0
+        work[_X, s], work[_Y, s], work[_Z, s] = x, y, z
+        work[_MX, s], work[_MY, s], work[_MZ, s] = mx, my, 0.0 if plate else z
+        work[_NX, s], work[_NY, s], work[_NZ, s] = nx, ny, nz
+        work[_VX, s], work[_VY, s], work[_VZ, s] = -dx, -dy, -dz
+
+
+@njit(cache=True, nogil=True)
+def _limit(work, body):
+    """Nothing is seen beyond the body's edge."""
+    for s in range(work.shape[1]):
+        inside = abs(work[_MX, s]) <= body[2] and abs(work[_MY, s]) <= body[3]
+        work[_SEEN, s] = work[_SEEN, s] if inside else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _spray(work, found, body, paint, counts, seed):
+    """Droplets of a tile: gathered once, or sample by sample where the tile spreads too far (grazing rays, edges)."""
+    middle, far = work.shape[1] // 2, 0.0
+    x, y, z = work[_MX, middle], work[_MY, middle], work[_MZ, middle]
+    for s in range(work.shape[1]):
+        square = (work[_MX, s] - x) ** 2 + (work[_MY, s] - y) ** 2 + (work[_MZ, s] - z) ** 2
+        if not square <= far:
+            far = square if square == square else 1e30
+    if far <= (6.0 * paint[3]) ** 2:
+        n = _gather(found, x, y, z, math.sqrt(far) + 1e-9, body, paint, counts, seed)
+        _coat(work, found, n, paint)
+        return
+    one = np.empty((_FIELDS, 1))
+    for s in range(work.shape[1]):
+        n = 0
+        if work[_SEEN, s] > 0.0:
+            n = _gather(found, work[_MX, s], work[_MY, s], work[_MZ, s], 0.0, body, paint, counts, seed)
+        one[:, 0] = work[:, s]
+        _coat(one, found, n, paint)
+        work[:, s] = one[:, 0]
+
+
+@njit(cache=True, nogil=True)
+def _light(work, light):
     """Radiance towards the camera in units of what an ideal white, facing the light at its nominal distance, gives.
 
     Lambert plus a micro-facet lobe exp((m.h - 1)/variance) with the masking of Cook and Torrance (1982).
     """
-    lx, ly, lz = light[0] - x, light[1] - y, light[2] - z
-    square = lx * lx + ly * ly + lz * lz
-    inverse = 1.0 / math.sqrt(square)
-    lx, ly, lz = lx * inverse, ly * inverse, lz * inverse
-    nl = n[0] * lx + n[1] * ly + n[2] * lz
-    ml = m[0] * lx + m[1] * ly + m[2] * lz
-    if nl <= 0.0 or ml <= 0.0:
-        return 0.0
-    # a facet beyond twice its share is in the shadow of its neighbours: no step at the terminator
-    total = albedo * min(ml, 2.0 * nl)
-    mv = m[0] * v[0] + m[1] * v[1] + m[2] * v[2]
-    if gloss > 0.0 and mv > 0.0:
-        hx, hy, hz = lx + v[0], ly + v[1], lz + v[2]
+    for s in range(work.shape[1]):
+        lx, ly, lz = light[0] - work[_X, s], light[1] - work[_Y, s], light[2] - work[_Z, s]
+        square = lx * lx + ly * ly + lz * lz
+        inverse = 1.0 / math.sqrt(square)
+        lx, ly, lz = lx * inverse, ly * inverse, lz * inverse
+        vx, vy, vz = work[_VX, s], work[_VY, s], work[_VZ, s]
+        nl = work[_NX, s] * lx + work[_NY, s] * ly + work[_NZ, s] * lz
+        ml = work[_FX, s] * lx + work[_FY, s] * ly + work[_FZ, s] * lz
+        mv = work[_FX, s] * vx + work[_FY, s] * vy + work[_FZ, s] * vz
+        hx, hy, hz = lx + vx, ly + vy, lz + vz
         length = math.sqrt(hx * hx + hy * hy + hz * hz)
         mh = (ml + mv) / length
-        exponent = (mh - 1.0) / variance
-        if exponent > -25.0:
-            vh = 0.5 * length
-            masking = min(1.0, 2.0 * mh * mv / vh, 2.0 * mh * ml / vh)
-            total += gloss * math.exp(exponent) * masking / mv
-    return light[3] / square * total
+        lit = work[_SEEN, s] * light[3] / square if nl > 0.0 and ml > 0.0 else 0.0
+        # a facet beyond twice its share is in the shadow of its neighbours: no step at the terminator
+        work[_ENERGY, s] = lit * work[_ALBEDO, s] * min(ml, 2.0 * nl)
+        reflected = lit * work[_GLOSS, s] if mv > 0.0 else 0.0
+        work[_HEIGHT, s] = reflected * min(1.0, 4.0 * mh * min(mv, ml) / length) / max(mv, 1e-9)
+        work[_EXPONENT, s] = (mh - 1.0) / work[_VARIANCE, s] if reflected > 0.0 else -1e9
+    for s in range(work.shape[1]):
+        if work[_EXPONENT, s] > -25.0:
+            work[_ENERGY, s] += work[_HEIGHT, s] * math.exp(work[_EXPONENT, s])
 
 
 @njit(cache=True, nogil=True)
-def hit(body, o, dx, dy, dz):
-    """Distance along the ray to the body's front, or -1."""
-    if body[0] == PLATE:
-        return -o[2] / dz if dz != 0.0 else -1.0
-    square, half, rest = dx * dx + dz * dz, o[0] * dx + o[2] * dz, o[0] * o[0] + o[2] * o[2]
-    if body[0] == SPHERE:
-        square, half, rest = square + dy * dy, half + o[1] * dy, rest + o[1] * o[1]
-    rest -= body[1] * body[1]
-    root = half * half - square * rest
-    return (-half - math.sqrt(root)) / square if root > 0.0 else -1.0
+def _trace_tile(out, x0, y0, lens, frame, body, affine, material, lights, paint, counts, seed):
+    """Radiance (k, rows, columns) of the sub-pixel samples of a tile whose first sample lies at pixel (x0, y0)."""
+    samples, across = out.shape[1], out.shape[2]
+    found = np.empty((MAX_CANDIDATES, 4))
+    work = np.empty((_FIELDS, samples * across))
+    grid, cells = np.empty((7, work.shape[1]), dtype=np.float32), np.empty((3, work.shape[1]), dtype=np.int32)
+    for s in range(work.shape[1]):
+        work[_CX, s], work[_CY, s] = (s % across) / samples, (s // across) / samples
+    _locate(work, x0, y0, lens, frame, body, affine)
+    if material.size > 0:
+        for s in range(work.shape[1]):
+            work[_MX, s], work[_MY, s] = material[s // across, s % across, 0], material[s // across, s % across, 1]
+    _limit(work, body)
+    _spray(work, found, body, paint, counts, seed)
+    _relief(work, grid, cells, paint, np.uint32(seed ^ np.uint32(0x5BD1E995)))
+    _finish(work, paint)
+    for j in range(lights.shape[0]):
+        _light(work, lights[j])
+        for r in range(samples):
+            for c in range(across):
+                s = r * across + c
+                out[j, r, c] = work[_ENERGY, s] if work[_SEEN, s] > 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def trace_rows(out, first_row, samples, taps, pad, camera, frame, body, affine, material, lights, paint, counts, seed):
+def trace_rows(out, first_row, samples, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed):
     """Radiance of every light along sub-pixel rows, filtered along x to whole pixels.
 
     Parameters
     ----------
     out : (k, n, W) float32
-        Written: light j on sub-pixel row ``first_row + i``.
+        Written: light j on sub-pixel row ``first_row + i``; n is a multiple of `samples`.
     first_row : int
         First sub-pixel row; row r lies at y = (r + 1/2)/samples - 1/2 px.
     samples, pad : int
@@ -222,59 +379,28 @@ def trace_rows(out, first_row, samples, taps, pad, camera, frame, body, affine, 
     """
     width = out.shape[2]
     columns = samples * (width + 2 * pad)
-    slack = 0.5 * paint[3]
-    for i in prange(out.shape[1]):
-        line = np.zeros((lights.shape[0], columns), dtype=np.float32)
-        found = np.empty((MAX_CANDIDATES, 4))
-        near = np.full(3, 1e30)
-        n, m, v = np.empty(3), np.empty(3), np.empty(3)
-        count = 0
-        cy = ((first_row + i + 0.5) / samples - 0.5 - camera[2] - camera[5]) / (camera[0] * (1.0 + camera[3]))
-        for s in range(columns):
-            cx = ((s + 0.5) / samples - 0.5 - pad - camera[1] - camera[4]) / (camera[0] * (1.0 + camera[3]))
-            dx = frame[3] * cx + frame[4] * cy + frame[5]
-            dy = frame[6] * cx + frame[7] * cy + frame[8]
-            dz = frame[9] * cx + frame[10] * cy + frame[11]
-            t = hit(body, frame, dx, dy, dz)
-            if t <= 0.0:
-                continue
-            x, y, z = frame[0] + t * dx, frame[1] + t * dy, frame[2] + t * dz
-            n[0], n[1], n[2] = 0.0, 0.0, -1.0
-            mx, my, mz = x, y, z
-            if body[0] == PLATE:
-                mz = 0.0
-                if material.size > 0:
-                    mx, my = material[i, s, 0], material[i, s, 1]
-                else:
-                    mx = affine[0] * x + affine[1] * y + affine[4]
-                    my = affine[2] * x + affine[3] * y + affine[5]
-            else:
-                n[0], n[2] = x / body[1], z / body[1]
-                n[1] = y / body[1] if body[0] == SPHERE else 0.0
-            inverse = -1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-            v[0], v[1], v[2] = dx * inverse, dy * inverse, dz * inverse
-            facing = n[0] * v[0] + n[1] * v[1] + n[2] * v[2]
-            if facing <= 0.0 or not (abs(mx) <= body[2] and abs(my) <= body[3]):
-                continue
-            if (mx - near[0]) ** 2 + (my - near[1]) ** 2 + (mz - near[2]) ** 2 > slack * slack:
-                near[0], near[1], near[2] = mx, my, mz
-                count = gather(found, mx, my, mz, n[0], n[1], n[2], slack, paint, counts, seed)
-            cover, _, dsx, dsy, dsz = coat(found, count, mx, my, mz, n[0], n[1], n[2], paint)
-            _, sx, sy, sz = relief(cover, mx, my, mz, n[0], n[1], n[2], paint, seed + np.uint64(1))
-            m[0], m[1], m[2] = n[0] - sx - dsx, n[1] - sy - dsy, n[2] - sz - dsz
-            length = 1.0 / math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-            m[0], m[1], m[2] = m[0] * length, m[1] * length, m[2] * length
-            albedo = (1.0 - cover) * paint[7] + cover * paint[12]
-            gloss = (1.0 - cover) * paint[10] + cover * paint[15]
-            variance = (1.0 - cover) * paint[11] + cover * paint[16]
-            for j in range(lights.shape[0]):
-                line[j, s] = radiance(lights[j], x, y, z, n, m, v, albedo, gloss, variance)
+    for block in prange(out.shape[1] // samples):
+        line = np.empty((lights.shape[0], samples, columns), dtype=np.float32)
+        row = block * samples
+        for left in range(0, columns, samples * TILE):
+            across = min(samples * TILE, columns - left)
+            points = material[row : row + samples, left : left + across] if material.size > 0 else material
+            x0, y0 = (left + 0.5) / samples - 0.5 - pad, (first_row + row + 0.5) / samples - 0.5
+            tile = line[:, :, left : left + across]
+            _trace_tile(tile, x0, y0, lens, frame, body, affine, points, lights, paint, counts, seed)
         for j in range(lights.shape[0]):
-            for c in range(width):
-                total = 0.0
-                for q in range(taps.size):
-                    total += taps[q] * line[j, c * samples + q]
-                out[j, i, c] = total
+            for r in range(samples):
+                _decimate(out[j, row + r], line[j, r], samples, taps)
+
+
+@njit(cache=True, nogil=True)
+def _decimate(out, line, samples, taps):
+    """Weighted sums of sub-pixel samples, one per pixel."""
+    for c in range(out.size):
+        total = 0.0
+        for q in range(taps.size):
+            total += taps[q] * line[c * samples + q]
+        out[c] = total
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -291,14 +417,22 @@ def filter_columns(out, rows, samples, taps):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def sample_paint(out, points, normals, paint, counts, seed):
-    """Cover, height (mm) and slope vector of the paint at material points: `out` (N, 5)."""
-    for p in prange(points.shape[0]):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
+def sample_paint(out, points, body, paint, counts, seed):
+    """Cover, height (mm) and slope vector of the paint at points on the body: `out` (N, 5)."""
+    for block in prange((points.shape[0] + 255) // 256):
+        start, stop = 256 * block, min(256 * block + 256, points.shape[0])
         found = np.empty((MAX_CANDIDATES, 4))
-        count = gather(found, x, y, z, nx, ny, nz, 0.0, paint, counts, seed)
-        cover, height, dsx, dsy, dsz = coat(found, count, x, y, z, nx, ny, nz, paint)
-        rise, sx, sy, sz = relief(cover, x, y, z, nx, ny, nz, paint, seed + np.uint64(1))
-        out[p, 0], out[p, 1] = cover, height + rise
-        out[p, 2], out[p, 3], out[p, 4] = sx + dsx, sy + dsy, sz + dsz
+        work = np.zeros((_FIELDS, stop - start))
+        grid, cells = np.empty((7, stop - start), dtype=np.float32), np.empty((3, stop - start), dtype=np.int32)
+        for p in range(stop - start):
+            x, y, z = points[start + p, 0], points[start + p, 1], points[start + p, 2]
+            work[_MX, p], work[_MY, p], work[_MZ, p] = x, y, z
+            work[_SEEN, p], work[_NZ, p] = 1.0, -1.0
+            if body[0] != PLATE:
+                work[_NX, p], work[_NZ, p] = x / body[1], z / body[1]
+                work[_NY, p] = y / body[1] if body[0] == SPHERE else 0.0
+        _spray(work, found, body, paint, counts, seed)
+        _relief(work, grid, cells, paint, np.uint32(seed ^ np.uint32(0x5BD1E995)))
+        for p in range(stop - start):
+            for column in range(5):
+                out[start + p, column] = work[_COVER + column, p]

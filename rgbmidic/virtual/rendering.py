@@ -137,7 +137,7 @@ def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> np
         material = np.empty((0, 0, 2))
         if affine is None:
             material = _subpixel_material(scene, state, lights[0], first, rows.shape[1], pad)
-        body, identity = scene.body._parameters(), np.array([1.0, 0, 0, 1, 0, 0])
+        body, identity = scene.body.parameters(), np.array([1.0, 0, 0, 1, 0, 0])
         trace_rows(
             rows, first, n, taps, pad, lens, frame, body, identity if affine is None else affine, material, positions,
             *scene.surface.parameters(),
@@ -186,14 +186,14 @@ def _intersect(scene: Scene, state: State, x: Array, y: Array) -> Array:
         if isinstance(scene.body, Plate):
             distance = -start[2] / direction[2]
         else:
-            axes = [0, 1, 2] if scene.body._parameters()[0] == 2 else [0, 2]
+            axes = [0, 1, 2] if scene.body.parameters()[0] == 2 else [0, 2]
             a = (direction[axes] ** 2).sum(axis=0)
             b = np.einsum("i,i...->...", start[axes], direction[axes])
             c = (start[axes] ** 2).sum() - scene.body.radius**2
             distance = (-b - np.sqrt(b * b - a * c)) / a
         distance = np.where(distance > 0, distance, np.nan)
     point = start.reshape(3, *[1] * x.ndim) + distance * direction
-    limits = scene.body._parameters()[2:]
+    limits = scene.body.parameters()[2:]
     if not isinstance(scene.body, Plate):
         point[:, abs(point[1]) > limits[1]] = np.nan
     return np.asarray(point)
@@ -223,7 +223,7 @@ def _normals(scene: Scene, material: Array) -> Array:
         normal[2] = -1.0
         return normal
     normal = material / scene.body.radius
-    if scene.body._parameters()[0] == 1:
+    if scene.body.parameters()[0] == 1:
         normal[1] = 0.0
     return normal
 

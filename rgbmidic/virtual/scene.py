@@ -42,7 +42,8 @@ class Sphere:
         """Rotation from the body's axes to the camera's in the reference state."""
         return np.eye(3)
 
-    def _parameters(self) -> Array:
+    def parameters(self) -> Array:
+        """[kind, radius, half width, half height] for the kernels."""
         return np.array([kernels.SPHERE, self.radius, np.inf, np.inf])
 
 
@@ -68,7 +69,8 @@ class Cylinder:
         """Rotation from the body's axes to the camera's in the reference state."""
         return rotation(self.tilt_deg, (0.0, 0.0, 1.0))
 
-    def _parameters(self) -> Array:
+    def parameters(self) -> Array:
+        """[kind, radius, half width, half height] for the kernels."""
         return np.array([kernels.CYLINDER, self.radius, np.inf, self.length / 2])
 
 
@@ -94,7 +96,8 @@ class Plate:
         """Rotation from the body's axes to the camera's in the reference state."""
         return rotation(self.tilt_deg[1], (1.0, 0.0, 0.0)) @ rotation(self.tilt_deg[0], (0.0, 1.0, 0.0))
 
-    def _parameters(self) -> Array:
+    def parameters(self) -> Array:
+        """[kind, radius, half width, half height] for the kernels."""
         return np.array([kernels.PLATE, 0.0, self.width / 2, self.height / 2])
 
 

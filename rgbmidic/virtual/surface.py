@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.render import sample_paint
+from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.errors import InputError
 
 __all__ = ["Finish", "Surface", "height_map"]
@@ -116,7 +116,7 @@ class Surface:
         mean_square = (2 * math.sinh(a / 2) / a) ** 2 if a else 1.0
         return -math.log(1 - self.coverage) / (math.pi / 4 * self.droplet**2 * mean_square)
 
-    def parameters(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], np.uint64]:
+    def parameters(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], np.uint32]:
         """What the kernels of `rgbmidic._kernels.render` take: paint, counts and seed."""
         radius = self.droplet / 2
         shell = 0.3 * radius
@@ -126,17 +126,19 @@ class Surface:
         counts = _poisson_table(self.droplets_per_area * cell**3 / (2 * shell))
         head = [cell, shell, reach, radius, self.spread, self.softness, self.dome]
         paint = np.array([*head, *self.white._parameters(), *self.black._parameters()])
-        return paint, counts, np.uint64(np.random.SeedSequence(self.seed).generate_state(1, np.uint64)[0])
+        return paint, counts, np.uint32(np.random.SeedSequence(self.seed).generate_state(1)[0])
 
     def sample(
-        self, points: npt.NDArray[np.float64], normals: npt.NDArray[np.float64]
+        self, points: npt.NDArray[np.float64], body: npt.NDArray[np.float64]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Cover by black paint (0 to 1), height (mm) and slope vector at material points.
 
         Parameters
         ----------
-        points, normals : (N, 3)
-            Material points (mm) in the body's frame and the outward unit normals there.
+        points : (N, 3)
+            Points (mm) on the body's surface, in its axes.
+        body : (4,)
+            The body's parameters (`Plate.parameters` and so on).
 
         Returns
         -------
@@ -146,7 +148,7 @@ class Surface:
             Gradient of the height in the tangent plane.
         """
         out = np.empty((len(points), 5))
-        sample_paint(out, np.ascontiguousarray(points), np.ascontiguousarray(normals), *self.parameters())
+        sample_paint(out, np.ascontiguousarray(points, dtype=float), body, *self.parameters())
         return out[:, 0], out[:, 1], out[:, 2:]
 
 
@@ -176,7 +178,7 @@ def height_map(
     steps = np.arange(round(size / pitch) + 1) * pitch
     x, y = np.meshgrid(corner[0] + steps, corner[1] + steps)
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    cover, height, _ = surface.sample(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape))
+    cover, height, _ = surface.sample(points, np.array([PLATE, 0.0, np.inf, np.inf]))
     return height.reshape(x.shape), cover.reshape(x.shape)
 
 
