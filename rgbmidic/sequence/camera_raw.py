@@ -18,7 +18,7 @@ from rgbmidic.sequence.tiff_structure import RawStructure
 if TYPE_CHECKING:
     import rawpy
 
-__all__ = ["MAXIMUM_FLAT_ROWS", "camera_raw_shape", "read_camera_raw"]
+__all__ = ["MAXIMUM_FLAT_ROWS", "camera_raw_shape", "has_camera_header", "read_camera_raw"]
 
 MAXIMUM_FLAT_ROWS = 0.01
 """Share of rows without any noise above which a camera raw counts as not decoded: defective rows may exist."""
@@ -69,7 +69,7 @@ def _open(path: Path) -> Iterator[rawpy.RawPy]:
     """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError."""
     import rawpy
 
-    if not _has_camera_header(path):
+    if not has_camera_header(path):
         raise _unsupported(path)
     try:
         with rawpy.imread(str(path)) as raw:
@@ -80,8 +80,11 @@ def _open(path: Path) -> Iterator[rawpy.RawPy]:
         raise _undecodable(path, error) from None
 
 
-def _has_camera_header(path: Path) -> bool:
-    """LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture."""
+def has_camera_header(path: Path) -> bool:
+    """Whether the file starts as camera raws do.
+
+    LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture.
+    """
     with path.open("rb") as file:
         head = file.read(12)
     return head.startswith(_CAMERA_HEADERS) or head[4:] == _CR3_HEADER

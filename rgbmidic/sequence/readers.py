@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rgbmidic.config import FrameKind
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.illumination.mosaic import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
-from rgbmidic.sequence.camera_raw import camera_raw_shape, read_camera_raw
+from rgbmidic.sequence.camera_raw import camera_raw_shape, has_camera_header, read_camera_raw
 from rgbmidic.sequence.contents import FileContents, damaged
 from rgbmidic.sequence.pictures import png_shape, read_headerless, read_png, read_tiff, tiff_shape
 from rgbmidic.sequence.tiff_structure import is_dng
@@ -97,9 +97,9 @@ def frame_shape(path: Path | str, shape: tuple[int, int] | None = None) -> tuple
 
 
 def tells_camera(path: Path | str) -> bool:
-    """Whether a frame file states its pattern and its black and white level itself (camera raws do)."""
+    """Whether the file tells pattern and levels itself, as camera raws do; TIFF, PNG and headerless do not."""
     path = Path(path)
-    return path.suffix.lower() not in _HEADERLESS and _format(path) == "camera raw"
+    return _format(path) == "camera raw" and _from_disk(has_camera_header, path)
 
 
 def _read(path: Path, kind: FrameKind | None, shape: tuple[int, int] | None, dtype: SampleType | None) -> FileContents:

@@ -1,8 +1,8 @@
 """The result of a test on disk: one folder that grows frame by frame and can be read at any time.
 
-``provenance.json`` (settings, inputs with their hashes, versions, dates), ``mesh.npz``, and one npz per frame under
-``solution/``. Every file appears under its name only when it is complete, so several processes may write frames and an
-interrupted run loses none that was finished.
+``provenance.json`` (settings, inputs with their hashes, versions, dates), ``mesh.npz``, ``reference.npz`` (the
+reference images as pictures) and one npz per frame under ``solution/``. Every file appears under its name only when it
+is complete, so several processes may write frames and an interrupted run loses none that was finished.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = ["FrameRecord", "Result", "ResultStore"]
 SCHEMA_NAME = "rgbmidic-result"
 SCHEMA_VERSION = 1
 
-_PROVENANCE, _MESH, _FRAMES = "provenance.json", "mesh.npz", "solution"
+_PROVENANCE, _MESH, _REFERENCE, _FRAMES = "provenance.json", "mesh.npz", "reference.npz", "solution"
 _FRAME_FILE = re.compile(r"frame_[0-9]{6,}\.npz(\.[0-9]+\.part)?")
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
 
@@ -66,6 +66,7 @@ class ResultStore:
         names: Sequence[str],
         lights: Sequence[str],
         settings: TestSettings | None = None,
+        reference: npt.ArrayLike | None = None,
         notes: Mapping[str, Any] | None = None,
         overwrite: bool = False,
     ) -> ResultStore:
@@ -81,6 +82,8 @@ class ResultStore:
             Name of each frame and of each light.
         settings
             Kept in the provenance, with the hash of the calibration file that they name.
+        reference : array, shape (k, H, W), optional
+            Reference image of each light, NaN where unknown; kept in 8 bit, for figures.
         notes
             Further plain values to keep in the provenance.
         overwrite
@@ -102,6 +105,9 @@ class ResultStore:
         _write_json(path / _PROVENANCE, provenance)
         _frame_path(path, 0).parent.mkdir(exist_ok=True)
         write_complete(path / _MESH, lambda file: np.savez(file, **mesh))
+        if reference is not None:
+            pictures = _pictures(np.asarray(reference, dtype=np.float32))
+            write_complete(path / _REFERENCE, lambda file: np.savez_compressed(file, pictures=pictures))
         return cls(path=path, frame_count=len(names), node_count=len(mesh["nodes"]), light_count=len(lights))
 
     def write_frame(self, index: int, record: FrameRecord) -> None:
@@ -220,6 +226,13 @@ class Result:
         return np.stack([getattr(record, name) for record in self._records])
 
     @cached_property
+    def reference(self) -> npt.NDArray[np.uint8] | None:
+        """Reference image of each light as a picture, shape (k, H, W); None where none was kept."""
+        if not (self.path / _REFERENCE).is_file():
+            return None
+        return read_arrays(self.path / _REFERENCE)["pictures"]
+
+    @cached_property
     def u(self) -> FloatArray:
         """Displacement in x, px, shape (T, N); NaN where not measured."""
         return self._stack("displacement")[..., 0]
@@ -279,6 +292,14 @@ def _frame_path(path: Path, index: int) -> Path:
     return path / _FRAMES / f"frame_{index:06d}.npz"
 
 
+def _pictures(images: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """Images in 8 bit, each stretched between its own extreme percent; 0 where unknown."""
+    low, high = np.nanpercentile(images, [1, 99], axis=(1, 2), keepdims=True)
+    scaled = 255 * (images - low) / np.maximum(high - low, 1e-6)
+    pictures: npt.NDArray[np.uint8] = np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8)
+    return pictures
+
+
 def _make_room(path: Path, *, overwrite: bool) -> None:
     """Make the folder, or empty it of an old result; nothing else in it is touched."""
     frames = path / _FRAMES
@@ -286,10 +307,11 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
         _read_provenance(path)  # refuses foreign files of this name
         if not overwrite:
             raise ResultError(f"{path} already holds a result; give another folder or allow overwriting it")
-    elif (path / _MESH).exists() or frames.exists():
-        raise ResultError(f"{path} holds {_MESH} or {_FRAMES}/ of something else; give another folder")
+    elif foreign := [name for name in (_MESH, _REFERENCE, _FRAMES) if (path / name).exists()]:
+        raise ResultError(f"{path} holds a {foreign[0]} that is not of a result; give another folder")
     try:
         path.mkdir(parents=True, exist_ok=True)
+        (path / _REFERENCE).unlink(missing_ok=True)
         for file in frames.glob("*"):
             if _FRAME_FILE.fullmatch(file.name):
                 file.unlink()

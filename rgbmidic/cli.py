@@ -1,0 +1,159 @@
+"""The command `rgbmidic`: thin; each sub-command calls one function of the library."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from rgbmidic import __version__
+from rgbmidic.errors import RgbmidicError
+from rgbmidic.report.export import EXPORT_FORMATS, export_result
+from rgbmidic.sequence.store import Result
+
+__all__ = ["app", "main"]
+
+BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
+_CONVERGED, _FAILED = 0, 2
+
+app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+_messages = Console(stderr=True)
+
+Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
+
+
+def main() -> None:
+    """Run the command; an error is one line on stderr, with its traceback only where ``--debug`` is given."""
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    handler = RichHandler(console=_messages, show_time=False, show_path=False, markup=False)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    sys.exit(_run(arguments, debug=debug))
+
+
+def _run(arguments: list[str], *, debug: bool) -> int:
+    try:
+        return app(args=arguments, standalone_mode=False) or 0
+    except KeyboardInterrupt:
+        return _fail("interrupted; what was finished is kept", INTERRUPTED)
+    except typer.Abort:
+        return _fail("aborted", FAILURE)
+    except Exception as error:  # the last resort of a command: whatever it is becomes one line and an exit status
+        if debug:
+            traceback.print_exc()
+        if isinstance(error, RgbmidicError):
+            return _fail(str(error), BAD_INPUT)
+        if (usage := getattr(error, "format_message", None)) is not None:  # typer's own, whichever click it brings
+            return _fail(usage(), BAD_INPUT)
+        return _fail(f"{type(error).__name__}: {error} (run again with --debug for the details)", FAILURE)
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return status
+
+
+@app.callback(invoke_without_command=True)
+def _rgbmidic(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an error comes from.")] = False,
+) -> None:
+    """Digital Image Correlation that survives light reflections."""
+    if version:
+        print(f"rgbmidic {__version__}")
+    elif context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+@app.command()
+def run(
+    test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
+    out: Out,
+    overwrite: Overwrite = False,
+    figures: Annotated[bool, typer.Option(help="Write pictures into DIR/figures.")] = True,
+) -> None:
+    """Measure a test: from raw frames to one displacement field per frame."""
+    from rgbmidic.config import read_test
+    from rgbmidic.pipeline import measure
+
+    started = time.perf_counter()
+    settings = read_test(test)
+    with _progress("measuring") as progress:
+        result = measure(settings, out, overwrite=overwrite, progress=progress)
+    if figures:
+        from rgbmidic.report.gallery import write_figures
+
+        write_figures(result, out / "figures")
+    _print_summary(result, time.perf_counter() - started)
+    if (result.status == _FAILED).all():
+        raise typer.Exit(_fail(f"every frame failed; the first says: {result.reasons[0]}", FAILURE))
+
+
+@app.command()
+def export(
+    result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that `rgbmidic run` wrote.")],
+    out: Annotated[Path, typer.Option("--out", help="File to write.")],
+    to: Annotated[str, typer.Option("--to", help=f"Format: {', '.join(EXPORT_FORMATS)}.")] = "npz",
+    overwrite: Overwrite = False,
+    partial: Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")] = False,
+) -> None:
+    """Write a result into one file for another program."""
+    export_result(Result.open(result, partial=partial), to, out, overwrite=overwrite)
+
+
+@app.command()
+def demo(out: Out) -> None:
+    """Make a small virtual test, calibrate, measure it, and compare with the known truth."""
+    from rgbmidic.demo import run_demo
+
+    run_demo(out)
+
+
+@app.command()
+def virtual(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to render.")],
+    out: Out,
+) -> None:
+    """Render a virtual test: raw frames, calibration captures and the exact truth."""
+    from rgbmidic.virtual.dataset import write_dataset
+
+    with _progress("rendering") as progress:
+        write_dataset(scene, out, progress)
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
+    """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.fields[line]}", markup=False), console=_messages) as bar:
+        task = bar.add_task(what, total=None, line="")
+        yield lambda done, total, line: bar.update(task, completed=done, total=total, line=line)
+
+
+def _print_summary(result: Result, seconds: float) -> None:
+    measured = 1 - (result.node_status > 0).mean()
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_row("frames", f"{len(result)}, {int((result.status == _CONVERGED).sum())} converged")
+    table.add_row("nodes", f"{len(result.nodes)}, {measured:.1%} measured")
+    for light, share in zip(result.lights, result.weight_share[result.status != _FAILED].T, strict=True):
+        table.add_row(f"light {light}", f"mean weight {share.mean():.2f}" if share.size else "-")
+    table.add_row("time", f"{seconds:.1f} s")
+    table.add_row("result", str(result.path))
+    Console(soft_wrap=True).print(table)
+
+
+if __name__ == "__main__":
+    main()
