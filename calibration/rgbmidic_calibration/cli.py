@@ -62,6 +62,9 @@ def crosstalk(
     shape: Shape = None,
     dtype: Dtype = None,
     block: Annotated[int, typer.Option(help="Side of the blocks that are averaged, px.")] = 16,
+    field: Annotated[
+        str, typer.Option(help="Degree by which A varies over the field: 0 to 4, or auto: what the data ask for.")
+    ] = "auto",
     allow: Allow = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -72,7 +75,12 @@ def crosstalk(
     check_output(out, overwrite=overwrite)
     statement = jobs.statement(kind, cfa, black_level, white_level, shape, dtype)
     calibration, estimate = jobs.calibrate_crosstalk(
-        named_patterns(light, "--light"), dark, statement, block=block, allow=tuple(allow or ())
+        named_patterns(light, "--light"),
+        dark,
+        statement,
+        block=block,
+        order=jobs.field_order(field),
+        allow=tuple(allow or ()),
     )
     calibration.write(out)
     display.crosstalk(estimate, out)

@@ -32,9 +32,12 @@ def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
     table.add_row("signal, DN", *(f"{fit.signal:.0f}" for fit in estimate.lights))
     table.add_row("captures", *(str(fit.captures) for fit in estimate.lights))
     table.add_row("blocks used, %", *(f"{100 * fit.used:.0f}" for fit in estimate.lights))
+    table.add_row("varies over field, rms", *(f"{fit.variation.rms:.5f}" for fit in estimate.lights))
+    table.add_row("  by chance, p", *(f"{fit.variation.p_value:.2g}" for fit in estimate.lights))
     table.add_row("strength drift, %", *(f"{100 * fit.intensity_drift:.2f}" for fit in estimate.lights))
     console.print(table)
-    console.print(f"condition number {result.condition_number:.2f}")
+    field = "the same everywhere" if result.field is None else f"varies over the field (degree {result.field.order})"
+    console.print(f"condition number {result.condition_number:.2f}; A {field}")
     console.print(f"written: {escape(str(out))}")
 
 

@@ -14,7 +14,7 @@ from rgbmidic_calibration.blocks import BlockMeans, block_means
 from rgbmidic_calibration.captures import CaptureFiles, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 
-__all__ = ["calibrate_crosstalk", "find_groups", "statement"]
+__all__ = ["calibrate_crosstalk", "field_order", "find_groups", "statement"]
 
 KINDS = ("bayer", "rgb", "monochrome")
 DTYPES = ("uint8", "uint16", ">u2")
@@ -60,6 +60,15 @@ def _as_option(key: re.Match[str]) -> str:
     return "--" + key[1].replace("_", "-")
 
 
+def field_order(text: str) -> int | None:
+    """Degree that ``--field`` states; None for ``auto``."""
+    if text == "auto":
+        return None
+    if not text.isdecimal():
+        raise ConfigurationError(f"--field is auto or a degree from 0, not {text!r}")
+    return int(text)
+
+
 def find_groups(
     lights: Mapping[str, str], dark: str | None, told: FrameSettings
 ) -> tuple[dict[str, CaptureFiles], CaptureFiles | None]:
@@ -74,6 +83,7 @@ def calibrate_crosstalk(
     told: FrameSettings,
     *,
     block: int = 16,
+    order: int | None = None,
     allow: Sequence[str] = (),
 ) -> tuple[Calibration, CrosstalkEstimate]:
     """Crosstalk section from capture files: patterns by light, pattern of the dark frames, what is stated of them."""
@@ -82,16 +92,23 @@ def calibrate_crosstalk(
     means = {name: _reduce(files, block, first) for name, files in found.items()}
     dark_means = _reduce(dark_files, block, first) if dark_files else []
     groups = [*found.values(), *([dark_files] if dark_files else [])]
-    estimate = estimate_crosstalk(
-        means, dark_means, allow=allow, labels={group.role.removeprefix("light "): group.labels for group in groups}
-    )
-    details = {"block": block, "waived_checks": list(allow), "warnings": list(estimate.warnings)}
+    labels = {group.role.removeprefix("light "): group.labels for group in groups}
+    estimate = estimate_crosstalk(means, dark_means, order=order, allow=allow, labels=labels)
+    details = {
+        "block": block,
+        "waived_checks": list(allow),
+        "warnings": list(estimate.warnings),
+        "variation_over_field": {
+            fit.name: {"p_value": fit.variation.p_value, "rms": fit.variation.rms} for fit in estimate.lights
+        },
+    }
     frame = first[0]
     calibration = Calibration(
         crosstalk=estimate.crosstalk,
         cfa=frame.cfa if isinstance(frame, Mosaic) else None,
         black_level=float(frame.black_level.mean()),
         white_level=frame.white_level,
+        shape=(frame.values.shape[-2], frame.values.shape[-1]),
         provenance={"crosstalk": provenance("crosstalk", groups, details)},
     )
     return calibration, estimate

@@ -47,6 +47,7 @@ COLOUR_LIMIT = 0.02
 DETAIL_LIMIT = 0.6
 INTENSITY_WARNING = 0.05
 COLOUR_DRIFT_WARNING = 5e-4
+OFFSET_WARNING, OFFSET_SIGNIFICANCE = 0.002, 5.0
 CONDITION_WARNING = 6.0
 
 
@@ -306,6 +307,13 @@ def _fit_warnings(fit: LightFit) -> list[str]:
         warnings.append(
             f"light {fit.name}: its colour drifts between captures (entries scatter by {fit.colour_drift:.2g} beyond "
             "noise); the stated uncertainty covers it"
+        )
+    left = np.abs(fit.offset)
+    if (clear := (left > OFFSET_SIGNIFICANCE * fit.offset_std) & (left > OFFSET_WARNING * fit.signal)).any():
+        channel = int(np.where(clear, left, 0).argmax())
+        warnings.append(
+            f"light {fit.name}: the {COLOURS[channel]} channel keeps {fit.offset[channel]:+.1f} DN where the light is "
+            "absent: dark frames of other settings or another ambient light, or a camera that is not linear"
         )
     if fit.rejected > 0.05:
         warnings.append(

@@ -18,77 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.camera_noise import CameraNoise
+from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
 from rgbmidic.illumination.mosaic import BAYER_PATTERNS, NoiseModel
+from rgbmidic.illumination.registration import Registration
 
 __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk"]
 
 SCHEMA_NAME = "rgbmidic-calibration"
 SCHEMA_VERSION = 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Crosstalk:
-    """How strongly each camera channel sees each light.
-
-    Attributes
-    ----------
-    matrix : ndarray, shape (C, k)
-        A in ``channels = A @ lights``; the largest entry of every column is 1.
-    lights : tuple of str, length k
-    covariance : ndarray, shape (C k, C k), or None
-        Covariance of the entries, taken row by row (``matrix.ravel()``).
-    std : ndarray, shape (C, k), or None
-        Standard uncertainty of every entry; from the covariance where that is given.
-    """
-
-    matrix: npt.NDArray[np.float64]
-    lights: tuple[str, ...]
-    std: npt.NDArray[np.float64] | None = None
-    covariance: npt.NDArray[np.float64] | None = None
-
-    def __post_init__(self) -> None:
-        matrix = np.asarray(self.matrix, dtype=np.float64)
-        if matrix.ndim != 2 or matrix.shape[1] != len(self.lights) or matrix.shape[1] > matrix.shape[0]:
-            raise CalibrationError(
-                f"a crosstalk matrix has one row per camera channel and one column per light, at most as many lights "
-                f"as channels; given is shape {matrix.shape} for the lights {', '.join(self.lights)}"
-            )
-        if not np.isfinite(matrix).all():
-            raise CalibrationError("the crosstalk matrix has entries that are not finite numbers")
-        condition = np.linalg.cond(matrix)
-        if not condition < 1e3:
-            raise CalibrationError(
-                f"the crosstalk matrix cannot be inverted (condition number {condition:.3g}, allowed is below 1000): "
-                "two lights look the same to the camera"
-            )
-        object.__setattr__(self, "matrix", matrix)
-        std = self.std
-        if self.covariance is not None:
-            covariance = _square(self.covariance, matrix.size, "the covariance of the crosstalk matrix")
-            object.__setattr__(self, "covariance", covariance)
-            std = np.sqrt(np.diag(covariance))
-        if std is not None:
-            object.__setattr__(self, "std", np.asarray(std, dtype=np.float64).reshape(matrix.shape))
-
-    @classmethod
-    def identity(cls, lights: tuple[str, ...]) -> Crosstalk:
-        """No crosstalk: every light is seen by its own channel alone."""
-        return cls(matrix=np.eye(len(lights)), lights=lights)
-
-    @property
-    def unmixing(self) -> npt.NDArray[np.float64]:
-        """The matrix (k, C) that turns channels into lights: the (pseudo-)inverse of A."""
-        return np.asarray(np.linalg.pinv(self.matrix), dtype=np.float64)
-
-    @property
-    def condition_number(self) -> float:
-        """Ratio of the largest to the smallest singular value of A."""
-        return float(np.linalg.cond(self.matrix))
-
-    @property
-    def noise_amplification(self) -> npt.NDArray[np.float64]:
-        """Noise of each light's image over the noise of one camera channel, shape (k,)."""
-        return np.asarray(np.sqrt((self.unmixing**2).sum(axis=1)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,21 +37,39 @@ class Calibration:
     ----------
     crosstalk, noise
         See `Crosstalk` and `NoiseModel`.
+    camera_noise
+        All figures of the photon transfer measurement, per colour plane; `noise` is its summary.
+    registration
+        Lateral registration of the lights; of the same lights, in the same order, as the crosstalk.
     cfa, black_level, white_level
         The camera settings of the captures, where they were stated or told by the files.
+    shape
+        Rows and columns of the captures.
     provenance
-        Inputs with their hashes, date, software version; kept as written.
+        Inputs with their hashes, date, software version, by section; kept as written.
     extra
         Sections of the file that this class does not interpret, kept when the file is written again.
     """
 
     crosstalk: Crosstalk | None = None
     noise: NoiseModel | None = None
+    camera_noise: CameraNoise | None = None
+    registration: Registration | None = None
     cfa: str | None = None
     black_level: float | None = None
     white_level: float | None = None
+    shape: tuple[int, int] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.crosstalk and self.registration and self.crosstalk.lights != self.registration.lights:
+            raise CalibrationError(
+                f"crosstalk and registration are of different lights: {', '.join(self.crosstalk.lights)} and "
+                f"{', '.join(self.registration.lights)}"
+            )
+        if self.noise is None and self.camera_noise is not None:
+            object.__setattr__(self, "noise", self.camera_noise.model)
 
     @classmethod
     def read(cls, path: Path | str) -> Calibration:
@@ -140,30 +96,27 @@ class Calibration:
             )
         try:
             return cls._from_document(document)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             reason = f"missing key {error}" if isinstance(error, KeyError) else error
             raise CalibrationError(f"{path} is damaged: {reason}") from None
 
     @classmethod
     def _from_document(cls, document: dict[str, Any]) -> Calibration:
-        known = {"schema", "schema_version", "crosstalk", "noise", "camera", "provenance"}
+        known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
         camera = document.get("camera", {})
         if (cfa := camera.get("cfa")) is not None and cfa not in BAYER_PATTERNS:
             raise ValueError(f"camera.cfa is {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
-        crosstalk = document.get("crosstalk")
         noise = document.get("noise")
+        shape = camera.get("shape")
         return cls(
-            crosstalk=crosstalk
-            and Crosstalk(
-                matrix=crosstalk["matrix"],
-                lights=tuple(crosstalk["lights"]),
-                std=crosstalk.get("std"),
-                covariance=crosstalk.get("covariance"),
-            ),
+            crosstalk=_read_crosstalk(document.get("crosstalk")),
             noise=noise and NoiseModel(gain=_positive(noise, "gain"), read_noise=_positive(noise, "read_noise")),
+            camera_noise=CameraNoise.from_document(noise["planes"]) if noise and "planes" in noise else None,
+            registration=_read_registration(document.get("registration")),
             cfa=cfa,
-            black_level=camera.get("black_level"),
-            white_level=camera.get("white_level"),
+            black_level=_level(camera, "black_level"),
+            white_level=_level(camera, "white_level"),
+            shape=None if shape is None else (int(shape[0]), int(shape[1])),
             provenance=document.get("provenance", {}),
             extra={key: value for key, value in document.items() if key not in known},
         )
@@ -171,34 +124,99 @@ class Calibration:
     def to_document(self) -> dict[str, Any]:
         """The JSON document, as plain dictionaries, lists and numbers."""
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION}
-        camera = {"cfa": self.cfa, "black_level": self.black_level, "white_level": self.white_level}
+        camera: dict[str, Any] = {"cfa": self.cfa, "black_level": self.black_level, "white_level": self.white_level}
+        camera["shape"] = None if self.shape is None else list(self.shape)
         document["camera"] = {key: value for key, value in camera.items() if value is not None}
-        if (crosstalk := self.crosstalk) is not None:
-            document["crosstalk"] = {
-                "lights": list(crosstalk.lights),
-                "matrix": crosstalk.matrix.tolist(),
-                "std": None if crosstalk.std is None else crosstalk.std.tolist(),
-                "covariance": None if crosstalk.covariance is None else crosstalk.covariance.tolist(),
-                "condition_number": crosstalk.condition_number,
-                "noise_amplification": crosstalk.noise_amplification.tolist(),
-            }
+        if self.crosstalk is not None:
+            document["crosstalk"] = _crosstalk_document(self.crosstalk)
         if self.noise is not None:
             document["noise"] = {"gain": self.noise.gain, "read_noise": self.noise.read_noise}
+            if self.camera_noise is not None:
+                document["noise"]["planes"] = self.camera_noise.to_document()
+        if self.registration is not None:
+            document["registration"] = _registration_document(self.registration)
         return {**document, **self.extra, "provenance": dict(self.provenance)}
 
     def write(self, path: Path | str) -> None:
-        """Write the calibration file; an existing file is replaced only once the new one is complete."""
+        """Write the calibration file; an existing file is replaced only once the new one is complete.
+
+        Raises
+        ------
+        CalibrationError
+            The file cannot be written.
+        """
         path = Path(path)
         temporary = path.with_name(path.name + ".part")
-        temporary.write_text(json.dumps(self.to_document(), indent=2) + "\n", encoding="utf-8")
-        temporary.replace(path)
+        try:
+            temporary.write_text(json.dumps(self.to_document(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            temporary.replace(path)
+        except OSError as error:
+            raise CalibrationError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
-def _square(values: npt.ArrayLike, size: int, name: str) -> npt.NDArray[np.float64]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape != (size, size) or not np.isfinite(array).all() or (np.diag(array) < 0).any():
-        raise CalibrationError(f"{name} must be {size} x {size} finite numbers with no negative variance")
-    return array
+def _read_crosstalk(section: dict[str, Any] | None) -> Crosstalk | None:
+    if section is None:
+        return None
+    variation = section.get("field")
+    return Crosstalk(
+        matrix=section["matrix"],
+        lights=tuple(section["lights"]),
+        std=section.get("std"),
+        covariance=section.get("covariance"),
+        field=variation
+        and CrosstalkField(
+            order=int(variation["order"]),
+            coefficients=variation["coefficients"],
+            shape=tuple(variation["shape"]),
+            std=variation.get("std"),
+        ),
+    )
+
+
+def _crosstalk_document(crosstalk: Crosstalk) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "lights": list(crosstalk.lights),
+        "matrix": crosstalk.matrix.tolist(),
+        "std": _listed(crosstalk.std),
+        "covariance": _listed(crosstalk.covariance),
+        "condition_number": crosstalk.condition_number,
+        "noise_amplification": crosstalk.noise_amplification.tolist(),
+    }
+    if (variation := crosstalk.field) is not None:
+        document["field"] = {
+            "order": variation.order,
+            "shape": list(variation.shape),
+            "coefficients": variation.coefficients.tolist(),
+            "std": _listed(variation.std),
+        }
+    return document
+
+
+def _read_registration(section: dict[str, Any] | None) -> Registration | None:
+    if section is None:
+        return None
+    return Registration(
+        lights=tuple(section["lights"]),
+        parameters=section["parameters"],
+        centre=tuple(section["centre"]),
+        radius=_positive(section, "radius"),
+        covariance=section.get("covariance"),
+    )
+
+
+def _registration_document(registration: Registration) -> dict[str, Any]:
+    return {
+        "lights": list(registration.lights),
+        "parameter_names": ["shift_x_px", "shift_y_px", "rotation_rad", "scale", "radial_at_radius"],
+        "parameters": registration.parameters.tolist(),
+        "centre": list(registration.centre),
+        "radius": registration.radius,
+        "covariance": _listed(registration.covariance),
+    }
+
+
+def _listed(values: npt.NDArray[np.float64] | None) -> Any:
+    return None if values is None else values.tolist()
 
 
 def _positive(section: dict[str, Any], key: str) -> float:
@@ -206,3 +224,10 @@ def _positive(section: dict[str, Any], key: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
         raise ValueError(f"{key} must be a positive number, not {value!r}")
     return float(value)
+
+
+def _level(camera: dict[str, Any], key: str) -> float | None:
+    value = camera.get(key)
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+        raise ValueError(f"camera.{key} must be a number, not {value!r}")
+    return None if value is None else float(value)

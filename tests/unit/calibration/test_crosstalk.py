@@ -244,3 +244,51 @@ def test_file_keeps_matrix_and_covariance(scene, tmp_path):
     assert (again.matrix == found.matrix).all()
     assert (again.covariance == found.covariance).all()
     assert again.std == pytest.approx(found.std)
+
+
+def varying_capture(picture, rng):
+    """Red light whose green entry grows from .14 at the centre to .154 half way to the corners, and leans in x."""
+    y, x = np.mgrid[-1 : 1 : picture.shape[0] * 1j, -1 : 1 : picture.shape[1] * 1j]
+    green = 0.14 + 0.014 * (x**2 + y**2) + 0.004 * x
+    channels = np.stack([picture, green * picture, 0.03 * picture])
+    return expose(channels, np.ones(3), rng), green
+
+
+@pytest.mark.parametrize("target", [white_target, speckle_target])
+def test_matrix_that_varies_over_the_field_is_found_where_the_data_ask_for_it(target):
+    rng = np.random.default_rng(12)
+    picture = 2500 * target((320, 320), rng)
+    frames = [varying_capture(picture, rng)[0] for _ in range(4)]
+    truth = varying_capture(picture, rng)[1]
+    found = estimate({"red": frames}, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(4)]).crosstalk
+    assert found.field.order == 2
+    points = np.stack(np.meshgrid(np.arange(0, 320, 20), np.arange(0, 320, 20)), axis=-1)
+    assert np.abs(found.at(points)[..., 1, 0] - truth[::20, ::20]).max() < 2e-3
+    assert found.matrix[1, 0] == pytest.approx(truth.mean(), abs=3e-4)
+
+
+def test_constant_matrix_gets_no_field(scene):
+    lights, dark = scene
+    found = estimate(lights, dark)
+    assert found.crosstalk.field is None
+    assert all(fit.variation.p_value > 1e-4 for fit in found.lights)
+    forced = estimate(lights, dark, order=2).crosstalk
+    assert np.abs(forced.field.coefficients / np.where(forced.field.std > 0, forced.field.std, np.inf)).max() < 5
+
+
+def test_dark_frames_of_other_settings_are_reported_on_a_textured_target(scene):
+    lights, _ = scene
+    rng = np.random.default_rng(6)
+    dark = [expose(np.zeros((160, 192)), MATRIX[:, 0], rng, black=BLACK + 15) for _ in range(2)]
+    dark = [relevel(frame, BLACK) for frame in dark]
+    found = estimate(lights, dark)
+    assert any("where the light is absent" in text for text in found.warnings)
+
+
+def test_field_survives_the_file(tmp_path):
+    rng = np.random.default_rng(12)
+    picture = 2500 * white_target((160, 160), rng)
+    found = estimate({"red": [varying_capture(picture, rng)[0] for _ in range(2)]}, order=1).crosstalk
+    Calibration(crosstalk=found).write(tmp_path / "c.json")
+    again = Calibration.read(tmp_path / "c.json").crosstalk
+    assert (again.at([[0, 0], [3, 99]]) == found.at([[0, 0], [3, 99]])).all()

@@ -1,0 +1,228 @@
+"""One column of A from one light's block averages: ratios of sums, constant or varying over the field.
+
+With x the reference channel's block average, y another channel's and phi the Legendre products over the field, the
+entry a(position) = sum_t a_t phi_t solves
+
+    sum over blocks of  w phi (y - x sum_t a_t phi_t) = 0,
+
+an instrumental-variable estimate: the instrument is the position, which carries no noise, so noise in x does not
+attenuate a as it does in least squares (Fuller, Measurement Error Models, 1987, section 1.4). The covariance is the
+cluster sandwich: the scatter of the score over neighbouring blocks, whatever causes it (noise, the texture's aliasing).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["ColumnFit", "Wald", "capture_scatter", "fit_column", "offsets_left", "wald"]
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+OUTLIER = 5.0
+"""Robust standard deviations beyond which a block is left out: a fluorescent spot, a label, a hot cluster."""
+
+DRIFT_SIGNIFICANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColumnFit:
+    """A column of A as a polynomial over the field.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (T, C)
+        Per Legendre product and channel; (1, 0, 0 ...) in the reference channel.
+    covariance : ndarray, shape (T, C, T, C)
+        From the scatter of the blocks.
+    leverage : ndarray, shape (T, C, C)
+        Change of the coefficients per grey level that all blocks of a channel (last axis) have too much.
+    weights : ndarray, shape (N, R, S)
+        1 for the blocks used, 0 for the others.
+    residual : ndarray, shape (N, C, R, S)
+        y - a x of the blocks used, 0 elsewhere.
+    mass : ndarray, shape (N,)
+        Sum of the reference channel over the blocks used, per capture.
+    clusters : int
+    """
+
+    coefficients: Floats
+    covariance: Floats
+    leverage: Floats
+    weights: Floats
+    residual: Floats
+    mass: Floats
+    clusters: int
+
+
+def fit_column(signal: Floats, valid: Bools, reference: int, design: Floats) -> ColumnFit:
+    """Fit one light's column.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (N, C, R, S)
+        Block averages above dark of N captures.
+    valid : ndarray, shape (N, R, S), bool
+        Blocks without saturated samples.
+    reference
+        Channel the others are compared with.
+    design : ndarray, shape (R, S, T)
+        Legendre products at the blocks' centres; T = 1 for a constant column.
+    """
+    base = signal[:, reference]
+    weights, coefficients = _without_outliers(signal, valid, reference, design)
+    residual = weights[:, None] * _residual(signal, base, design, coefficients)
+    inverse = np.linalg.inv(_moment(weights * base, design))
+    score = np.einsum("ncrs,rst->tcrs", residual, design)
+    sums = _cluster_sums(score.reshape(-1, *score.shape[2:]))
+    count = max(len(sums), 2)
+    terms, channels = coefficients.shape
+    spread = (sums.T @ sums * count / (count - 1)).reshape(terms, channels, terms, channels)
+    lever = np.einsum("tu,uc,cd->tcd", inverse, _total(weights, design)[:, None], np.eye(channels))
+    lever[:, :, reference] -= inverse @ _moment(weights, design) @ coefficients
+    return ColumnFit(
+        coefficients=coefficients,
+        covariance=np.einsum("tu,ucvd,wv->tcwd", inverse, spread, inverse),
+        leverage=lever,
+        weights=weights,
+        residual=residual,
+        mass=(weights * base).sum(axis=(1, 2)),
+        clusters=count,
+    )
+
+
+def _moment(weights: Floats, design: Floats) -> Floats:
+    return np.asarray(np.einsum("nrs,rst,rsu->tu", weights, design, design, optimize=True))
+
+
+def _total(weights: Floats, design: Floats) -> Floats:
+    return np.asarray(np.einsum("nrs,rst->t", weights, design))
+
+
+def _residual(signal: Floats, base: Floats, design: Floats, coefficients: Floats) -> Floats:
+    return np.asarray(signal - np.einsum("rst,tc->crs", design, coefficients) * base[:, None])
+
+
+def _without_outliers(signal: Floats, valid: Bools, reference: int, design: Floats) -> tuple[Floats, Floats]:
+    """Weights and coefficients, iterated from the median of the blocks' ratios.
+
+    Every channel's residual is compared with its median spread times the square root of x (shot noise). Weights
+    between 0 and 1 would need a correction of the sandwich and would cost efficiency.
+    """
+    base = signal[:, reference]
+    root = np.sqrt(np.maximum(base, 1e-3 * np.median(base[valid])))
+    ratios = signal / np.where(base > 0, base, np.inf)[:, None]
+    coefficients = np.zeros((design.shape[-1], signal.shape[1]))
+    coefficients[0] = np.median(ratios.transpose(0, 2, 3, 1)[valid], axis=0)
+    weights = valid.astype(np.float64)
+    for _ in range(20):
+        scaled = _residual(signal, base, design, coefficients) / root[:, None]
+        spread = np.median(np.abs(scaled.transpose(0, 2, 3, 1)[valid]), axis=0) / 0.6745
+        limit = np.where(spread > 0, OUTLIER * spread, np.inf)[:, None, None]
+        weights = (valid & (np.abs(scaled) <= limit).all(axis=1)).astype(np.float64)
+        right = np.einsum("nrs,ncrs,rst->tc", weights, signal, design, optimize=True)
+        update = np.linalg.solve(_moment(weights * base, design), right)
+        done = np.abs(update - coefficients).max() < 1e-10
+        coefficients = update
+        if done:
+            break
+    coefficients[:, reference] = np.eye(len(coefficients))[0]
+    return weights, coefficients
+
+
+def _cluster_sums(values: Floats) -> Floats:
+    """Sums (clusters, Q) of (Q, R, S) over 2 x 2 blocks: what spills over a block's border stays within a cluster."""
+    rows, columns = values.shape[1:]
+    step = 2 if rows * columns >= 64 else 1
+    by_rows = np.add.reduceat(values, np.arange(0, rows, step), axis=1)
+    return np.asarray(np.add.reduceat(by_rows, np.arange(0, columns, step), axis=2).reshape(len(values), -1).T)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wald:
+    """Does a column vary over the field?
+
+    Attributes
+    ----------
+    p_value : float
+        Probability of coefficients this large without variation.
+    rms : float
+        Root mean square over the field of the variation, of the channel where it is largest.
+    """
+
+    p_value: float
+    rms: float
+
+
+def wald(fit: ColumnFit, reference: int, terms: slice, norms: Floats) -> Wald:
+    """Test that the coefficients of some Legendre products are zero in every channel (Hotelling's T squared).
+
+    Parameters
+    ----------
+    fit
+        Fit that has these terms.
+    reference
+        Channel that is 1 by definition.
+    terms
+        Which of the products.
+    norms : ndarray, shape (T,)
+        Mean square over the field of every product.
+    """
+    from scipy.stats import f as fisher
+
+    others = [c for c in range(fit.coefficients.shape[1]) if c != reference]
+    value = fit.coefficients[terms][:, others]
+    covariance = fit.covariance[terms][:, others][:, :, terms][..., others].reshape(value.size, value.size)
+    rms = float(np.sqrt((value**2 * norms[: len(fit.coefficients)][terms, None]).sum(axis=0)).max())
+    freedom = fit.clusters - value.size
+    if freedom < 1:
+        return Wald(p_value=1.0, rms=rms)
+    squared = float(value.ravel() @ np.linalg.solve(covariance, value.ravel()))
+    return Wald(p_value=float(fisher.sf(squared / value.size * freedom / fit.clusters, value.size, freedom)), rms=rms)
+
+
+def capture_scatter(fit: ColumnFit) -> Floats:
+    """Variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
+
+    The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
+    """
+    from scipy.stats import f as fisher
+
+    count, channels = fit.residual.shape[:2]
+    if count < 2:
+        return np.zeros(channels)
+    share = fit.residual / fit.mass[:, None, None, None]
+    own = (share - share.mean(axis=0)).transpose(1, 0, 2, 3).reshape(channels, -1)
+    noise = (own**2).sum(axis=1) / (count - 1)
+    scatter = share.sum(axis=(2, 3)).var(axis=0, ddof=1)
+    limit = fisher.isf(DRIFT_SIGNIFICANCE / channels, count - 1, own.shape[1])
+    return np.where(scatter > limit * noise, scatter - noise, 0.0)
+
+
+def offsets_left(signal: Floats, weights: Floats, reference: int, design: Floats) -> tuple[Floats, Floats]:
+    """Grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
+
+    ``y = x a + o`` with the other captures' x as instrument for the slope: their noise is independent. NaN for fewer
+    than two captures. The offset of a dark level that is right is zero; on a plain target it is poorly determined.
+    """
+    count, channels = signal.shape[:2]
+    offset, std = np.full(channels, np.nan), np.full(channels, np.nan)
+    if count < 2:
+        return offset, std
+    base = signal[:, reference]
+    others = (base.sum(axis=0) - base) / (count - 1)
+    columns = [base[..., None] * design, np.ones((*base.shape, 1))]
+    instruments = [np.broadcast_to(design, (count, *design.shape)), others[..., None]]
+    left = weights[..., None] * np.concatenate(instruments, axis=-1)
+    right = np.concatenate(columns, axis=-1)
+    matrix = np.einsum("nrsi,nrsj->ij", left, right)
+    inverse = np.linalg.inv(matrix)
+    for channel in (c for c in range(channels) if c != reference):
+        solution = inverse @ np.einsum("nrsi,nrs->i", left, signal[:, channel])
+        score = (left * (signal[:, channel] - right @ solution)[..., None]).sum(axis=0)
+        sums = _cluster_sums(score.transpose(2, 0, 1)) @ inverse.T
+        offset[channel], std[channel] = solution[-1], np.sqrt((sums[:, -1] ** 2).sum())
+    return offset, std

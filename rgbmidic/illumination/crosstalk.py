@@ -1,0 +1,190 @@
+"""The crosstalk between lights and camera channels: ``channels = A @ lights``, everywhere alike or varying slowly.
+
+A varies over the field where the light falls on the colour filters at an angle (wide lenses, microlenses). It is then
+``A(x, y) = matrix + sum of coefficients x Legendre products``: the products average to zero over the field, so `matrix`
+stays the mean and whoever ignores the variation makes the smallest error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import CalibrationError
+
+__all__ = ["Crosstalk", "CrosstalkField", "legendre_products"]
+
+Floats = npt.NDArray[np.float64]
+
+
+def legendre_products(points: npt.ArrayLike, shape: tuple[int, int], order: int) -> Floats:
+    """Products of Legendre polynomials in x and y up to a total degree, on the field scaled to [-1, 1].
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 2)
+        Points (x, y) in px.
+    shape
+        Rows and columns of the field.
+    order
+        Largest total degree.
+
+    Returns
+    -------
+    ndarray, shape (..., T)
+        ``P_a(2x/(W-1) - 1) P_b(2y/(H-1) - 1)`` ordered by degree a + b, then by b; the first is 1,
+        T = (order + 1)(order + 2)/2.
+    """
+    from numpy.polynomial import legendre
+
+    xy = np.asarray(points, dtype=np.float64)
+    scaled = 2 * xy / (np.array(shape[::-1]) - 1) - 1
+    in_x, in_y = (legendre.legvander(scaled[..., axis], order) for axis in (0, 1))
+    terms = [in_x[..., total - b] * in_y[..., b] for total in range(order + 1) for b in range(total + 1)]
+    return np.stack(terms, axis=-1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CrosstalkField:
+    """How the crosstalk matrix departs from its mean over the field.
+
+    Attributes
+    ----------
+    order : int
+        Total degree of the polynomial, at least 1.
+    coefficients : ndarray, shape (T - 1, C, k)
+        One matrix per Legendre product after the constant one (`legendre_products`).
+    shape : tuple of int
+        Rows and columns of the frames.
+    std : ndarray, shape (T - 1, C, k), or None
+        Standard uncertainty of every coefficient.
+    """
+
+    order: int
+    coefficients: Floats
+    shape: tuple[int, int]
+    std: Floats | None = None
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.coefficients, dtype=np.float64)
+        terms = (self.order + 1) * (self.order + 2) // 2 - 1
+        if self.order < 1 or values.ndim != 3 or len(values) != terms or not np.isfinite(values).all():
+            raise CalibrationError(
+                f"a crosstalk field of order {self.order} needs {terms} finite matrices, not an array of {values.shape}"
+            )
+        object.__setattr__(self, "coefficients", values)
+        object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
+        if self.std is not None:
+            object.__setattr__(self, "std", np.asarray(self.std, dtype=np.float64).reshape(values.shape))
+
+    def departure(self, points: npt.ArrayLike) -> Floats:
+        """A(x, y) minus its mean at points (x, y), shape (..., C, k)."""
+        terms = legendre_products(points, self.shape, self.order)[..., 1:]
+        return np.asarray(np.tensordot(terms, self.coefficients, axes=1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Crosstalk:
+    """How strongly each camera channel sees each light.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (C, k)
+        A in ``channels = A @ lights``; the largest entry of every column is 1. Its mean where it varies.
+    lights : tuple of str, length k
+    covariance : ndarray, shape (C k, C k), or None
+        Covariance of the entries, taken row by row (``matrix.ravel()``).
+    std : ndarray, shape (C, k), or None
+        Standard uncertainty of every entry; from the covariance where that is given.
+    field : CrosstalkField or None
+        How A varies over the field; None: it is the same everywhere.
+    """
+
+    matrix: Floats
+    lights: tuple[str, ...]
+    std: Floats | None = None
+    covariance: Floats | None = None
+    field: CrosstalkField | None = None
+
+    def __post_init__(self) -> None:
+        matrix = np.asarray(self.matrix, dtype=np.float64)
+        if matrix.ndim != 2 or matrix.shape[1] != len(self.lights) or matrix.shape[1] > matrix.shape[0]:
+            raise CalibrationError(
+                f"a crosstalk matrix has one row per camera channel and one column per light, at most as many lights "
+                f"as channels; given is shape {matrix.shape} for the lights {', '.join(self.lights)}"
+            )
+        if not np.isfinite(matrix).all():
+            raise CalibrationError("the crosstalk matrix has entries that are not finite numbers")
+        condition = np.linalg.cond(matrix)
+        if not condition < 1e3:
+            raise CalibrationError(
+                f"the crosstalk matrix cannot be inverted (condition number {condition:.3g}, allowed is below 1000): "
+                "two lights look the same to the camera"
+            )
+        if self.field is not None and self.field.coefficients.shape[1:] != matrix.shape:
+            raise CalibrationError(
+                f"the field of the crosstalk is for matrices of shape {self.field.coefficients.shape[1:]}, "
+                f"the matrix has {matrix.shape}"
+            )
+        object.__setattr__(self, "matrix", matrix)
+        self._set_uncertainty()
+
+    def _set_uncertainty(self) -> None:
+        std, size = self.std, self.matrix.size
+        if self.covariance is not None:
+            covariance = np.asarray(self.covariance, dtype=np.float64)
+            if covariance.shape != (size, size) or not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
+                raise CalibrationError(
+                    f"the covariance of the crosstalk matrix must be {size} x {size} finite numbers with no negative "
+                    f"variance; given is shape {covariance.shape}"
+                )
+            object.__setattr__(self, "covariance", covariance)
+            std = np.sqrt(np.diag(covariance))
+        if std is not None:
+            object.__setattr__(self, "std", np.asarray(std, dtype=np.float64).reshape(self.matrix.shape))
+
+    @classmethod
+    def identity(cls, lights: tuple[str, ...]) -> Crosstalk:
+        """No crosstalk: every light is seen by its own channel alone."""
+        return cls(matrix=np.eye(len(lights)), lights=lights)
+
+    def at(self, points: npt.ArrayLike) -> Floats:
+        """A at points (x, y) in px of shape (..., 2): shape (..., C, k)."""
+        place = np.asarray(points, dtype=np.float64)
+        if self.field is None:
+            return np.broadcast_to(self.matrix, (*place.shape[:-1], *self.matrix.shape))
+        return np.asarray(self.matrix + self.field.departure(place))
+
+    @property
+    def unmixing(self) -> Floats:
+        """The matrix (k, C) that turns channels into lights: the (pseudo-)inverse of A."""
+        return np.asarray(np.linalg.pinv(self.matrix), dtype=np.float64)
+
+    def unmixing_at(self, points: npt.ArrayLike) -> Floats:
+        """The (pseudo-)inverse of A at points (x, y) in px of shape (..., 2): shape (..., k, C)."""
+        return np.asarray(np.linalg.pinv(self.at(points)), dtype=np.float64)
+
+    @property
+    def condition_number(self) -> float:
+        """Ratio of the largest to the smallest singular value of A."""
+        return float(np.linalg.cond(self.matrix))
+
+    @property
+    def noise_amplification(self) -> Floats:
+        """Noise of each light's image over the noise of one camera channel, shape (k,)."""
+        return np.asarray(np.sqrt((self.unmixing**2).sum(axis=1)))
+
+    @property
+    def leakage_std(self) -> Floats | None:
+        """Standard uncertainty (k, k) of what light j (column) leaves in the image of light i (row) after unmixing.
+
+        An error dA leaves ``-A^-1 dA`` there.
+        """
+        if self.covariance is None:
+            return None
+        channels, lights = self.matrix.shape
+        blocks = self.covariance.reshape(channels, lights, channels, lights)
+        variance = np.einsum("ic,cjdj,id->ij", self.unmixing, blocks, self.unmixing)
+        return np.asarray(np.sqrt(np.maximum(variance, 0)))
