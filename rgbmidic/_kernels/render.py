@@ -39,7 +39,7 @@ _FIELDS = 28
 _A, _B, _C = 0.80473785, -0.31061722, 0.50587936
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _hash(i, j, k, seed):
     """32 random bits of a lattice point (finaliser: "lowbias32" of C. Wellons)."""
     h = np.uint32(np.uint32(i) * np.uint32(0x8DA6B343))
@@ -48,31 +48,31 @@ def _hash(i, j, k, seed):
     return _mix(np.uint32(h ^ seed))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mix(h):
     h = np.uint32(np.uint32(h ^ np.uint32(h >> np.uint32(16))) * np.uint32(0x7FEB352D))
     h = np.uint32(np.uint32(h ^ np.uint32(h >> np.uint32(15))) * np.uint32(0x846CA68B))
     return np.uint32(h ^ np.uint32(h >> np.uint32(16)))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _unit(h):
     """A hash as a number in [0, 1)."""
     return np.float64(h) * (1.0 / 4294967296.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fade(t):
     return t * t * t * (t * (t * np.float32(6.0) - np.float32(15.0)) + np.float32(10.0))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fade_slope(t):
     rest = t * (t - np.float32(1.0))
     return np.float32(30.0) * rest * rest
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _corner(h, u, v, w, wu, wv, ww, du, dv, dw):
     """One lattice corner's share of the noise and of its gradient."""
     scale, one = np.float32(2.0 / 1023.0), np.float32(1.0)
@@ -84,7 +84,7 @@ def _corner(h, u, v, w, wu, wv, ww, du, dv, dw):
     return weight * dot, weight * p + dot * du * vw, weight * q + dot * wu * dv * ww, weight * r + dot * wu * wv * dw
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _enter_lattice(work, grid, cells, paint):
     """Position of the samples in the wrinkle lattice: cell and place within it."""
     for s in range(work.shape[1]):
@@ -96,7 +96,7 @@ def _enter_lattice(work, grid, cells, paint):
         grid[0, s], grid[1, s], grid[2, s] = np.float32(u - i), np.float32(v - j), np.float32(w - k)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _noise(grid, cells, seed):
     """Gradient noise (row 3 of `grid`) and its gradient (rows 4 to 6), in lattice units and axes."""
     one = np.float32(1.0)
@@ -121,7 +121,7 @@ def _noise(grid, cells, seed):
         grid[6, s] = ((r0 + r1) + (r2 + r3)) + ((r4 + r5) + (r6 + r7))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _gather(found, x, y, z, slack, body, paint, counts, seed):
     """Droplets (centre on the surface, radius) that can touch a point within `slack` of the given one; their number."""
     cell, reach = paint[0], paint[2] + slack
@@ -137,7 +137,7 @@ def _gather(found, x, y, z, slack, body, paint, counts, seed):
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _to_surface(x, y, z, body):
     """Height of a point above the body's surface, and the surface point below it."""
     if body[0] == PLATE:
@@ -147,7 +147,7 @@ def _to_surface(x, y, z, body):
     return length - body[1], x * scale, y * scale if body[0] == SPHERE else y, z * scale
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
     """Append the droplets of one cell that lie near enough."""
     cell, chance, number = paint[0], _unit(h), 0
@@ -175,7 +175,7 @@ def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _coat(work, found, n, paint):
     """Cover by black paint (0 to 1) of the samples, with height and slope of the droplet on top."""
     inverse, dome = 1.0 / max(paint[5], 1e-9), paint[6]
@@ -194,7 +194,7 @@ def _coat(work, found, n, paint):
         work[_COVER, s] = t * t * (3.0 - 2.0 * t)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _dome(work, x, y, z, radius, dome):
     """Height dome (1 - r**2)**2 of one droplet, where it is the highest."""
     for s in range(work.shape[1]):
@@ -209,7 +209,7 @@ def _dome(work, x, y, z, radius, dome):
             work[_DZ, s] = slope * (dz - normal * work[_NZ, s])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _relief(work, grid, cells, paint, seed):
     """Add the wrinkles to height and slope."""
     _enter_lattice(work, grid, cells, paint)
@@ -226,7 +226,7 @@ def _relief(work, grid, cells, paint, seed):
         work[_DZ, s] += gz - normal * work[_NZ, s]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _finish(work, paint):
     """Micro-normal and reflection properties of the samples."""
     for s in range(work.shape[1]):
@@ -239,41 +239,53 @@ def _finish(work, paint):
         work[_VARIANCE, s] = (1.0 - cover) * paint[11] + cover * paint[16]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _locate(work, x0, y0, lens, frame, body, affine):
     """Where the rays through the pixels (x0 + `_CX`, y0 + `_CY`) meet the body; `_SEEN` is 1 or 0."""
     scale = 1.0 / (lens[0] * (1.0 + lens[3]))
     x0, y0 = x0 - lens[1] - lens[4], y0 - lens[2] - lens[5]
-    # axes that the surface curves about: 0 for the plate, x and z for the cylinder, all for the sphere
-    plate, round_y = body[0] == PLATE, 1.0 if body[0] == SPHERE else 0.0
-    curvature = 0.0 if plate else 1.0 / body[1]
+    # the surface is quadric . (x², y², z²) = 1 along the axes it curves about, or the plane z = 0
+    ax, ay = 0.0 if body[0] == PLATE else 1.0, 1.0 if body[0] == SPHERE else 0.0
     ox, oy, oz = frame[0], frame[1], frame[2]
-    rest = ox * ox + oz * oz + round_y * oy * oy - body[1] * body[1]
+    rest = ax * (ox * ox + oz * oz) + ay * oy * oy - body[1] * body[1]
     for s in range(work.shape[1]):
         cx, cy = (x0 + work[_CX, s]) * scale, (y0 + work[_CY, s]) * scale
         dx = frame[3] * cx + frame[4] * cy + frame[5]
         dy = frame[6] * cx + frame[7] * cy + frame[8]
         dz = frame[9] * cx + frame[10] * cy + frame[11]
-        inverse = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-        dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
-        square = dx * dx + dz * dz + round_y * dy * dy
-        half = ox * dx + oz * dz + round_y * oy * dy
+        inverse = -1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
+        work[_VX, s], work[_VY, s], work[_VZ, s] = dx * inverse, dy * inverse, dz * inverse
+    for s in range(work.shape[1]):
+        dx, dy, dz = -work[_VX, s], -work[_VY, s], -work[_VZ, s]
+        square = ax * (dx * dx + dz * dz) + ay * dy * dy
+        half = ax * (ox * dx + oz * dz) + ay * oy * dy
         root = half * half - square * rest
-        t = -oz / dz if plate else (-half - math.sqrt(max(root, 0.0))) / square
-        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-        nx, ny, nz = curvature * x, curvature * round_y * y, -1.0 if plate else curvature * z
-        mx = affine[0] * x + affine[1] * y + affine[4]
-        my = affine[2] * x + affine[3] * y + affine[5]
-        facing = -(nx * dx + ny * dy + nz * dz)
-        seen = t > 0.0 and (plate or root > 0.0) and facing > 0.0
-        work[_SEEN, s] = 1.0 if seen else 0.0
-        work[_X, s], work[_Y, s], work[_Z, s] = x, y, z
-        work[_MX, s], work[_MY, s], work[_MZ, s] = mx, my, 0.0 if plate else z
-        work[_NX, s], work[_NY, s], work[_NZ, s] = nx, ny, nz
-        work[_VX, s], work[_VY, s], work[_VZ, s] = -dx, -dy, -dz
+        plane, curved = -oz / dz, (-half - math.sqrt(max(root, 0.0))) / square
+        t = plane if ax == 0.0 else curved
+        work[_SEEN, s] = 1.0 if (t > 0.0) & ((root > 0.0) | (ax == 0.0)) else 0.0
+        work[_X, s], work[_Y, s], work[_Z, s] = ox + t * dx, oy + t * dy, oz + t * dz
+    _settle(work, body, affine)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _settle(work, body, affine):
+    """Material point and normal of the points hit; none where the surface turns its back."""
+    plate, round_y = body[0] == PLATE, 1.0 if body[0] == SPHERE else 0.0
+    curvature = 0.0 if plate else 1.0 / body[1]
+    back = -1.0 if plate else 0.0
+    thick = 0.0 if plate else 1.0
+    for s in range(work.shape[1]):
+        x, y, z = work[_X, s], work[_Y, s], work[_Z, s]
+        work[_MX, s] = affine[0] * x + affine[1] * y + affine[4]
+        work[_MY, s] = affine[2] * x + affine[3] * y + affine[5]
+        work[_MZ, s] = thick * z
+        work[_NX, s], work[_NY, s], work[_NZ, s] = curvature * x, curvature * round_y * y, curvature * z + back
+    for s in range(work.shape[1]):
+        facing = work[_NX, s] * work[_VX, s] + work[_NY, s] * work[_VY, s] + work[_NZ, s] * work[_VZ, s]
+        work[_SEEN, s] = work[_SEEN, s] if facing > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _limit(work, body):
     """Nothing is seen beyond the body's edge."""
     for s in range(work.shape[1]):
@@ -281,10 +293,10 @@ def _limit(work, body):
         work[_SEEN, s] = work[_SEEN, s] if inside else 0.0
 
 
-@njit(cache=True, nogil=True)
-def _spray(work, found, body, paint, counts, seed):
-    """Droplets of a tile: gathered once, or sample by sample where the tile spreads too far (grazing rays, edges)."""
-    middle, far = work.shape[1] // 2, 0.0
+@njit(cache=True, nogil=True, error_model="numpy")
+def _spray(work, middle, found, body, paint, counts, seed):
+    """Droplets of a tile: gathered once about its middle sample, or sample by sample where the tile spreads too far."""
+    far = 0.0
     x, y, z = work[_MX, middle], work[_MY, middle], work[_MZ, middle]
     for s in range(work.shape[1]):
         square = (work[_MX, s] - x) ** 2 + (work[_MY, s] - y) ** 2 + (work[_MZ, s] - z) ** 2
@@ -304,7 +316,7 @@ def _spray(work, found, body, paint, counts, seed):
         work[:, s] = one[:, 0]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _light(work, light):
     """Radiance towards the camera in units of what an ideal white, facing the light at its nominal distance, gives.
 
@@ -333,32 +345,36 @@ def _light(work, light):
             work[_ENERGY, s] += work[_HEIGHT, s] * math.exp(work[_EXPONENT, s])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _trace_tile(out, x0, y0, lens, frame, body, affine, material, lights, paint, counts, seed):
-    """Radiance (k, rows, columns) of the sub-pixel samples of a tile whose first sample lies at pixel (x0, y0)."""
-    samples, across = out.shape[1], out.shape[2]
+    """Radiance (k, sub-row, sub-column, pixel) of the samples of a tile; the first lies at pixel (x0, y0)."""
+    samples, across = out.shape[1], out.shape[3]
     found = np.empty((MAX_CANDIDATES, 4))
-    work = np.empty((_FIELDS, samples * across))
+    work = np.empty((_FIELDS, samples * samples * across))
     grid, cells = np.empty((7, work.shape[1]), dtype=np.float32), np.empty((3, work.shape[1]), dtype=np.int32)
     for s in range(work.shape[1]):
-        work[_CX, s], work[_CY, s] = (s % across) / samples, (s // across) / samples
+        part = s // across
+        work[_CX, s], work[_CY, s] = s % across + (part % samples) / samples, (part // samples) / samples
     _locate(work, x0, y0, lens, frame, body, affine)
     if material.size > 0:
         for s in range(work.shape[1]):
-            work[_MX, s], work[_MY, s] = material[s // across, s % across, 0], material[s // across, s % across, 1]
+            part = s // across
+            row, column = part // samples, s % across * samples + part % samples
+            work[_MX, s], work[_MY, s] = material[row, column, 0], material[row, column, 1]
     _limit(work, body)
-    _spray(work, found, body, paint, counts, seed)
+    _spray(work, work.shape[1] // 2 + across // 2, found, body, paint, counts, seed)
     _relief(work, grid, cells, paint, np.uint32(seed ^ np.uint32(0x5BD1E995)))
     _finish(work, paint)
     for j in range(lights.shape[0]):
         _light(work, lights[j])
         for r in range(samples):
-            for c in range(across):
-                s = r * across + c
-                out[j, r, c] = work[_ENERGY, s] if work[_SEEN, s] > 0.0 else 0.0
+            for q in range(samples):
+                for c in range(across):
+                    s = (r * samples + q) * across + c
+                    out[j, r, q, c] = work[_ENERGY, s] if work[_SEEN, s] > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def trace_rows(out, first_row, samples, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed):
     """Radiance of every light along sub-pixel rows, filtered along x to whole pixels.
 
@@ -377,33 +393,36 @@ def trace_rows(out, first_row, samples, taps, pad, lens, frame, body, affine, ma
     lights : (k, 4)
         Position in the body's frame and power.
     """
-    width = out.shape[2]
-    columns = samples * (width + 2 * pad)
+    across = out.shape[2] + 2 * pad
     for block in prange(out.shape[1] // samples):
-        line = np.empty((lights.shape[0], samples, columns), dtype=np.float32)
+        line = np.empty((lights.shape[0], samples, samples, across), dtype=np.float32)
         row = block * samples
-        for left in range(0, columns, samples * TILE):
-            across = min(samples * TILE, columns - left)
-            points = material[row : row + samples, left : left + across] if material.size > 0 else material
-            x0, y0 = (left + 0.5) / samples - 0.5 - pad, (first_row + row + 0.5) / samples - 0.5
-            tile = line[:, :, left : left + across]
+        y0 = (first_row + row + 0.5) / samples - 0.5
+        for left in range(0, across, TILE):
+            right = min(left + TILE, across)
+            points = material[row : row + samples, left * samples : right * samples] if material.size > 0 else material
+            x0 = left - pad + 0.5 / samples - 0.5
+            tile = line[:, :, :, left:right]
             _trace_tile(tile, x0, y0, lens, frame, body, affine, points, lights, paint, counts, seed)
         for j in range(lights.shape[0]):
             for r in range(samples):
-                _decimate(out[j, row + r], line[j, r], samples, taps)
+                _decimate(out[j, row + r], line[j, r], taps)
 
 
-@njit(cache=True, nogil=True)
-def _decimate(out, line, samples, taps):
-    """Weighted sums of sub-pixel samples, one per pixel."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _decimate(out, line, taps):
+    """Weighted sums of the sub-pixel samples (sub-column, pixel) of a row, one per pixel."""
+    samples = line.shape[0]
+    total = np.zeros(out.size)
+    for q in range(taps.size):
+        weight, part, shift = taps[q], line[q % samples], q // samples
+        for c in range(out.size):
+            total[c] += weight * part[shift + c]
     for c in range(out.size):
-        total = 0.0
-        for q in range(taps.size):
-            total += taps[q] * line[c * samples + q]
-        out[c] = total
+        out[c] = total[c]
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def filter_columns(out, rows, samples, taps):
     """Pixel aperture and lens blur along y: sub-pixel rows (k, n, W) to pixel rows `out` (k, h, W)."""
     for r in prange(out.shape[1]):
@@ -416,7 +435,7 @@ def filter_columns(out, rows, samples, taps):
                 out[j, r, c] = total[c]
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def sample_paint(out, points, body, paint, counts, seed):
     """Cover, height (mm) and slope vector of the paint at points on the body: `out` (N, 5)."""
     for block in prange((points.shape[0] + 255) // 256):
@@ -431,7 +450,7 @@ def sample_paint(out, points, body, paint, counts, seed):
             if body[0] != PLATE:
                 work[_NX, p], work[_NZ, p] = x / body[1], z / body[1]
                 work[_NY, p] = y / body[1] if body[0] == SPHERE else 0.0
-        _spray(work, found, body, paint, counts, seed)
+        _spray(work, work.shape[1] // 2, found, body, paint, counts, seed)
         _relief(work, grid, cells, paint, np.uint32(seed ^ np.uint32(0x5BD1E995)))
         for p in range(stop - start):
             for column in range(5):

@@ -50,7 +50,8 @@ class Camera:
     read_noise
         Standard deviation in electrons.
     samples
-        Rays per pixel and direction: ``samples**2`` rays per pixel.
+        Rays per pixel and direction: ``samples**2`` rays per pixel. None: as many as the paint needs
+        (`rgbmidic.virtual.rendering.samples_needed`).
     exposure_time
         Seconds; a body with a velocity is blurred over it.
     """
@@ -67,7 +68,7 @@ class Camera:
     black_level: int = 64
     gain: float = 4.0
     read_noise: float = 12.0
-    samples: int = 6
+    samples: int | None = None
     exposure_time: float = 0.0
 
     def __post_init__(self) -> None:
@@ -78,7 +79,7 @@ class Camera:
         cfa_channels(self.cfa)
         if not (8 <= self.bits <= 16 and 0 <= self.black_level < 2**self.bits - 1):
             raise InputError(f"bits lie in 8 to 16 and black_level below saturation: {self.bits}, {self.black_level}")
-        if not (self.focal_px > 0 and 0 <= self.lens_blur <= 20 and 1 <= self.samples <= 64):
+        if not (self.focal_px > 0 and 0 <= self.lens_blur <= 20 and 1 <= (self.samples or 1) <= 64):
             raise InputError(
                 f"focal_px is positive, lens_blur 0 to 20 px, samples 1 to 64; given are {self.focal_px}, "
                 f"{self.lens_blur}, {self.samples}"
