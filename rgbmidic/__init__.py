@@ -2,6 +2,64 @@
 
 Several coloured lights shine at once, one colour camera records one raw frame per state, and one weighted
 minimisation over the separated illumination images gives the displacement (Multiple Illumination DIC).
+
+The names below are imported on first use, so that ``import rgbmidic`` stays cheap.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rgbmidic.config import TestSettings, read_test
+    from rgbmidic.correlation import NodeStatus, Solution, Status, correlate
+    from rgbmidic.errors import RgbmidicError
+    from rgbmidic.illumination.calibration import Calibration
+    from rgbmidic.mesh import Region, Tri3Mesh
+    from rgbmidic.pipeline import measure
+    from rgbmidic.sequence.readers import read_frame
+    from rgbmidic.sequence.store import Result
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "Calibration",
+    "NodeStatus",
+    "Region",
+    "Result",
+    "RgbmidicError",
+    "Solution",
+    "Status",
+    "TestSettings",
+    "Tri3Mesh",
+    "__version__",
+    "correlate",
+    "measure",
+    "read_frame",
+    "read_test",
+]
+
+_HOMES = {
+    "Calibration": "rgbmidic.illumination.calibration",
+    "NodeStatus": "rgbmidic.correlation",
+    "Region": "rgbmidic.mesh",
+    "Result": "rgbmidic.sequence.store",
+    "RgbmidicError": "rgbmidic.errors",
+    "Solution": "rgbmidic.correlation",
+    "Status": "rgbmidic.correlation",
+    "TestSettings": "rgbmidic.config",
+    "Tri3Mesh": "rgbmidic.mesh",
+    "correlate": "rgbmidic.correlation",
+    "measure": "rgbmidic.pipeline",
+    "read_frame": "rgbmidic.sequence.readers",
+    "read_test": "rgbmidic.config",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

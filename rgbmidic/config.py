@@ -89,9 +89,22 @@ class FrameSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IlluminationSettings:
-    """How the frame becomes one image per light (``[illumination]``)."""
+    """How the frame becomes one image per light (``[illumination]``).
+
+    Attributes
+    ----------
+    demosaic
+        Method of `rgbmidic.illumination.separate` for Bayer frames.
+    normalise
+        Standard deviation in px of the local mean by which each light's image is divided before the solve; 0 leaves
+        the grey levels as they are.
+    """
 
     demosaic: str = "malvar"
+    normalise: float = _bounded(10.0, at_least=0)
+
+    def __post_init__(self) -> None:
+        _check_bounds(self, "illumination")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +156,7 @@ class WeightSettings:
 
     method: Literal["threshold", "none"] = "threshold"
     threshold: float = _bounded(2 / 3, above=0, at_most=1)
-    blur: float = _bounded(10.0, at_least=0)
+    blur: float = _bounded(10.0, above=0)
 
     def __post_init__(self) -> None:
         _check_bounds(self, "weights")

@@ -42,7 +42,7 @@ def claim_pixels(nodes, elements, owner, counts):
 
 @njit(cache=True, nogil=True)
 def list_pixels(owner, position, rows, columns):
-    """Write the pixels of each element, row by row; `position` (E,) int64 holds each element's first slot (consumed)."""
+    """Write the pixels of each element, row by row; `position` (E,) int64 holds each first slot and is consumed."""
     for row in range(owner.shape[0]):
         for column in range(owner.shape[1]):
             e = owner[row, column]

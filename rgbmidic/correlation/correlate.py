@@ -29,7 +29,7 @@ def correlate(
     weights: npt.ArrayLike | None = None,
     initial: npt.ArrayLike | None = None,
     deformed_weights: npt.ArrayLike | None = None,
-    prefilter: str = "gaussian",
+    prefilter: str = "binomial",
     rigid: str = "none",
     search_radius: float = 64.0,
     tolerance: float = 1e-3,

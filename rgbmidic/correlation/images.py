@@ -9,7 +9,15 @@ import numpy.typing as npt
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients
 from rgbmidic.errors import InputError
 
-__all__ = ["PREFILTERS", "apply_prefilter", "as_light_stack", "fill_holes", "spline_coefficients", "usable_pixels"]
+__all__ = [
+    "PREFILTERS",
+    "apply_prefilter",
+    "as_light_stack",
+    "fill_holes",
+    "noise_energy",
+    "spline_coefficients",
+    "usable_pixels",
+]
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -71,13 +79,10 @@ def apply_prefilter(image: FloatImage, prefilter: str) -> FloatImage:
 
 
 def usable_pixels(valid: npt.NDArray[np.bool_], prefilter: str) -> npt.NDArray[np.bool_]:
-    """Pixels whose filtered value and spline neighbourhood use valid pixels only."""
-    if valid.all():
-        return valid
+    """Pixels whose filtered value and spline neighbourhood use valid pixels inside the image only."""
     reach = len(PREFILTERS[prefilter]) // 2 + 1
     element = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
-    # outside the image counts as valid: the spline is mirrored there
-    return cv2.erode(valid.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=1).astype(bool)
+    return cv2.erode(valid.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(bool)
 
 
 def spline_coefficients(image: FloatImage) -> FloatImage:
@@ -85,3 +90,26 @@ def spline_coefficients(image: FloatImage) -> FloatImage:
     out = np.empty((image.shape[0] + 2 * PAD, image.shape[1] + 2 * PAD), dtype=np.float32)
     bspline_coefficients(np.ascontiguousarray(image), out)
     return out
+
+
+def noise_energy(prefilter: str, displacement: npt.NDArray[np.float64]) -> float:
+    """Variance of an image filtered and interpolated at displaced pixels, for white noise of variance 1.
+
+    Interpolation smooths most half-way between pixels, so the mean is taken over the fractions of the displacements
+    (M, 2), in px. The separable impulse response is the prefilter convolved with the cardinal cubic spline.
+    """
+    distance = np.arange(-12, 13)
+    pole = np.sqrt(3.0) - 2.0
+    line = np.convolve(-6 * pole / (1 - pole**2) * pole ** np.abs(distance), PREFILTERS[prefilter])
+    fractions = np.linspace(0, 1, 33)
+    taps = _bspline(np.arange(-2, 3)[:, None] - fractions)
+    energy = [float((np.convolve(line, column) ** 2).sum()) for column in taps.T]
+    wrapped = displacement - np.floor(displacement)
+    return float(np.interp(wrapped, fractions, energy).prod(axis=1).mean())
+
+
+def _bspline(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Centred cubic B-spline."""
+    a = np.abs(t)
+    inner = 2 / 3 - a**2 + a**3 / 2
+    return np.asarray(np.where(a < 1, inner, np.where(a < 2, (2 - a) ** 3 / 6, 0.0)))

@@ -81,4 +81,9 @@ class Solution:
     @property
     def measured(self) -> npt.NDArray[np.bool_]:
         """True for each measured node, shape (N,)."""
-        return self.node_status == NodeStatus.MEASURED
+        return np.asarray(self.node_status == NodeStatus.MEASURED)
+
+    @property
+    def mismatched_share(self) -> float:
+        """Share of the nodes around which the images do not match."""
+        return float((self.node_status == NodeStatus.DECORRELATED).mean())

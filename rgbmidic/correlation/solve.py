@@ -17,7 +17,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import element_hessian, element_moments, element_right_side, pull_back, warp
-from rgbmidic.correlation.images import PREFILTERS, apply_prefilter
+from rgbmidic.correlation.images import apply_prefilter, noise_energy
 from rgbmidic.correlation.problem import Deformed, Reference
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.system import factorise
@@ -35,13 +35,18 @@ _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
 _SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area."""
-_CORRELATED = 0.25
-"""Correlation coefficient under which the images around a node do not match."""
+_MATCHED = 0.4
+"""Correlation coefficient under which the images of an element do not match; the element then carries no weight
+until its neighbours have brought it to a displacement at which they do."""
 _LONGEST_STEP = 4.0
 """Longest motion of a node in one iteration, px."""
 _FIRST_PASS = 0.05
 """Increment (px) at which the first pass hands over to the pass with the weights brought back anew."""
-_PASSES = 3
+_PASSES = 8
+"""Most passes: each brings the weights back with the latest displacement."""
+_PASS_ITERATIONS = 12
+_SETTLED = 1e-3
+"""Share of the weight that may still change for the passes to end."""
 
 
 def solve(
@@ -86,25 +91,32 @@ def solve(
     if initial.shape != reference.mesh.nodes.shape or not np.isfinite(initial).all():
         raise InputError(f"the initial displacement must be finite with shape {reference.mesh.nodes.shape}")
     functions = _rigid_functions(reference.mesh.nodes, rigid)
-    state = _State(displacement=initial.copy(), rigid=np.zeros((len(reference.images), functions.shape[1])))
+    state = _State(
+        displacement=initial.copy(),
+        rigid=np.zeros((len(reference.images), functions.shape[1])),
+        matched=np.ones(len(reference.mesh.elements), dtype=bool),
+    )
     step = None
     for number in range(_PASSES):
         weights = _pull_back(reference, deformed, state, functions)
         if not weights.any():
             return _failed(reference, state, "no light sees the region: every weight is zero")
-        if step is not None and np.abs(weights - step.weights).sum() <= 1e-3 * weights.sum():
+        weights *= np.repeat(state.matched, np.diff(reference.pixels.offsets))
+        if step is not None and np.abs(weights - step.weights).sum() <= _SETTLED * weights.sum():
             break
         step = _Step.build(reference, weights, functions)
         if not step.measured.any():
-            return _failed(reference, state, "the images have no texture in the region")
+            reason = "the images have no texture" if state.matched.all() else "the images do not match anywhere"
+            return _failed(reference, state, f"{reason} in the region")
         goal = max(tolerance, _FIRST_PASS) if number == 0 else tolerance
         _iterate(reference, deformed, state, step, functions, goal, max_iterations)
         if not np.isfinite(state.displacement).all():
             return _failed(reference, state, "the iteration diverged")
+        state.matched = _matched_elements(reference, deformed, state, functions)
     assert step is not None
     if state.history[-1] > tolerance:
         _iterate(reference, deformed, state, step, functions, tolerance, max_iterations)
-    return _conclude(reference, deformed, state, step, functions, tolerance)
+    return _conclude(reference, state, step, tolerance)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -113,6 +125,7 @@ class _State:
 
     displacement: FloatArray
     rigid: FloatArray
+    matched: npt.NDArray[np.bool_]
     history: list[float] = field(default_factory=list)
     sums: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
@@ -164,7 +177,7 @@ class _Step:
         if not self.border.shape[1]:
             return free, np.empty(0)
         rigid = np.linalg.lstsq(self.schur, rigid_side - self.border.T @ free, rcond=1e-9)[0]
-        return free - self.border_solved @ rigid, rigid
+        return free - self.border_solved @ rigid, np.asarray(rigid, dtype=np.float64)
 
 
 def _rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
@@ -180,7 +193,7 @@ def _rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
 
 
 def _light_displacement(state: _State, functions: FloatArray, light: int) -> FloatArray:
-    return state.displacement + (functions @ state.rigid[light]).reshape(-1, 2)
+    return np.asarray(state.displacement + (functions @ state.rigid[light]).reshape(-1, 2))
 
 
 def _pull_back(reference: Reference, deformed: Deformed, state: _State, functions: FloatArray) -> FloatImage:
@@ -235,7 +248,7 @@ def _iterate(
     max_iterations: int,
 ) -> None:
     """Gauss-Newton iterations with one Hessian until no measured node moves by more than `tolerance` px."""
-    while len(state.history) < max_iterations:
+    for _ in range(min(_PASS_ITERATIONS, max_iterations - len(state.history))):
         right_side, rigid_side, state.sums = _right_sides(reference, deformed, state, step, functions)
         motion, rigid = step.increment(right_side, rigid_side)
         motion = motion.reshape(-1, 2)
@@ -274,31 +287,26 @@ def _right_sides(
     return total, np.concatenate(rigid) if rigid else np.empty(0), np.array(light_sums)
 
 
-def _conclude(
-    reference: Reference,
-    deformed: Deformed,
-    state: _State,
-    step: _Step,
-    functions: FloatArray,
-    tolerance: float,
-) -> Solution:
+def _conclude(reference: Reference, state: _State, step: _Step, tolerance: float) -> Solution:
+    elements = reference.mesh.elements
     node_status = np.where(step.measured, NodeStatus.MEASURED, NodeStatus.NOT_SEEN).astype(np.uint8)
-    correlation = _nodal_correlation(reference, deformed, state, step, functions)
-    node_status[step.measured & (correlation < _CORRELATED)] = NodeStatus.DECORRELATED
-    measured = node_status == NodeStatus.MEASURED
+    beside_mismatch = np.zeros(len(node_status), dtype=bool)
+    beside_mismatch[elements[~state.matched]] = True
+    node_status[beside_mismatch & ~step.measured] = NodeStatus.DECORRELATED
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = state.sums[:, 0] / state.sums[:, 1]
-    std = _displacement_std(reference, step, np.nan_to_num(variance))
-    converged = state.history[-1] <= tolerance and measured.any()
-    reason = "" if converged else f"the last iteration moved a node by {state.history[-1]:.3g} px"
+    energy = noise_energy(reference.prefilter, np.zeros((1, 2)))
+    energy += noise_energy(reference.prefilter, state.displacement[step.measured])
+    std = _displacement_std(reference, step, np.nan_to_num(variance) * 2 / energy)
+    converged = state.history[-1] <= tolerance
     return Solution(
         nodes=reference.mesh.nodes,
-        elements=reference.mesh.elements,
-        displacement=np.where(measured[:, None], state.displacement, np.nan),
-        displacement_std=np.where(measured[:, None], std, np.nan),
+        elements=elements,
+        displacement=np.where(step.measured[:, None], state.displacement, np.nan),
+        displacement_std=np.where(step.measured[:, None], std, np.nan),
         node_status=node_status,
         status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
-        reason=reason if measured.any() else "the images do not match anywhere in the region",
+        reason="" if converged else f"the last iteration still moved a node by {state.history[-1]:.3g} px",
         rigid=state.rigid,
         residual=np.sqrt(variance),
         weight_share=step.weights.mean(axis=1, dtype=np.float64),
@@ -306,43 +314,56 @@ def _conclude(
     )
 
 
-def _nodal_correlation(
-    reference: Reference, deformed: Deformed, state: _State, step: _Step, functions: FloatArray
-) -> FloatArray:
-    """Zero-mean correlation coefficient (N,) of both images around each node, all lights together."""
+def _matched_elements(
+    reference: Reference, deformed: Deformed, state: _State, functions: FloatArray
+) -> npt.NDArray[np.bool_]:
+    """Elements (E,) whose images match: zero-mean correlation coefficient of all lights together, at the displacement
+    found. Elements without weight or texture say nothing and count as matched."""
     pixels, mesh = reference.pixels, reference.mesh
+    weights = _pull_back(reference, deformed, state, functions)
     warped = np.empty(pixels.rows.size, dtype=np.float32)
     moments = np.zeros((len(mesh.elements), 6))
-    products = np.zeros((3, len(mesh.elements)))
+    fg, ff, gg = np.zeros((3, len(mesh.elements)))
     for light, coefficients in enumerate(deformed.coefficients):
         warp(
             coefficients, pixels.local_x, pixels.local_y, pixels.offsets, pixels.origin, mesh.elements,
             pixels.barycentric, _light_displacement(state, functions, light), warped,
         )  # fmt: skip
-        element_moments(reference.values[light], warped, step.weights[light], pixels.offsets, moments)
-        total, f1, g1, f2, fg, g2 = moments.T
+        element_moments(reference.values[light], warped, weights[light], pixels.offsets, moments)
+        total, f, g, f2, product, g2 = moments.T
         total = np.maximum(total, 1e-30)
-        products += (fg - f1 * g1 / total, f2 - f1 * f1 / total, g2 - g1 * g1 / total)
-    nodes = [np.bincount(mesh.elements.ravel(), np.repeat(p, 3), minlength=len(mesh.nodes)) for p in products]
-    return np.asarray(nodes[0] / np.sqrt(np.maximum(nodes[1] * nodes[2], 1e-30)))
+        fg += product - f * g / total
+        ff += f2 - f * f / total
+        gg += g2 - g * g / total
+    own = _correlation(fg, ff, gg)
+    # a few speckles can match by chance; those of all elements around a node hardly
+    around = _correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
+    patch = np.median(around[mesh.elements], axis=1)
+    return np.asarray(np.minimum(own, patch) >= _MATCHED)
+
+
+def _correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
+    """Correlation coefficient from centred products; 1 where there is nothing to compare."""
+    scale = np.sqrt(np.maximum(ff, 0) * np.maximum(gg, 0))
+    empty = scale <= 1e-9 * scale.max(initial=0.0)
+    return np.where(empty, 1.0, fg / np.where(empty, 1.0, scale))
 
 
 def _displacement_std(reference: Reference, step: _Step, variance: FloatArray) -> FloatArray:
-    """Sandwich uncertainty (N, 2) from the residual variance (k,) of each light; the prefilter correlates noise.
+    """Sandwich uncertainty (N, 2) for white noise whose difference between the two images has variance (k,).
 
-    With white noise of variance s^2 before the filter h, the right-hand side has the covariance
-    ``s^2 integral (h * w grad f)(h * w grad f)^T phi phi^T`` and the residual the variance ``s^2 sum h^2``.
+    The prefilter h correlates the noise: the right-hand side has the covariance
+    ``s^2 integral (h * w grad f)(h * w grad f)^T phi phi^T`` (shape functions phi are smooth on the scale of h).
     """
-    taps = PREFILTERS[reference.prefilter]
-    energy = float((np.outer(taps, taps) ** 2).sum())
+    filtered = reference.prefilter != "none"
     pixels = reference.pixels
     one = np.ones(pixels.rows.size, dtype=np.float32)
     blocks = np.zeros((len(reference.mesh.elements), 3, 3, 3))
     for light, weight in enumerate(step.weights):
         gradient = [weight * reference.gradient_x[light], weight * reference.gradient_y[light]]
-        if len(taps) > 1:
+        if filtered:
             gradient = [pixels.gather(apply_prefilter(pixels.scatter(g), reference.prefilter)) for g in gradient]
-        blocks += variance[light] / energy * _hessian_blocks(reference, light, one, (gradient[0], gradient[1]))
+        blocks += variance[light] * _hessian_blocks(reference, light, one, (gradient[0], gradient[1]))
     return nodal_std(step.solve, reference.equations.matrix(blocks), reference.probing)
 
 

@@ -36,7 +36,7 @@ _SCORE = 0.3
 def coarse_start(reference: Reference, deformed: Deformed, search_radius: float) -> FloatArray:
     """Displacement (N, 2) of the nodes in px, found without any hint within `search_radius` px."""
     f, g = (feature_image(state.images, state.weights) for state in (reference, deformed))
-    half_f, half_g = (cv2.pyrDown(image) for image in (f, g))
+    half_f, half_g = (np.asarray(cv2.pyrDown(image), dtype=np.float32) for image in (f, g))
     centres = _window_centres(reference)
     side = min(_WINDOW, *(int(size) // 2 * 2 for size in f.shape))
     motion, score = _match(half_f, half_g, centres / 2, side // 2, int(np.ceil(search_radius / 2)), None)
@@ -94,7 +94,7 @@ def _match(
         area = g[y0 : max(top + dy + radius + side, 0), x0 : max(left + dx + radius + side, 0)]
         if area.shape[0] < template.shape[0] or area.shape[1] < template.shape[1] or not template.any():
             continue
-        surface = cv2.matchTemplate(area, template, cv2.TM_CCORR_NORMED)
+        surface = np.asarray(cv2.matchTemplate(area, template, cv2.TM_CCORR_NORMED), dtype=np.float32)
         _, best, _, (column, row) = cv2.minMaxLoc(surface)
         if not np.isfinite(best):
             continue
@@ -122,7 +122,7 @@ def _smooth_outliers(points: FloatArray, motion: FloatArray, score: FloatArray, 
     if len(points) < 4:
         good = score > _SCORE
         return np.where(good[:, None], motion, np.median(motion[good], axis=0) if good.any() else 0.0)
-    neighbours = cKDTree(points).query(points, k=min(9, len(points)))[1][:, 1:]
+    neighbours = np.asarray(cKDTree(points).query(points, k=min(9, len(points)))[1])[:, 1:]
     found = np.where((score > _SCORE)[:, None], motion, np.nan)
     with np.errstate(all="ignore"):
         for _ in range(2):
@@ -136,7 +136,7 @@ def _smooth_outliers(points: FloatArray, motion: FloatArray, score: FloatArray, 
 
 def _nanmedian(values: FloatArray) -> FloatArray:
     """Median over axis 1 without NaN; NaN where nothing is left, without a warning."""
-    empty = np.isnan(values).all(axis=1, keepdims=True)
+    empty = np.asarray(np.isnan(values).all(axis=1, keepdims=True))
     result = np.nanmedian(np.where(empty, 0.0, values), axis=1)
     return np.where(empty[:, 0], np.nan, result)
 
@@ -169,7 +169,7 @@ def _interpolate(points: FloatArray, motion: FloatArray, nodes: FloatArray) -> F
         # the affine part is interpolated exactly; the rest is what the windows add to it, fading outwards
         rest = LinearNDInterpolator(points, motion - basis @ affine)(nodes)
     except (QhullError, ValueError):
-        return outside
+        return np.asarray(outside)
     nearest = _fill_from_nearest(nodes, rest)
     return np.asarray(outside + nearest)
 

@@ -51,14 +51,13 @@ class NormalEquations:
         columns = np.tile(unknowns, 6).ravel()
         keys, slots = np.unique(columns * size + rows, return_inverse=True)
         indptr = np.searchsorted(keys, np.arange(size + 1) * size)
-        area = np.bincount(mesh.elements.ravel(), np.repeat(mesh.areas / 3, 3), minlength=len(mesh.nodes))
         return cls(
             unknowns=unknowns,
             slots=slots.ravel(),
             indices=(keys % size).astype(np.int32),
             indptr=indptr.astype(np.int32),
             smoothness=_laplacian(mesh),
-            nodal_area=area,
+            nodal_area=mesh.to_nodes(mesh.areas / 3),
         )
 
     @property
@@ -69,12 +68,13 @@ class NormalEquations:
     def matrix(self, blocks: FloatArray) -> sp.csc_matrix:
         """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N)."""
         full = blocks[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
-        data = np.bincount(self.slots, full.ravel(), minlength=len(self.indices))
+        data = np.bincount(self.slots, weights=full.ravel(), minlength=len(self.indices))
         return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
 
     def vector(self, parts: FloatArray) -> FloatArray:
         """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""
-        return np.bincount(self.unknowns.ravel(), parts.ravel(), minlength=self.size)
+        sums = np.bincount(self.unknowns.ravel(), weights=parts.ravel(), minlength=self.size)
+        return np.asarray(sums, dtype=np.float64)
 
 
 def factorise(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:

@@ -45,9 +45,9 @@ class Probing:
 
         count = len(mesh.nodes)
         i, j = mesh.neighbours.T
-        ring = sp.coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
-        ring = sp.csr_matrix(ring + ring.T + sp.eye(count, dtype=np.int8))
-        reach = ring
+        edges = sp.coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
+        ring = sp.csr_matrix(edges + edges.T + sp.eye(count, dtype=np.int8))
+        reach = sp.csr_matrix(ring)
         for _ in range(_RINGS - 2):
             reach = sp.csr_matrix((reach @ ring) > 0)
         colour = _greedy_colours(reach.indptr, reach.indices)
@@ -90,5 +90,5 @@ def nodal_std(
         unit[2 * nodes + axis, probing.colour] = 1.0
         columns = solve(unit)
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
-        variance[:, axis] = np.bincount(probing.nearest.ravel(), energy.T.ravel(), minlength=count)
+        variance[:, axis] = np.bincount(probing.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
     return np.sqrt(np.maximum(variance, 0))

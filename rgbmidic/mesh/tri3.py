@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypedDict
 
 import cv2
 import numpy as np
@@ -71,11 +72,21 @@ class Tri3Mesh:
         """Area of each element in square px, shape (E,)."""
         return _signed_area(self.nodes, self.elements)
 
+    def to_nodes(self, per_element: FloatArray) -> FloatArray:
+        """Sum of a value per element (E,) over the elements around each node, shape (N,)."""
+        sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
+        return np.asarray(sums, dtype=np.float64)
+
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes joined by an edge, shape (M, 2), each pair once."""
         edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
         return np.unique(np.sort(edges, axis=1), axis=0)
+
+
+class _Parts(TypedDict):
+    nodes: FloatArray
+    elements: npt.NDArray[np.int32]
 
 
 def _signed_area(nodes: FloatArray, elements: npt.NDArray[np.int32]) -> FloatArray:
@@ -84,9 +95,7 @@ def _signed_area(nodes: FloatArray, elements: npt.NDArray[np.int32]) -> FloatArr
     return np.asarray((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2)
 
 
-def _rectangle_mesh(
-    rectangle: tuple[float, float, float, float], size: float
-) -> dict[str, npt.NDArray[np.float64] | npt.NDArray[np.int32]]:
+def _rectangle_mesh(rectangle: tuple[float, float, float, float], size: float) -> _Parts:
     x0, y0, x1, y1 = rectangle
     if min(x1 - x0, y1 - y0) < 4:
         raise RegionError(f"the region {rectangle} is too small: an element needs at least 4 x 4 px")
@@ -104,9 +113,7 @@ def _rectangle_mesh(
     return {"nodes": np.stack([x.ravel(), y.ravel()], 1), "elements": elements}
 
 
-def _outline_mesh(
-    mask: npt.NDArray[np.bool_], size: float
-) -> dict[str, npt.NDArray[np.float64] | npt.NDArray[np.int32]]:
+def _outline_mesh(mask: npt.NDArray[np.bool_], size: float) -> _Parts:
     from scipy.spatial import Delaunay, QhullError
 
     outline = _outline_points(mask, size)

@@ -1,0 +1,63 @@
+"""Local normalisation: each light's image divided by its local mean.
+
+A body that turns under fixed lights grows brighter or darker smoothly, and a reflection lifts the mean; dividing by
+the local mean leaves the texture, which is what moves with the surface.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import InputError
+
+__all__ = ["DARK", "local_mean", "normalise"]
+
+FloatImage = npt.NDArray[np.float32]
+
+DARK = 0.01
+"""A light whose local mean is below this share of the full scale does not see the surface there."""
+
+
+def normalise(images: FloatImage, sigma: float, full_scale: float) -> FloatImage:
+    """Divide images (k, H, W) by their local mean; NaN where invalid or dark.
+
+    Parameters
+    ----------
+    images
+        Grey levels above black; NaN marks invalid pixels.
+    sigma
+        Standard deviation of the Gaussian window in px, several speckles wide.
+    full_scale
+        Grey level of a just saturated sample; sets what counts as dark (`DARK`).
+
+    Raises
+    ------
+    InputError
+        `sigma` is not positive.
+    """
+    if not sigma > 0:
+        raise InputError(f"the width of the local mean must be positive, not {sigma!r} px")
+    out = np.empty_like(images)
+    for image, normalised in zip(images, out, strict=True):
+        mean = local_mean(image, sigma)
+        with np.errstate(invalid="ignore"):
+            seen = mean > DARK * full_scale
+        np.divide(image, mean, out=normalised, where=seen)
+        normalised[~seen] = np.nan
+    return out
+
+
+def local_mean(image: FloatImage, sigma: float) -> FloatImage:
+    """Gaussian mean (H, W) of the finite pixels around each pixel; NaN where there is none."""
+    finite = np.isfinite(image)
+    if finite.all():
+        return _blur(image, sigma)
+    weight = _blur(finite.astype(np.float32), sigma)
+    total = _blur(np.where(finite, image, np.float32(0)), sigma)
+    return np.where(weight > 1e-3, total / np.maximum(weight, np.float32(1e-3)), np.float32(np.nan))
+
+
+def _blur(image: FloatImage, sigma: float) -> FloatImage:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)

@@ -1,0 +1,320 @@
+"""The main job: raw frames in, displacement fields out.
+
+raw frame -> linearise -> demosaic and unmix -> one image per light -> weights -> one MIDIC solve -> displacement with
+its uncertainty, frame after frame, each kept as it finishes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.config import FrameSettings, RegionSettings, SolverSettings, TestSettings
+from rgbmidic.correlation import Deformed, Reference, Solution, Status, solve
+from rgbmidic.correlation.start import coarse_start, refine_start
+from rgbmidic.errors import ConfigurationError, FrameError, RegionError, RgbmidicError
+from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.mosaic import ChannelFrame, LinearChannels, LinearMosaic, Mosaic, linearise
+from rgbmidic.illumination.normalise import normalise
+from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.unmix import unmix
+from rgbmidic.illumination.weights import light_weights
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.sequence.frames import FrameSequence, list_frames, open_frames
+from rgbmidic.sequence.readers import read_frame, tells_camera
+from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
+
+__all__ = ["Separator", "average", "measure", "read_region", "texture", "track"]
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[int, int, str], None]
+FloatArray = npt.NDArray[np.float64]
+FloatImage = npt.NDArray[np.float32]
+
+_THUMBNAIL = 256
+"""Longest side in px of the picture of the weights that is kept of every frame."""
+
+
+def measure(
+    settings: TestSettings, out: Path | str, *, overwrite: bool = False, progress: Progress | None = None
+) -> Result:
+    """Measure a test: displacement of every frame against the reference.
+
+    Parameters
+    ----------
+    settings
+        What `rgbmidic.config.read_test` reads from TEST.toml.
+    out
+        Result folder; nothing is written to it before settings, calibration, region and reference are found good.
+    overwrite
+        Replace a result that is already there.
+    progress
+        Called after every frame with the number of frames done, their total and a line about the last one.
+
+    Returns
+    -------
+    Result
+        A frame that cannot be read or measured is kept as failed with its reason; the others go on.
+
+    Raises
+    ------
+    RgbmidicError
+        The settings, the calibration, the region or the reference frames are not usable.
+    """
+    separator = Separator.from_settings(settings)
+    frames = open_frames(_with_camera(settings, separator.calibration), settings.base)
+    images = average([separator(frames.read(index)) for index in settings.frames.reference])
+    region = read_region(settings.region, images.shape)
+    mesh = Tri3Mesh.from_region(region, settings.element_size)
+    reference = Reference.prepare(
+        texture(images, settings),
+        region,
+        light_weights(images, settings.weights),
+        mesh=mesh,
+        prefilter=settings.solver.prefilter or "binomial",
+    )
+    store = ResultStore.create(
+        out,
+        nodes=mesh.nodes,
+        elements=mesh.elements,
+        names=[frames.name(index) for index in range(len(frames))],
+        lights=images.names,
+        settings=settings,
+        overwrite=overwrite,
+    )
+    last: FloatArray | None = None
+    for index in range(len(frames)):
+        record, last = _measure_frame(index, frames, separator, settings, reference, last)
+        store.write_frame(index, record)
+        if progress is not None:
+            progress(index + 1, len(frames), _line(frames.name(index), record))
+    store.finish()
+    return Result.open(out)
+
+
+def _with_camera(settings: TestSettings, calibration: Calibration | None) -> FrameSettings:
+    """Frame settings with pattern and levels of the calibration where neither the file nor the settings tell them."""
+    frames = settings.frames
+    first = list_frames(frames.path[0], settings.base)[0]
+    if calibration is None or tells_camera(first):
+        return frames
+    return replace(
+        frames,
+        cfa=frames.cfa or (calibration.cfa if frames.kind in (None, "bayer") else None),
+        black_level=calibration.black_level if frames.black_level is None else frames.black_level,
+        white_level=calibration.white_level if frames.white_level is None else frames.white_level,
+    )
+
+
+def _measure_frame(
+    index: int,
+    frames: FrameSequence,
+    separator: Separator,
+    settings: TestSettings,
+    reference: Reference,
+    last: FloatArray | None,
+) -> tuple[FrameRecord, FloatArray | None]:
+    """Record of one frame, and the displacement from which the next one starts."""
+    nodes, lights = len(reference.mesh.nodes), len(reference.images)
+    try:
+        images = separator(frames.read(index))
+        if images.values.shape != reference.images.shape:
+            raise FrameError(
+                f"{frames.name(index)} has the shape {images.values.shape}, the reference {reference.images.shape}"
+            )
+        weights = light_weights(images, settings.weights)
+        deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
+        alone = settings.frames.reference == (index,)
+        start = np.zeros((nodes, 2)) if alone else last
+        solution = track(reference, deformed, start, settings.solver)
+        inputs = frames.hashes(index)
+    except RgbmidicError as error:
+        logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)
+        return FrameRecord.failed(str(error), nodes=nodes, lights=lights), last
+    record = FrameRecord.from_solution(solution, weights_thumbnail=_thumbnail(weights), inputs=inputs)
+    return record, _next_start(reference, solution, last)
+
+
+def track(reference: Reference, deformed: Deformed, start: FloatArray | None, settings: SolverSettings) -> Solution:
+    """Solve one frame from the last frame's displacement, and anew from a search where that does not converge.
+
+    Parameters
+    ----------
+    reference, deformed
+        The two states.
+    start : ndarray, shape (N, 2), or None
+        Displacement to start from in px; None searches.
+    settings
+        Solver settings.
+    """
+    solution: Solution | None = None
+    attempts = ("last", "refined", "search") if start is not None else ("search",)
+    for attempt in attempts:
+        if attempt == "search":
+            initial = coarse_start(reference, deformed, settings.search_radius)
+        else:
+            assert start is not None
+            initial = start if attempt == "last" else refine_start(reference, deformed, start)
+        trial = solve(
+            reference,
+            deformed,
+            initial,
+            rigid=settings.rigid,
+            tolerance=settings.tolerance,
+            max_iterations=settings.max_iterations,
+        )
+        solution = trial if solution is None or _better(trial, solution) else solution
+        if solution.status is Status.CONVERGED and not solution.mismatched_share > _MISMATCH:
+            break
+    assert solution is not None
+    return solution
+
+
+_MISMATCH = 0.02
+"""Share of the nodes that may have lost their match before another start is tried."""
+
+
+def _better(trial: Solution, best: Solution) -> bool:
+    return (trial.status, trial.mismatched_share) < (best.status, best.mismatched_share)
+
+
+def _next_start(reference: Reference, solution: Solution, last: FloatArray | None) -> FloatArray | None:
+    """The solution with its gaps filled from the nearest measured nodes; the last start where nothing was measured."""
+    from scipy.spatial import cKDTree
+
+    measured = solution.measured
+    if not measured.any():
+        return last
+    nodes = reference.mesh.nodes
+    nearest = cKDTree(nodes[measured]).query(nodes)[1]
+    return np.where(measured[:, None], solution.displacement, solution.displacement[measured][nearest])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Separator:
+    """From what the camera recorded of one state to one image per light.
+
+    Attributes
+    ----------
+    crosstalk
+        None for monochrome frames.
+    calibration
+        Camera noise and settings, where there is a calibration.
+    settings
+        The test's settings.
+    """
+
+    settings: TestSettings
+    calibration: Calibration | None = None
+
+    @classmethod
+    def from_settings(cls, settings: TestSettings) -> Separator:
+        """Read the calibration file that the settings name, if any."""
+        file = settings.calibration_file
+        return cls(settings=settings, calibration=None if file is None else Calibration.read(file))
+
+    def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...]) -> IlluminationImages:
+        """Illumination images of one state from its frame, or its frames if lights fired in succession.
+
+        Raises
+        ------
+        ConfigurationError
+            Colour frames without a calibrated crosstalk, or settings that contradict the calibration.
+        """
+        noise = self.calibration.noise if self.calibration else None
+        linear = [linearise(frame, noise) for frame in frames]
+        if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
+            return _stack_monochrome([one for one in linear if isinstance(one, LinearChannels)])
+        if len(linear) > 1:
+            raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
+        crosstalk = self._crosstalk()
+        (only,) = linear
+        if isinstance(only, LinearMosaic):
+            return separate(only, crosstalk, self.settings.illumination.demosaic)
+        return unmix(only, crosstalk)
+
+    def _crosstalk(self) -> Crosstalk:
+        if self.calibration is None or self.calibration.crosstalk is None:
+            what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
+            raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
+        return self.calibration.crosstalk
+
+
+def _stack_monochrome(series: list[LinearChannels]) -> IlluminationImages:
+    names = ("light",) if len(series) == 1 else tuple(f"light {i + 1}" for i in range(len(series)))
+    return IlluminationImages(
+        values=np.concatenate([one.values for one in series]),
+        valid=np.concatenate([one.valid for one in series]),
+        names=names,
+        full_scale=series[0].full_scale,
+    )
+
+
+def average(images: list[IlluminationImages]) -> IlluminationImages:
+    """Mean of several images of one state; a pixel is valid where it is valid in all of them.
+
+    Raises
+    ------
+    FrameError
+        The images have different shapes.
+    """
+    first = images[0]
+    if len(images) == 1:
+        return first
+    shapes = {one.values.shape for one in images}
+    if len(shapes) > 1:
+        raise FrameError(f"the reference frames have different shapes: {sorted(shapes)}")
+    values = np.asarray(np.mean([one.values for one in images], axis=0, dtype=np.float64))
+    return IlluminationImages(
+        values=np.asarray(values, dtype=np.float32),
+        valid=np.logical_and.reduce([one.valid for one in images]),
+        names=first.names,
+        full_scale=first.full_scale,
+        covariance=None if first.covariance is None else first.covariance / len(images),
+    )
+
+
+def texture(images: IlluminationImages, settings: TestSettings) -> FloatImage:
+    """What the solve correlates (k, H, W): the illumination images, locally normalised unless the settings say no."""
+    sigma = settings.illumination.normalise
+    return normalise(images.values, sigma, images.full_scale) if sigma else images.values
+
+
+def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
+    """The region of interest of the settings on images of `shape` (H, W).
+
+    Raises
+    ------
+    RegionError
+        The region is empty, outside the image, or the mask image has another size.
+    """
+    if settings.rectangle is not None:
+        return Region.from_rectangle(settings.rectangle, shape)
+    if settings.polygon is not None:
+        return Region.from_polygon(settings.polygon, shape)
+    assert settings.mask is not None
+    mask = read_frame(settings.mask, kind="monochrome").values[0]
+    try:
+        return Region.from_mask(mask, shape)
+    except RegionError as error:
+        raise RegionError(f"region.mask {settings.mask}: {error}") from None
+
+
+def _thumbnail(weights: FloatImage) -> npt.NDArray[np.uint8]:
+    step = -(-max(weights.shape[1:]) // _THUMBNAIL)
+    return np.round(weights[:, ::step, ::step] * 255).astype(np.uint8)
+
+
+def _line(name: str, record: FrameRecord) -> str:
+    status = Status(record.status)
+    if status is Status.CONVERGED:
+        measured = float((record.node_status == 0).mean())
+        return f"{name}: converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
+    return f"{name}: {status.name.lower().replace('_', ' ')}: {record.reason}"
