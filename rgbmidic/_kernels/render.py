@@ -334,7 +334,7 @@ def _light(work, light):
         hx, hy, hz = lx + vx, ly + vy, lz + vz
         length = math.sqrt(hx * hx + hy * hy + hz * hz)
         mh = (ml + mv) / length
-        lit = work[_SEEN, s] * light[3] / square if nl > 0.0 and ml > 0.0 else 0.0
+        lit = light[3] / square if (work[_SEEN, s] > 0.0) & (nl > 0.0) & (ml > 0.0) else 0.0
         # a facet beyond twice its share is in the shadow of its neighbours: no step at the terminator
         work[_ENERGY, s] = lit * work[_ALBEDO, s] * min(ml, 2.0 * nl)
         reflected = lit * work[_GLOSS, s] if mv > 0.0 else 0.0
@@ -352,26 +352,29 @@ def _trace_tile(out, x0, y0, lens, frame, body, affine, material, lights, paint,
     found = np.empty((MAX_CANDIDATES, 4))
     work = np.empty((_FIELDS, samples * samples * across))
     grid, cells = np.empty((7, work.shape[1]), dtype=np.float32), np.empty((3, work.shape[1]), dtype=np.int32)
-    for s in range(work.shape[1]):
-        part = s // across
-        work[_CX, s], work[_CY, s] = s % across + (part % samples) / samples, (part // samples) / samples
+    shape = (samples, samples, across)
+    cx, cy, mx, my = work[_CX].reshape(shape), work[_CY].reshape(shape), work[_MX].reshape(shape), work[_MY].reshape(shape)
+    for r in range(samples):
+        for q in range(samples):
+            for c in range(across):
+                cx[r, q, c], cy[r, q, c] = c + q / samples, r / samples
     _locate(work, x0, y0, lens, frame, body, affine)
     if material.size > 0:
-        for s in range(work.shape[1]):
-            part = s // across
-            row, column = part // samples, s % across * samples + part % samples
-            work[_MX, s], work[_MY, s] = material[row, column, 0], material[row, column, 1]
+        for r in range(samples):
+            for q in range(samples):
+                for c in range(across):
+                    mx[r, q, c], my[r, q, c] = material[r, c * samples + q, 0], material[r, c * samples + q, 1]
     _limit(work, body)
     _spray(work, work.shape[1] // 2 + across // 2, found, body, paint, counts, seed)
     _relief(work, grid, cells, paint, np.uint32(seed ^ np.uint32(0x5BD1E995)))
     _finish(work, paint)
     for j in range(lights.shape[0]):
         _light(work, lights[j])
+        energy, seen = work[_ENERGY].reshape(shape), work[_SEEN].reshape(shape)
         for r in range(samples):
             for q in range(samples):
                 for c in range(across):
-                    s = (r * samples + q) * across + c
-                    out[j, r, q, c] = work[_ENERGY, s] if work[_SEEN, s] > 0.0 else 0.0
+                    out[j, r, q, c] = energy[r, q, c] if seen[r, q, c] > 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
