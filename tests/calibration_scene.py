@@ -30,7 +30,9 @@ def speckle_target(shape, rng, size=4.2):
     return ndimage.gaussian_filter(0.1 + 0.7 / (1 + np.exp(-12 * field)), 0.5)
 
 
-def expose(picture, column, rng, cfa="RGGB", *, gain=GAIN, read=READ, black=BLACK, white=WHITE, kind="bayer"):
+def expose(
+    picture, column, rng, cfa="RGGB", *, gain=GAIN, read=READ, black=BLACK, white=WHITE, kind="bayer", offset=0.0
+):
     """One raw frame of a light whose picture (H, W), or (C, H, W) for one per channel, is in DN of its best channel."""
     channels = np.asarray(column, float).reshape(3, *([1] * (picture.ndim if picture.ndim == 2 else 2))) * picture
     if kind == "bayer":
@@ -38,7 +40,7 @@ def expose(picture, column, rng, cfa="RGGB", *, gain=GAIN, read=READ, black=BLAC
         y, x = np.indices(channels.shape[1:])
         channels = np.take_along_axis(channels, cell[y % 2, x % 2][None], axis=0)[0]
     electrons = rng.poisson(np.maximum(channels, 0) * gain) + rng.normal(0, read * gain, channels.shape)
-    values = np.clip(np.rint(electrons / gain + black), 0, white).astype(np.uint16)
+    values = np.clip(np.rint(electrons / gain + black + offset), 0, white).astype(np.uint16)
     if kind == "bayer":
         return Mosaic(values=values, cfa=cfa, black_level=black, white_level=white)
     return ChannelFrame(values=values, black_level=black, white_level=white)

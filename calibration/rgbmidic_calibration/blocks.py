@@ -16,7 +16,7 @@ import numpy.typing as npt
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic, cfa_channels
 
-__all__ = ["BlockMeans", "block_centres", "block_means", "planes_of"]
+__all__ = ["BlockMeans", "block_centres", "block_means", "plane_origins", "planes_of", "saturation_pile"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -81,6 +81,14 @@ def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.N
     return ("R", "G1", "G2", "B"), planes, frame.black_level.ravel()[order]
 
 
+def plane_origins(frame: Mosaic | ChannelFrame) -> tuple[tuple[int, int], ...]:
+    """Row and column of the first sample of every plane of `planes_of`."""
+    if isinstance(frame, ChannelFrame):
+        return ((0, 0),) * len(frame.values)
+    order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
+    return tuple((int(position) // 2, int(position) % 2) for position in order)
+
+
 def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
     """Average every colour plane of a frame in blocks.
 
@@ -107,7 +115,7 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
             f"frames of {shape[1]} x {shape[0]} px are too small for calibration in blocks of {block} px "
             f"(at least {3 * block + 4} px on each side)"
         )
-    offsets = _offsets(frame)
+    offsets = plane_origins(frame)
     step = 2 if isinstance(frame, Mosaic) else 1
     means = [
         _window(shape[0], len(plane), block, step, row) @ plane @ _window(shape[1], plane.shape[1], block, step, col).T
@@ -124,7 +132,7 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
         shape=shape,
         block=block,
         detail=_detail(planes[brightest], float(black[brightest])),
-        piled_at=_pile(planes[brightest], frame.white_level),
+        piled_at=saturation_pile(planes[brightest], frame.white_level),
     )
 
 
@@ -137,13 +145,6 @@ def block_centres(shape: tuple[int, int], block: int) -> Floats:
 def _starts(side: int, block: int) -> npt.NDArray[np.intp]:
     # Two pixels at each border stay unused: the window reaches one pixel beyond its block.
     return np.arange(2, side - side % 2 - block - 1, block)
-
-
-def _offsets(frame: Mosaic | ChannelFrame) -> list[tuple[int, int]]:
-    if isinstance(frame, ChannelFrame):
-        return [(0, 0)] * len(frame.values)
-    order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
-    return [(int(position) // 2, int(position) % 2) for position in order]
 
 
 def _window(side: int, length: int, block: int, step: int, offset: int) -> Floats:
@@ -166,7 +167,7 @@ def _saturated(frame: Mosaic | ChannelFrame, block: int) -> npt.NDArray[np.bool_
     return np.asarray(count + table[np.ix_(top, left)] > 0)
 
 
-def _pile(plane: npt.NDArray[np.uint16], white: float) -> float | None:
+def saturation_pile(plane: npt.NDArray[np.uint16], white: float) -> float | None:
     """Largest value of a plane where it occurs far more often than the values just below it."""
     top = int(plane.max())
     if top >= white or top < 8:

@@ -12,7 +12,7 @@ import rgbmidic
 from rgbmidic.config import FrameSettings
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic
-from rgbmidic.sequence.frames import FrameSequence, file_hash, open_frames
+from rgbmidic.sequence.frames import FrameSequence, FrameSource, file_hash, open_frames
 
 __all__ = ["CaptureFiles", "check_output", "named_patterns", "provenance"]
 
@@ -49,6 +49,16 @@ class CaptureFiles:
             return cls(role=role, sequence=open_frames(settings, base or Path()), stated=settings)
         except FrameError as error:
             raise CalibrationError(f"{role}: {error}") from None
+
+    def by_folder(self) -> list[CaptureFiles]:
+        """The same flat frames in one group per folder."""
+        groups: dict[Path, list[FrameSource]] = {}
+        for source in self.sequence.lights[0]:
+            groups.setdefault(source.path.parent, []).append(source)
+        return [
+            replace(self, role=f"flat {folder}", sequence=FrameSequence(lights=(tuple(sources),)))
+            for folder, sources in groups.items()
+        ]
 
     def __len__(self) -> int:
         return len(self.sequence)
@@ -89,7 +99,7 @@ def named_patterns(options: Sequence[str], option: str) -> dict[str, str]:
     return named
 
 
-def check_output(path: Path, *, overwrite: bool) -> None:
+def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
     """Refuse to write where that would lose something.
 
     Raises
@@ -98,11 +108,11 @@ def check_output(path: Path, *, overwrite: bool) -> None:
         The file exists and may not be overwritten, or its folder does not exist.
     """
     if path.is_dir():
-        raise ConfigurationError(f"--out {path} is a folder; state a file name")
+        raise ConfigurationError(f"{option} {path} is a folder; state a file name")
     if path.exists() and not overwrite:
-        raise ConfigurationError(f"{path} exists already; choose another --out or add --overwrite")
+        raise ConfigurationError(f"{path} exists already; choose another {option} or add --overwrite")
     if not path.parent.is_dir():
-        raise ConfigurationError(f"the folder of --out {path} does not exist")
+        raise ConfigurationError(f"the folder of {option} {path} does not exist")
 
 
 def provenance(command: str, groups: Sequence[CaptureFiles], details: Mapping[str, Any]) -> dict[str, Any]:

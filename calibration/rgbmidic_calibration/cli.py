@@ -86,6 +86,74 @@ def crosstalk(
     display.crosstalk(estimate, out)
 
 
+@app.command()
+def noise(
+    dark: Annotated[str, typer.Option(help="Dark frames, two at least: lens capped, exposure time of the test.")],
+    flat: Annotated[
+        list[str],
+        typer.Option(
+            help="Lit frames at rest, two at least per exposure: FILES in one folder per exposure, or TIME=FILES for "
+            "one exposure with its time. May be repeated."
+        ),
+    ],
+    out: Out = Path("noise.json"),
+    cfa: Cfa = None,
+    black_level: Black = None,
+    white_level: White = None,
+    kind: Kind = None,
+    shape: Shape = None,
+    dtype: Dtype = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Gain, read noise, black level, saturation, linearity, fixed pattern and defects of the camera."""
+    from rgbmidic_calibration import display, jobs
+    from rgbmidic_calibration.captures import check_output
+
+    check_output(out, overwrite=overwrite)
+    statement = jobs.statement(kind, cfa, black_level, white_level, shape, dtype)
+    calibration, estimate = jobs.calibrate_noise(dark, flat, statement)
+    calibration.write(out)
+    display.noise(estimate, out)
+
+
+@app.command()
+def merge(
+    files: Annotated[list[Path], typer.Argument(help="Calibration files; every section from one of them.")],
+    out: Out = Path("calibration.json"),
+    overwrite: Overwrite = False,
+) -> None:
+    """Noise, crosstalk and registration from several files into one."""
+    from rgbmidic_calibration import display
+    from rgbmidic_calibration.captures import check_output
+    from rgbmidic_calibration.merging import merge_files
+
+    check_output(out, overwrite=overwrite)
+    calibration = merge_files(files)
+    calibration.write(out)
+    display.merged(calibration, out)
+
+
+@app.command()
+def show(
+    file: Annotated[Path, typer.Argument(help="Calibration file.")],
+    picture: Annotated[Path | None, typer.Option(help="Write a picture too (PNG, PDF or SVG).")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """A calibration file in words, and in one picture."""
+    from rgbmidic.illumination.calibration import Calibration
+    from rgbmidic_calibration import display
+    from rgbmidic_calibration.captures import check_output
+
+    calibration = Calibration.read(file)
+    if picture is not None:
+        check_output(picture, overwrite=overwrite, option="--picture")
+    display.calibration(calibration, file)
+    if picture is not None:
+        from rgbmidic_calibration.pictures import draw_calibration
+
+        draw_calibration(calibration, picture)
+
+
 def _plain(text: str) -> str:
     from rich.markup import escape
 

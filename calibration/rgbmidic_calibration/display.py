@@ -5,30 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.camera_noise import CameraNoise, Quantity
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.registration import Registration
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
+from rgbmidic_calibration.noise import NoiseEstimate
 
-__all__ = ["crosstalk"]
+__all__ = ["calibration", "crosstalk", "merged", "noise", "registration_table"]
 
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
     """Print the matrix with its uncertainties, what it means for the noise, and the warnings."""
-    console = Console(highlight=False)
+    console = _console()
     _warnings(console, estimate.warnings)
-    result = estimate.crosstalk
-    table = Table(title="Crosstalk: camera channels = A . lights (± standard uncertainty)", title_justify="left")
-    table.add_column("channel")
-    for name in result.lights:
-        table.add_column(escape(name), justify="right")
-    std = result.std
-    for row, channel in enumerate(CHANNELS):
-        cells = [_entry(value, None if std is None else std[row, i]) for i, value in enumerate(result.matrix[row])]
-        table.add_row(channel, *cells)
-    table.add_section()
-    table.add_row("noise amplification", *(f"{value:.2f}" for value in result.noise_amplification))
+    table = _matrix_table(estimate.crosstalk)
     table.add_row("signal, DN", *(f"{fit.signal:.0f}" for fit in estimate.lights))
     table.add_row("captures", *(str(fit.captures) for fit in estimate.lights))
     table.add_row("blocks used, %", *(f"{100 * fit.used:.0f}" for fit in estimate.lights))
@@ -36,9 +32,124 @@ def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
     table.add_row("  by chance, p", *(f"{fit.variation.p_value:.2g}" for fit in estimate.lights))
     table.add_row("strength drift, %", *(f"{100 * fit.intensity_drift:.2f}" for fit in estimate.lights))
     console.print(table)
+    console.print(_matrix_words(estimate.crosstalk))
+    _written(console, out)
+
+
+def noise(estimate: NoiseEstimate, out: Path) -> None:
+    """Print the noise figures per plane and the warnings."""
+    console = _console()
+    _warnings(console, estimate.warnings)
+    console.print(_noise_table(estimate.camera_noise))
+    console.print(_defect_words(estimate.camera_noise))
+    _written(console, out)
+
+
+def merged(result: Calibration, out: Path) -> None:
+    """Print which sections a merged file has."""
+    console = _console()
+    console.print(f"sections: {', '.join(_sections(result))}")
+    _written(console, out)
+
+
+def calibration(result: Calibration, path: Path) -> None:
+    """Print all that a calibration file tells."""
+    console = _console()
+    console.print(f"[bold]{escape(str(path))}[/]: {', '.join(_sections(result)) or 'empty'}")
+    camera = {"pattern": result.cfa, "black level": result.black_level, "white level": result.white_level}
+    told = [f"{name} {value}" for name, value in camera.items() if value is not None]
+    told += [f"{result.shape[1]} x {result.shape[0]} px"] if result.shape else []
+    console.print(f"camera: {', '.join(told) or 'nothing stated'}")
+    if result.crosstalk is not None:
+        console.print(_matrix_table(result.crosstalk))
+        console.print(_matrix_words(result.crosstalk))
+    if result.camera_noise is not None:
+        console.print(_noise_table(result.camera_noise))
+        console.print(_defect_words(result.camera_noise))
+    elif result.noise is not None:
+        console.print(f"noise: gain {result.noise.gain:.4g} e-/DN, read noise {result.noise.read_noise:.4g} DN")
+    if result.registration is not None:
+        console.print(registration_table(result.registration))
+    for section, origin in result.provenance.items():
+        if isinstance(origin, dict):
+            files = len(origin.get("inputs", ()))
+            console.print(f"{section}: {files} files, {origin.get('date', '?')}, version {origin.get('version', '?')}")
+            _warnings(console, origin.get("warnings", ()))
+
+
+def registration_table(result: Registration) -> Table:
+    """Table of the parameters of every light with their uncertainties."""
+    table = Table(title=f"Registration against {escape(result.lights[0])}", title_justify="left")
+    for head in ("light", "shift x, px", "shift y, px", "rotation, mrad", "scale, 1e-3", "radial at corner, 1e-3"):
+        table.add_column(head, justify="left" if head == "light" else "right")
+    factors = np.array([1, 1, 1e3, 1e3, 1e3])
+    for index, name in enumerate(result.lights[1:], start=1):
+        values = result.parameters[index] * factors
+        std = None if result.covariance is None else np.sqrt(np.diag(result.covariance[index])) * factors
+        cells = [f"{value:.4f}" + ("" if std is None else f" ± {std[term]:.4f}") for term, value in enumerate(values)]
+        table.add_row(escape(name), *cells)
+    return table
+
+
+def _console() -> Console:
+    return Console(highlight=False)
+
+
+def _sections(result: Calibration) -> list[str]:
+    return [name for name in ("crosstalk", "noise", "registration") if getattr(result, name) is not None]
+
+
+def _matrix_table(result: Crosstalk) -> Table:
+    table = Table(title="Crosstalk: camera channels = A . lights (± standard uncertainty)", title_justify="left")
+    table.add_column("channel", no_wrap=True)
+    for name in result.lights:
+        table.add_column(escape(name), justify="right")
+    std = result.std
+    for row, values in enumerate(result.matrix):
+        cells = [_entry(value, None if std is None else std[row, column]) for column, value in enumerate(values)]
+        table.add_row(CHANNELS[row] if len(result.matrix) == 3 else str(row + 1), *cells)
+    table.add_section()
+    table.add_row("noise amplification", *(f"{value:.2f}" for value in result.noise_amplification))
+    return table
+
+
+def _matrix_words(result: Crosstalk) -> str:
     field = "the same everywhere" if result.field is None else f"varies over the field (degree {result.field.order})"
-    console.print(f"condition number {result.condition_number:.2f}; A {field}")
-    console.print(f"written: {escape(str(out))}")
+    words = f"condition number {result.condition_number:.2f}; A is {field}"
+    if (leakage := result.leakage_std) is not None:
+        words += f"; its uncertainty leaves at most {100 * leakage.max():.3f} % of one light in another (1 sigma)"
+    return words
+
+
+def _noise_table(result: CameraNoise) -> Table:
+    table = Table(title="Camera noise (EMVA 1288; ± standard uncertainty)", title_justify="left")
+    table.add_column("", no_wrap=True)
+    for name in result.planes:
+        table.add_column(name, justify="right")
+    rows: list[tuple[str, Quantity, int]] = [
+        ("gain 1/K, e-/DN", result.gain, 3),
+        ("dark noise, DN", result.read_noise, 3),
+        ("dark noise, e-", result.dark_noise, 2),
+        ("black level, DN", result.black_level, 2),
+        ("saturation, DN", result.saturation, 0),
+        ("full well, e-", result.full_well, 0),
+        ("linearity LE, %", result.linearity_error, 3),
+        ("DSNU, DN", result.dsnu, 3),
+        ("PRNU, %", result.prnu, 3),
+    ]
+    for name, quantity, digits in rows:
+        table.add_row(name, *(_figure(v, s, digits) for v, s in zip(quantity.value, quantity.std, strict=True)))
+    table.add_row("dynamic range, dB", *(f"{value:.1f}" for value in result.dynamic_range))
+    return table
+
+
+def _defect_words(result: CameraNoise) -> str:
+    counts = [f"{sum(kind == name for *_, kind in result.defects)} {name}" for name in ("hot", "dead")]
+    return f"pixels to distrust: {', '.join(counts)}"
+
+
+def _figure(value: float, std: float, digits: int) -> str:
+    return f"{value:.{digits}f} ± {std:.{digits}f}" if np.isfinite(value) else "-"
 
 
 def _entry(value: float, std: float | None) -> str:
@@ -48,3 +159,7 @@ def _entry(value: float, std: float | None) -> str:
 def _warnings(console: Console, warnings: Sequence[str]) -> None:
     for warning in warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}")
+
+
+def _written(console: Console, out: Path) -> None:
+    console.print(f"written: {escape(str(out))}")

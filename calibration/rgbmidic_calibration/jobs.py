@@ -13,8 +13,10 @@ from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic
 from rgbmidic_calibration.blocks import BlockMeans, block_means
 from rgbmidic_calibration.captures import CaptureFiles, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
+from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
+from rgbmidic_calibration.stacks import stack_frames
 
-__all__ = ["calibrate_crosstalk", "field_order", "find_groups", "statement"]
+__all__ = ["calibrate_crosstalk", "calibrate_noise", "field_order", "find_groups", "statement"]
 
 KINDS = ("bayer", "rgb", "monochrome")
 DTYPES = ("uint8", "uint16", ">u2")
@@ -102,16 +104,60 @@ def calibrate_crosstalk(
             fit.name: {"p_value": fit.variation.p_value, "rms": fit.variation.rms} for fit in estimate.lights
         },
     }
-    frame = first[0]
     calibration = Calibration(
         crosstalk=estimate.crosstalk,
-        cfa=frame.cfa if isinstance(frame, Mosaic) else None,
-        black_level=float(frame.black_level.mean()),
-        white_level=frame.white_level,
-        shape=(frame.values.shape[-2], frame.values.shape[-1]),
         provenance={"crosstalk": provenance("crosstalk", groups, details)},
+        **_camera(first[0]),
     )
     return calibration, estimate
+
+
+def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
+    """Noise section from capture files.
+
+    Parameters
+    ----------
+    dark
+        Pattern of the dark frames.
+    flats
+        Patterns of the flat frames. A pattern ``TIME=FILES`` is one exposure with its time; else the files of every
+        folder are one exposure.
+    told
+        What is stated of the files.
+    """
+    dark_files = CaptureFiles.find("dark", dark, told)
+    groups = [group for text in flats for group in _exposures(text, told)]
+    dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames")
+    stacks = [stack_frames(files.frames(), exposure=time, name=files.role) for files, time in groups]
+    estimate = photon_transfer(dark_stack, stacks)
+    all_files = [dark_files, *(files for files, _ in groups)]
+    details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in groups]}
+    frame = next(dark_files.frames())
+    return Calibration(
+        camera_noise=estimate.camera_noise,
+        provenance={"noise": provenance("noise", all_files, details)},
+        **_camera(frame),
+    ), estimate
+
+
+def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float | None]]:
+    time, separator, pattern = text.partition("=")
+    if separator:
+        try:
+            return [(CaptureFiles.find(f"flat exposure {time}", pattern, told), float(time))]
+        except ValueError:
+            raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
+    return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, told).by_folder()]
+
+
+def _camera(frame: Mosaic | ChannelFrame) -> dict[str, Any]:
+    """Camera settings of a calibration, from one of its frames."""
+    return {
+        "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
+        "black_level": float(frame.black_level.mean()),
+        "white_level": frame.white_level,
+        "shape": (frame.values.shape[-2], frame.values.shape[-1]),
+    }
 
 
 def _reduce(files: CaptureFiles, block: int, first: list[Mosaic | ChannelFrame]) -> list[BlockMeans]:

@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from calibration_scene import MATRICES, captures, speckle_target
+from calibration_scene import MATRICES, captures, expose, speckle_target, white_target
 
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.sequence.writers import write_dng, write_tiff
@@ -27,6 +27,12 @@ def bench(tmp_path_factory):
         for index, frame in enumerate(frames):
             write_tiff(folder / name / f"{index}.tif", frame)
             write_dng(folder / name / f"{index}.dng", frame)
+    rng = np.random.default_rng(2)
+    picture = white_target((128, 160), rng)
+    for level in (1000, 1700, 2800):
+        (folder / f"flat_{level}").mkdir()
+        for index in range(2):
+            write_tiff(folder / f"flat_{level}" / f"{index}.tif", expose(level * picture, MATRIX[:, 1] + 0.4, rng))
     return folder
 
 
@@ -97,3 +103,39 @@ def test_a_mistake_is_one_line_and_writes_nothing(run, tmp_path, arguments, mess
     assert "Traceback" not in error
     assert len(error.strip().splitlines()) == 1
     assert not any(tmp_path.iterdir())
+
+
+def test_noise_then_merge_then_show(run, tmp_path):
+    noise, matrix, merged = (str(tmp_path / f"{name}.json") for name in ("noise", "matrix", "merged"))
+    code, shown, _ = run("noise", "--dark", "dark/*.tif", "--flat", "flat_*/*.tif", *STATED, "--out", noise)
+    assert code == 0
+    assert "gain 1/K" in shown
+    assert Calibration.read(noise).noise.gain == pytest.approx(4, rel=0.05)
+    assert run("crosstalk", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", matrix)[0] == 0
+    code, shown, _ = run("merge", noise, matrix, "--out", merged)
+    assert code == 0
+    assert "sections: crosstalk, noise" in shown
+    code, shown, _ = run("show", merged, "--picture", str(tmp_path / "p.png"))
+    assert code == 0
+    assert "condition number" in shown
+    assert "dark noise, e-" in shown
+    assert (tmp_path / "p.png").is_file()
+    assert run("show", merged, "--picture", str(tmp_path / "p.png"))[0] == 2
+
+
+def test_noise_with_exposure_times(run, tmp_path):
+    flats = [part for level in (1000, 1700, 2800) for part in ("--flat", f"{level}=flat_{level}")]
+    out = str(tmp_path / "n.json")
+    code, _, error = run("noise", "--dark", "dark/*.tif", *flats, *STATED, "--out", out)
+    assert code == 0, error
+    assert np.isfinite(Calibration.read(out).camera_noise.linearity_error.value).all()
+    code, _, error = run("noise", "--dark", "dark/*.tif", "--flat", "long=flat_1000", *STATED, "--out", out + "2")
+    assert code == 2
+    assert "TIME=FILES" in error
+
+
+def test_show_of_a_file_that_is_none(run, tmp_path):
+    (tmp_path / "x.json").write_text("{}")
+    code, _, error = run("show", str(tmp_path / "x.json"))
+    assert code == 2
+    assert "is not a calibration file" in error

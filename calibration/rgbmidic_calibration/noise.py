@@ -1,0 +1,295 @@
+"""Camera noise by the photon transfer method: gain, read noise, black level, saturation, linearity, fixed pattern.
+
+With shot noise of the electrons and read noise, the temporal variance of a sample is ``v = r^2 + K mu`` with K = 1/gain
+and mu the mean above dark (EMVA standard 1288, release 4.0, section 2.2 and 6). Mean and variance are taken in blocks,
+so neither shading nor texture of the target matters, as long as it stands still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.camera_noise import CameraNoise, Quantity
+from rgbmidic_calibration.pattern import fixed_pattern
+from rgbmidic_calibration.stacks import TemporalStack, same_camera
+
+__all__ = ["NoiseEstimate", "TransferCurve", "photon_transfer"]
+
+Floats = npt.NDArray[np.float64]
+
+BLOCK = 16
+"""Side of the blocks, in samples of a plane."""
+
+HIGHEST = 0.9
+"""Blocks brighter than this share of the range are not used: the variance falls as samples reach white."""
+
+KNEE = 0.8
+"""Variance over its prediction below which the sensor itself saturates before the white level does."""
+
+DRIFT_LIMIT, DRIFT_WARNING = 0.2, 0.02
+RANGE_WARNING = 0.2
+SCATTER_WARNING = 1.5
+CURVE_WARNING, BEND_SIGNIFICANCE = 0.03, 4.0
+ZEROS_WARNING = 0.005
+PLANES_WARNING = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TransferCurve:
+    """Photon transfer curve of one plane, for a picture: one point per exposure.
+
+    Attributes
+    ----------
+    mean, variance : ndarray, shape (E,)
+        Mean above dark (DN) and variance (DN squared); the first exposure is dark.
+    scatter : float
+        Scatter of the blocks' variances about the line over what noise alone explains.
+    bend : float
+        Largest relative departure of an exposure's mean variance from the line, beyond its noise.
+    """
+
+    mean: Floats
+    variance: Floats
+    scatter: float
+    bend: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseEstimate:
+    """Result of `photon_transfer`: the figures, the curve of every plane, and what the user should know."""
+
+    camera_noise: CameraNoise
+    curves: tuple[TransferCurve, ...]
+    exposures: tuple[float | None, ...]
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    read_variance: float
+    slope: float
+    covariance: Floats  # (2, 2)
+    curve: TransferCurve
+
+
+def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> NoiseEstimate:
+    """Noise figures of every colour plane from dark frames and flat frames at several exposures.
+
+    Parameters
+    ----------
+    dark
+        At least two frames without light, at the exposure time of the test.
+    flats
+        One stack per exposure, each of at least two frames. Any target that stands still; a plain one where the
+        response's fixed pattern (PRNU) and dead pixels are wanted.
+
+    Raises
+    ------
+    CalibrationError
+        Too few frames, frames of different cameras, a lamp that flickers, everything saturated, dark frames as bright
+        as the flats.
+    """
+    same_camera([dark, *flats])
+    _check(dark, flats)
+    planes = range(len(dark.names))
+    lines = [_fit_line(dark, flats, plane) for plane in planes]
+    black = _black_level(dark)
+    saturation, warnings = _saturation(dark, flats, lines, black)
+    pattern = fixed_pattern(dark, flats, saturation)
+    read = np.sqrt([line.read_variance for line in lines])
+    gain = np.array([1 / line.slope for line in lines])
+    noise = CameraNoise(
+        planes=dark.names,
+        gain=Quantity(gain, gain**2 * np.array([np.sqrt(line.covariance[1, 1]) for line in lines])),
+        read_noise=Quantity(read, np.array([np.sqrt(line.covariance[0, 0]) for line in lines]) / (2 * read)),
+        black_level=black,
+        saturation=saturation,
+        linearity_error=_linearity(dark, flats, saturation.value),
+        dsnu=pattern.dsnu,
+        prnu=pattern.prnu,
+        defects=pattern.defects,
+    )
+    curves = tuple(line.curve for line in lines)
+    warnings += [*_warnings(dark, flats, noise, curves), *pattern.warnings]
+    return NoiseEstimate(
+        camera_noise=noise,
+        curves=curves,
+        exposures=tuple(flat.exposure for flat in flats),
+        warnings=tuple(warnings),
+    )
+
+
+def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
+    for name, stack in [("the dark frames", dark), *((f"flat exposure {i + 1}", s) for i, s in enumerate(flats))]:
+        if stack.count < 2:
+            raise CalibrationError(f"{name}: temporal noise needs at least two frames of the same scene, given is one")
+    if not flats:
+        raise CalibrationError("no flat exposure is given: the gain needs lit frames at one exposure at least")
+    for index, flat in enumerate(flats):
+        drift = float((np.ptp(flat.strength, axis=0) / np.maximum(flat.strength.mean(axis=0), 1)).max())
+        if drift > DRIFT_LIMIT:
+            raise CalibrationError(
+                f"flat exposure {index + 1}: the frames' strengths differ by {100 * drift:.0f} %: each group must be "
+                "frames of one exposure with a steady lamp"
+            )
+        if flat.piled_at is not None:
+            raise CalibrationError(
+                f"flat exposure {index + 1}: samples pile up at {flat.piled_at:.0f} DN, below the stated white level "
+                f"{flat.white:g}: the camera saturates there; state --white-level {flat.piled_at:.0f}"
+            )
+    brightest = max(float(flat.strength.mean(axis=0).max()) for flat in flats)
+    if float(dark.strength.mean(axis=0).max()) > 0.5 * brightest:
+        raise CalibrationError("the dark frames are not darker than half of the brightest flat frames: was a lamp on?")
+
+
+def _blocks(values: npt.NDArray[np.generic]) -> Floats:
+    """Means over blocks of BLOCK x BLOCK samples, flattened; a border that does not fill a block is left out."""
+    size = min(BLOCK, *values.shape)
+    rows, columns = (side // size for side in values.shape)
+    cut = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
+    return np.asarray(cut.mean(axis=(1, 3), dtype=np.float64).ravel())
+
+
+def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -> _Line:
+    """Line of variance over mean through the blocks of all exposures, weighted by the variance of a variance."""
+    level = _blocks(dark.mean[plane])
+    range_ = dark.white - float(dark.black[plane])
+    points = [(np.zeros_like(level), _blocks(dark.variance[plane]), dark.count)]
+    for flat in flats:
+        mean = _blocks(flat.mean[plane]) - level
+        good = (_blocks(flat.clipped[plane]) == 0) & (mean + level < HIGHEST * range_)
+        variance = _blocks(flat.variance[plane])
+        points.append((np.where(good, mean, np.nan), variance, flat.count))
+    exposure = np.concatenate([np.full(len(m), i) for i, (m, _, _) in enumerate(points)])
+    mean = np.concatenate([m for m, _, _ in points])
+    variance = np.concatenate([v for _, v, _ in points])
+    freedom = np.concatenate([np.full(len(m), BLOCK**2 * (n - 1)) for m, _, n in points])
+    used = np.isfinite(mean)
+    if not (used & (exposure > 0)).any():
+        raise CalibrationError(
+            f"plane {dark.names[plane]}: every block of every flat exposure is saturated or nearly so; "
+            "shorten the exposure"
+        )
+    if mean[used].max() <= 0:
+        raise CalibrationError(f"plane {dark.names[plane]}: the flat frames are not brighter than the dark ones")
+    return _weighted_line(mean[used], variance[used], freedom[used], exposure[used])
+
+
+def _weighted_line(mean: Floats, variance: Floats, freedom: Floats, exposure: Floats) -> _Line:
+    design = np.stack([np.ones_like(mean), mean], axis=1)
+    fitted = np.maximum(variance.mean(), 1e-6) * np.ones_like(mean)
+    for _ in range(8):
+        weight = freedom / fitted**2
+        inverse = np.linalg.inv(design.T @ (weight[:, None] * design))
+        solution = inverse @ (design.T @ (weight * variance))
+        fitted = np.maximum(design @ solution, 1e-3 * variance.mean())
+    residual = variance - design @ solution
+    score = (weight * residual)[:, None] * design
+    groups = np.unique(exposure)
+    means = np.array([[values[exposure == g].mean() for g in groups] for values in (mean, variance, fitted)])
+    scatter = float(np.sqrt(np.mean((residual / fitted) ** 2 * freedom / 2)))
+    if solution[1] <= 0:
+        raise CalibrationError(
+            "the variance does not grow with the signal: these are not raw samples with shot noise (compressed, "
+            "averaged or noise-reduced frames cannot be calibrated)"
+        )
+    noise = scatter * np.sqrt([2 / freedom[exposure == g].sum() for g in groups])
+    curve = TransferCurve(
+        mean=means[0],
+        variance=means[1],
+        scatter=scatter,
+        bend=float(np.maximum(np.abs(means[1] / means[2] - 1) - BEND_SIGNIFICANCE * noise, 0).max()),
+    )
+    return _Line(max(float(solution[0]), 1e-12), float(solution[1]), inverse @ (score.T @ score) @ inverse, curve)
+
+
+def _black_level(dark: TemporalStack) -> Quantity:
+    drift = dark.strength.var(axis=0, ddof=1)
+    noise = np.array([variance.mean(dtype=np.float64) / variance.size for variance in dark.variance])
+    return Quantity(dark.black + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, noise) / dark.count))
+
+
+def _saturation(
+    dark: TemporalStack, flats: Sequence[TemporalStack], lines: Sequence[_Line], black: Quantity
+) -> tuple[Quantity, list[str]]:
+    """Where samples saturate: the white level, or the lower level at which the variance breaks down."""
+    level = dark.white - black.value
+    std = np.hypot(black.std, 0.5)
+    warnings = []
+    for plane, line in enumerate(lines):
+        if (knee := _knee(dark, flats, plane, line)) is not None and knee < 0.95 * level[plane]:
+            warnings.append(
+                f"plane {dark.names[plane]}: the variance breaks down at {knee:.0f} DN above black, below "
+                f"the white level: the sensor saturates there (white_level {knee + black.value[plane]:.0f} in the test)"
+            )
+            level[plane], std[plane] = knee, 0.05 * knee
+    if not any(clipped.any() for flat in flats for clipped in flat.clipped) and not warnings:
+        warnings.append("no exposure reached saturation: the full well is that of the stated white level")
+    return Quantity(level, std), warnings
+
+
+def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line) -> float | None:
+    lowest: float | None = None
+    for flat in flats:
+        mean = _blocks(flat.mean[plane]) - _blocks(dark.mean[plane])
+        free = _blocks(flat.clipped[plane]) == 0
+        ratio = _blocks(flat.variance[plane]) / (line.read_variance + line.slope * np.maximum(mean, 0))
+        noise = np.sqrt(2 / (BLOCK**2 * (flat.count - 1)))
+        broken = free & (ratio < KNEE - 3 * noise) & (mean > 0.3 * (dark.white - dark.black[plane]))
+        if broken.sum() > 0.02 * len(mean):
+            knee = float(np.median(mean[broken]))
+            lowest = knee if lowest is None else min(lowest, knee)
+    return lowest
+
+
+def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: Floats) -> Quantity:
+    """EMVA 1288 LE: mean relative deviation in % from the line through mean against exposure time, 5 to 95 %."""
+    planes = len(dark.names)
+    known = [flat for flat in flats if flat.exposure is not None]
+    time = np.array([flat.exposure for flat in known], dtype=np.float64)
+    error, std = np.full(planes, np.nan), np.full(planes, np.nan)
+    for plane in range(planes):
+        mean = np.array([flat.strength[:, plane].mean() for flat in known]) - dark.strength[:, plane].mean()
+        steady = np.array([flat.strength[:, plane].std(ddof=1) / np.sqrt(flat.count) for flat in known])
+        free = np.array([not flat.clipped[plane].any() for flat in known], dtype=bool)
+        good = free & (mean > 0.05 * saturation[plane]) & (mean < 0.95 * saturation[plane])
+        if len(np.unique(time[good])) < 3:
+            continue
+        line = np.polyfit(time[good], mean[good], 1, w=1 / mean[good])
+        error[plane] = 100 * np.abs(mean[good] / np.polyval(line, time[good]) - 1).mean()
+        std[plane] = 100 * np.sqrt(((steady[good] / mean[good]) ** 2).sum()) / good.sum()
+    return Quantity(error, std)
+
+
+def _warnings(
+    dark: TemporalStack, flats: Sequence[TemporalStack], noise: CameraNoise, curves: Sequence[TransferCurve]
+) -> list[str]:
+    warnings = []
+    if dark.zeros > ZEROS_WARNING:
+        warnings.append(
+            f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise "
+            "comes out too small; raise the camera's black level (offset)"
+        )
+    drift = max(float((np.ptp(f.strength, axis=0) / np.maximum(f.strength.mean(axis=0), 1)).max()) for f in flats)
+    if drift > DRIFT_WARNING:
+        warnings.append(f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out")
+    reach = max(float(curve.mean.max()) for curve in curves)
+    if reach < RANGE_WARNING * (dark.white - float(dark.black.min())):
+        warnings.append(
+            f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
+        )
+    for name, curve in zip(dark.names, curves, strict=True):
+        if curve.scatter > SCATTER_WARNING or curve.bend > CURVE_WARNING:
+            warnings.append(
+                f"plane {name}: the variance does not follow a line (departs by {100 * curve.bend:.1f} %, scatters "
+                f"{curve.scatter:.1f} times as much as noise): did the target move, or the lamp "
+                "flicker, between frames?"
+            )
+    if np.ptp(noise.gain.value) > PLANES_WARNING * noise.gain.value.mean():
+        warnings.append("the gains of the planes differ: the camera applies digital gain per colour; the mean is used")
+    return warnings
