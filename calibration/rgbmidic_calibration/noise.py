@@ -189,7 +189,9 @@ def _weighted_line(mean: Floats, variance: Floats, freedom: Floats, exposure: Fl
         solution = inverse @ (design.T @ (weight * variance))
         fitted = np.maximum(design @ solution, 1e-3 * variance.mean())
     residual = variance - design @ solution
-    score = (weight * residual)[:, None] * design
+    # Sandwich covariance with each residual as if its block had not been fitted (HC3): the dark blocks pull strongly.
+    leverage = weight * np.einsum("bi,ij,bj->b", design, inverse, design)
+    score = (weight * residual / (1 - leverage))[:, None] * design
     groups = np.unique(exposure)
     means = np.array([[values[exposure == g].mean() for g in groups] for values in (mean, variance, fitted)])
     scatter = float(np.sqrt(np.mean((residual / fitted) ** 2 * freedom / 2)))
