@@ -1,0 +1,195 @@
+"""TRI3 meshes and pixel maps: orientation, coverage, one owner per pixel, shape functions, and what is refused."""
+
+from __future__ import annotations
+
+import naive_mesh
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rgbmidic.errors import InputError, RegionError
+from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+
+SHAPE = (97, 121)
+
+
+def disc_with_hole(shape=SHAPE):
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    radius = np.hypot(x - 55, y - 48)
+    return Region.from_mask((radius < 40) & (radius > 14))
+
+
+def two_islands(shape=SHAPE):
+    mask = np.zeros(shape, dtype=bool)
+    mask[10:60, 5:50] = mask[30:90, 70:115] = True
+    return Region.from_mask(mask)
+
+
+REGIONS = {
+    "rectangle": Region.from_rectangle((3, 5, 110, 90), SHAPE),
+    "rectangle between pixels": Region.from_rectangle((3.3, 5.7, 110.1, 90.2), SHAPE),
+    "whole image": Region.from_rectangle((0, 0, 120, 96), SHAPE),
+    "polygon": Region.from_polygon([(10, 5), (115, 20), (90, 90), (20, 80), (40, 45)], SHAPE),
+    "mask with a hole": disc_with_hole(),
+    "two islands": two_islands(),
+}
+
+
+@pytest.mark.parametrize("size", [6.5, 13, 25])
+@pytest.mark.parametrize("name", REGIONS)
+def test_elements_are_positive_and_every_node_is_used(name, size):
+    mesh = Tri3Mesh.from_region(REGIONS[name], size)
+    assert (mesh.areas > 0).all()
+    np.testing.assert_array_equal(np.unique(mesh.elements), np.arange(len(mesh.nodes)))
+    assert len(np.unique(mesh.nodes, axis=0)) == len(mesh.nodes)
+
+
+@pytest.mark.parametrize("size", [6.5, 13, 25])
+@pytest.mark.parametrize("name", REGIONS)
+def test_every_covered_pixel_has_exactly_one_owner_that_contains_it(name, size):
+    region = REGIONS[name]
+    mesh = Tri3Mesh.from_region(region, size)
+    pixels = PixelMap.from_mesh(mesh, region)
+    assert len({*zip(pixels.rows.tolist(), pixels.columns.tolist(), strict=True)}) == pixels.rows.size
+    assert region.mask[pixels.rows, pixels.columns].all()
+    owned = pixels.scatter(np.ones(pixels.rows.size, dtype=np.float32)) > 0
+    if region.rectangle is not None:
+        np.testing.assert_array_equal(owned, region.mask)
+    values = shape_functions(pixels)
+    assert values.min() > -1e-4
+
+
+def shape_functions(pixels):
+    """Shape functions (P, 3) of the owner at every owned pixel."""
+    e = np.repeat(np.arange(len(pixels.offsets) - 1), np.diff(pixels.offsets))
+    position = np.stack([np.ones(e.size), pixels.local_x, pixels.local_y])
+    return np.einsum("pac,cp->pa", pixels.barycentric[e], position.astype(np.float64))
+
+
+@pytest.mark.parametrize(("name", "share"), [("polygon", 0.97), ("mask with a hole", 0.96), ("two islands", 0.99)])
+def test_a_mesh_of_any_outline_covers_nearly_all_of_the_region(name, share):
+    region = REGIONS[name]
+    mesh = Tri3Mesh.from_region(region, 13)
+    pixels = PixelMap.from_mesh(mesh, region)
+    assert pixels.rows.size > share * region.mask.sum()
+    assert mesh.areas.sum() == pytest.approx(region.mask.sum(), rel=0.08)
+
+
+def test_a_hole_and_the_gap_between_islands_are_not_meshed():
+    assert not covered_by(Tri3Mesh.from_region(REGIONS["mask with a hole"], 13), (55, 48))
+    assert not covered_by(Tri3Mesh.from_region(REGIONS["two islands"], 13), (60, 45))
+
+
+def covered_by(mesh, point):
+    return any(naive_mesh.contains(mesh.nodes[element], *point) for element in mesh.elements)
+
+
+@given(
+    width=st.integers(9, 40),
+    height=st.integers(9, 40),
+    left=st.floats(0, 3),
+    top=st.floats(0, 3),
+    size=st.floats(4, 30),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_rectangle_is_covered_once(width, height, left, top, size):
+    shape = (height + 5, width + 5)
+    region = Region.from_rectangle((left, top, left + width, top + height), shape)
+    mesh = Tri3Mesh.from_region(region, size)
+    pixels = PixelMap.from_mesh(mesh, region)
+    assert mesh.areas.sum() == pytest.approx(np.prod(np.diff(np.reshape(region.rectangle, (2, 2)), axis=0)))
+    assert pixels.rows.size == region.mask.sum()
+    assert pixels.offsets[-1] == pixels.rows.size
+
+
+@given(seed=st.integers(0, 2**32 - 1), outlined=st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_owners_equal_the_naive_twin(seed, outlined):
+    random = np.random.default_rng(seed)
+    shape = (int(random.integers(18, 30)), int(random.integers(18, 30)))
+    if outlined:
+        corners = random.uniform(0, 1, (5, 2)) * (shape[1] - 1, shape[0] - 1)
+        region = Region.from_polygon(corners, shape)
+    else:
+        region = Region.from_rectangle((*random.uniform(0, 4, 2), shape[1] - 2.5, shape[0] - 3), shape)
+    try:
+        mesh = Tri3Mesh.from_region(region, float(random.uniform(6, 12)))
+    except RegionError:
+        return  # a sliver of a polygon
+    expected = naive_mesh.owners(mesh.nodes, mesh.elements, region.mask)
+    if not (expected >= 0).any():
+        return
+    pixels = PixelMap.from_mesh(mesh, region)
+    found = np.where(region.mask, -1, -2)
+    found[pixels.rows, pixels.columns] = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
+    # a pixel on a shared edge may go to either neighbour: the kernel allows for rounding
+    for row, column in np.argwhere(found != expected):
+        assert found[row, column] >= 0
+        assert shape_functions_at(mesh, found[row, column], column, row).min() > -1e-6
+
+
+def shape_functions_at(mesh, element, x, y):
+    corners = mesh.nodes[mesh.elements[element]]
+    return np.linalg.solve(np.vstack([np.ones(3), corners.T]), [1, x, y])
+
+
+def test_shape_functions_are_one_at_their_corner_and_sum_to_one():
+    mesh = Tri3Mesh.from_region(REGIONS["polygon"], 13)
+    pixels = PixelMap.from_mesh(mesh, REGIONS["polygon"])
+    corners = mesh.nodes[mesh.elements] - pixels.origin[:, None]
+    position = np.concatenate([np.ones((len(corners), 3, 1)), corners], axis=2)
+    np.testing.assert_allclose(
+        np.einsum("eac,ebc->eba", pixels.barycentric, position),
+        np.broadcast_to(np.eye(3), (len(corners), 3, 3)),
+        atol=1e-9,
+    )
+    np.testing.assert_allclose(shape_functions(pixels).sum(axis=1), 1, atol=1e-6)
+
+
+def test_gather_and_scatter_are_inverse_on_the_region():
+    region = REGIONS["whole image"]
+    pixels = PixelMap.from_mesh(Tri3Mesh.from_region(region), region)
+    image = np.random.default_rng(0).normal(size=SHAPE).astype(np.float32)
+    np.testing.assert_array_equal(pixels.scatter(pixels.gather(image)), image)
+    np.testing.assert_array_equal(pixels.gather(np.stack([image, 2 * image]))[1], 2 * pixels.gather(image))
+
+
+def test_the_size_of_the_elements_is_about_what_is_asked_for():
+    mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 500, 250), (251, 501)), 25)
+    assert mesh.areas == pytest.approx(25 * 25 / 2)
+    outlined = Tri3Mesh.from_region(REGIONS["mask with a hole"], 13)
+    assert np.median(np.sqrt(2 * outlined.areas)) == pytest.approx(13, rel=0.3)
+
+
+def test_neighbours_and_sums_at_the_nodes():
+    mesh = Tri3Mesh(nodes=[(0, 0), (10, 0), (10, 10), (0, 10)], elements=[(0, 1, 2), (0, 2, 3)])
+    np.testing.assert_array_equal(mesh.neighbours, [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)])
+    np.testing.assert_allclose(mesh.to_nodes(np.array([1.0, 10.0])), [11, 1, 11, 10])
+
+
+def test_clockwise_elements_are_turned_and_impossible_meshes_refused():
+    mesh = Tri3Mesh(nodes=[(0, 0), (10, 0), (10, 10)], elements=[(0, 2, 1)])
+    np.testing.assert_array_equal(mesh.elements, [(0, 1, 2)])
+    for nodes, elements, message in [
+        ([(0, 0), (1, 1), (2, 2)], [(0, 1, 2)], "no area"),
+        ([(0, 0), (1, 0), (2, 2)], [(0, 1, 3)], "name existing nodes"),
+        ([(0, 0), (1, 0), (np.nan, 2)], [(0, 1, 2)], "finite"),
+        ([(0, 0, 0), (1, 0, 0), (2, 2, 0)], [(0, 1, 2)], r"nodes \(N, 2\)"),
+        ([(0, 0), (1, 0), (2, 2)], np.empty((0, 3)), r"elements \(E, 3\)"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            Tri3Mesh(nodes=nodes, elements=elements)
+
+
+def test_too_small_regions_and_elements_are_refused():
+    with pytest.raises(InputError, match="at least 4 px"):
+        Tri3Mesh.from_region(REGIONS["rectangle"], 3.9)
+    with pytest.raises(InputError, match="at least 4 px"):
+        Tri3Mesh.from_region(REGIONS["rectangle"], float("nan"))
+    with pytest.raises(RegionError, match="too small"):
+        Tri3Mesh.from_region(Region.from_rectangle((10, 10, 13, 60), SHAPE))
+    line = np.zeros(SHAPE, dtype=bool)
+    line[20, 10:60] = True
+    with pytest.raises(RegionError, match="too small"):
+        Tri3Mesh.from_region(Region.from_mask(line))
