@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
@@ -159,9 +160,14 @@ class Camera:
 
 
 def record(
-    images: npt.NDArray[np.floating], camera: Camera, lights: tuple[Light, ...], *, seed: int
+    images: npt.NDArray[np.floating],
+    camera: Camera,
+    lights: tuple[Light, ...],
+    *,
+    seed: int,
+    on: Collection[str] | None = None,
 ) -> Mosaic | ChannelFrame:
-    """The raw frame of lights that shine together.
+    """The raw frame that the camera takes.
 
     Electrons = Poisson(gain x signal) + normal(read noise); DN = round(electrons/gain + black), clipped at saturation.
 
@@ -175,30 +181,44 @@ def record(
         The k lights of the images.
     seed
         Of the noise; the same seed gives the same frame.
+    on
+        Names of the lights that shine; None: all together, () a dark frame.
 
     Returns
     -------
     Mosaic (Bayer camera) or ChannelFrame (3 channels, or 1 for a monochrome camera)
     """
-    signal = _channel_signal(np.asarray(images), camera, lights)
+    signal = _channel_signal(_lit(np.asarray(images), lights, on), camera, lights)
     values = _expose(signal, camera, np.random.default_rng(seed))
     if camera.kind == "bayer":
-        return Mosaic(values=values, cfa=camera.cfa, black_level=_levels(camera, (2, 2)), white_level=camera.white_level)
-    return ChannelFrame(
-        values=values, black_level=_levels(camera, (camera.channels,)), white_level=camera.white_level
-    )
+        return Mosaic(
+            values=values, cfa=camera.cfa, black_level=_levels(camera, (2, 2)), white_level=camera.white_level
+        )
+    return ChannelFrame(values=values, black_level=_levels(camera, (camera.channels,)), white_level=camera.white_level)
 
 
 def _levels(camera: Camera, shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
     return np.full(shape, float(camera.black_level))
 
 
+def _lit(
+    images: npt.NDArray[np.floating], lights: tuple[Light, ...], on: Collection[str] | None
+) -> npt.NDArray[np.floating]:
+    """The images with those of the lights that are off set to nothing."""
+    if images.ndim != 3 or len(images) != len(lights):
+        raise InputError(f"{len(lights)} lights give as many images (k, H, W), not an array of shape {images.shape}")
+    if on is None:
+        return images
+    names = [light.name for light in lights]
+    if unknown := set(on) - set(names):
+        raise InputError(f"no light {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+    return images * np.array([name in on for name in names], dtype=images.dtype)[:, None, None]
+
+
 def _channel_signal(
     images: npt.NDArray[np.floating], camera: Camera, lights: tuple[Light, ...]
 ) -> npt.NDArray[np.float32]:
     """Noise-free DN above black: (H, W) behind a colour filter array, else (C, H, W)."""
-    if images.ndim != 3 or len(images) != len(lights):
-        raise InputError(f"{len(lights)} lights give as many images (k, H, W), not an array of shape {images.shape}")
     matrix = camera.mixing(lights)
     channels = np.einsum("cl,lyx->cyx", matrix.astype(np.float32), images.astype(np.float32, copy=False))
     if camera.kind != "bayer":
@@ -209,9 +229,7 @@ def _channel_signal(
     return mosaic
 
 
-def _expose(
-    signal: npt.NDArray[np.float32], camera: Camera, generator: np.random.Generator
-) -> npt.NDArray[np.uint16]:
+def _expose(signal: npt.NDArray[np.float32], camera: Camera, generator: np.random.Generator) -> npt.NDArray[np.uint16]:
     electrons = generator.poisson(np.maximum(signal, 0) * camera.gain).astype(np.float64)
     if camera.read_noise > 0:
         electrons += generator.normal(scale=camera.read_noise, size=signal.shape)

@@ -9,9 +9,9 @@ import numpy.typing as npt
 from scipy.special import erf
 
 from rgbmidic._kernels.render import filter_columns, trace_rows
-from rgbmidic.errors import InputError
+from rgbmidic.virtual.fields import AffineField, InPlaneField, material_from_spatial
 from rgbmidic.virtual.light import NOMINAL_DISTANCE, Light
-from rgbmidic.virtual.scene import AffineField, InPlaneField, Plate, Scene, State
+from rgbmidic.virtual.scene import Plate, Scene, State
 
 __all__ = ["material_points", "render", "samples_needed", "truth"]
 
@@ -20,8 +20,6 @@ BAND = 64
 """Pixel rows traced at a time: bounds the memory."""
 LONGEST_STEP = 0.25
 """Motion (px) between two of the poses over which a moving body is averaged."""
-INVERSION_TOLERANCE = 1e-8
-"""Accuracy (mm) of the material point found from a spatial one."""
 
 
 def samples_needed(scene: Scene) -> int:
@@ -70,7 +68,7 @@ def material_points(scene: Scene, state: State | None = None) -> Array:
     x, y = np.meshgrid(np.arange(scene.camera.shape[1], dtype=float), np.arange(scene.camera.shape[0], dtype=float))
     spatial = _intersect(scene, state, x, y)
     if isinstance(scene.body, Plate):
-        spatial[:2] = _to_material(spatial[:2], state.displacement)
+        spatial[:2] = material_from_spatial(state.displacement, spatial[0], spatial[1])
         spatial[2] = np.where(np.isfinite(spatial[0]), 0.0, np.nan)
         outside = (abs(spatial[0]) > scene.body.width / 2) | (abs(spatial[1]) > scene.body.height / 2)
         spatial[:, outside] = np.nan
@@ -141,7 +139,9 @@ def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> np
     camera, n = scene.camera, samples_needed(scene)
     turn, origin = state.pose(scene.body)
     frame = np.concatenate([-turn.T @ origin, turn.T.ravel()])
-    positions = np.array([[*(turn.T @ (np.array(li.position) - origin)), li.power * NOMINAL_DISTANCE**2] for li in lights])
+    positions = np.array(
+        [[*(turn.T @ (np.array(li.position) - origin)), li.power * NOMINAL_DISTANCE**2] for li in lights]
+    )
     lens = np.array([camera.focal_px, *camera.centre, lights[0].magnification, *lights[0].shift])
     affine = _affine(state.displacement)
     pad, taps = _aperture(camera.lens_blur, n)
@@ -190,13 +190,15 @@ def _subpixel_material(scene: Scene, state: State, light: Light, first: int, row
     x = (x - camera.centre[0] - light.shift[0]) / zoom + camera.centre[0]
     y = (y - camera.centre[1] - light.shift[1]) / zoom + camera.centre[1]
     spatial = _intersect(scene, state, *np.meshgrid(x, y))
-    return np.ascontiguousarray(np.moveaxis(_to_material(spatial[:2], state.displacement), 0, -1))
+    return np.stack(material_from_spatial(state.displacement, spatial[0], spatial[1]), axis=-1)
 
 
 def _intersect(scene: Scene, state: State, x: Array, y: Array) -> Array:
     """Point (3, ...) in body axes where the rays through image points (px) meet the body's front; NaN beside it."""
     camera, (turn, origin) = scene.camera, state.pose(scene.body)
-    rays = np.stack([(x - camera.centre[0]) / camera.focal_px, (y - camera.centre[1]) / camera.focal_px, np.ones_like(x)])
+    rays = np.stack(
+        [(x - camera.centre[0]) / camera.focal_px, (y - camera.centre[1]) / camera.focal_px, np.ones_like(x)]
+    )
     direction = np.einsum("ji,j...->i...", turn, rays)
     start = -turn.T @ origin
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -216,23 +218,6 @@ def _intersect(scene: Scene, state: State, x: Array, y: Array) -> Array:
     return np.asarray(point)
 
 
-def _to_material(spatial: Array, field: InPlaneField | None) -> Array:
-    """Material points X of a plate with X + u(X) = x, by fixed-point iteration (a contraction: strains are < 1)."""
-    if field is None:
-        return spatial
-    if isinstance(field, AffineField):
-        m = field.inverse()
-        return np.stack([m[0] * spatial[0] + m[1] * spatial[1] + m[4], m[2] * spatial[0] + m[3] * spatial[1] + m[5]])
-    material = spatial
-    for _ in range(100):
-        following = spatial - np.stack(field(material[0], material[1]))
-        change = np.abs(following - material)
-        material = following
-        if not (change > INVERSION_TOLERANCE).any():
-            return material
-    raise InputError("the plate's displacement field cannot be inverted: its gradient must stay below 1 everywhere")
-
-
 def _normals(scene: Scene, material: Array) -> Array:
     """Outward unit normals (3, H, W) in body axes."""
     normal = np.zeros_like(material)
@@ -243,5 +228,3 @@ def _normals(scene: Scene, material: Array) -> Array:
     if scene.body.parameters()[0] == 1:
         normal[1] = 0.0
     return normal
-
-

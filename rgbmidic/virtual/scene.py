@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,14 +11,13 @@ import numpy.typing as npt
 from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import InputError
 from rgbmidic.virtual.camera import Camera
+from rgbmidic.virtual.fields import InPlaneField
 from rgbmidic.virtual.light import Light, Vector, rotation
 from rgbmidic.virtual.surface import Surface
 
-__all__ = ["AffineField", "Body", "Cylinder", "InPlaneField", "Plate", "Scene", "Sphere", "State"]
+__all__ = ["Body", "Cylinder", "Plate", "Scene", "Sphere", "State"]
 
 Array = npt.NDArray[np.float64]
-InPlaneField = Callable[[Array, Array], tuple[Array, Array]]
-"""Displacement (ux, uy) in mm of a plate's material points (x, y) in mm, in the plate's own axes; vectorised."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,32 +100,6 @@ class Plate:
 
 
 Body = Sphere | Cylinder | Plate
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AffineField:
-    """A uniform displacement gradient on a plate: u = gradient . x + offset.
-
-    Attributes
-    ----------
-    gradient
-        ((du/dx, du/dy), (dv/dx, dv/dy)).
-    offset
-        Displacement (mm) of the plate's middle.
-    """
-
-    gradient: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
-    offset: tuple[float, float] = (0.0, 0.0)
-
-    def __call__(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Displacement (mm) of the material points."""
-        (xx, xy), (yx, yy) = self.gradient
-        return xx * x + xy * y + self.offset[0], yx * x + yy * y + self.offset[1]
-
-    def inverse(self) -> Array:
-        """[m00, m01, m10, m11, t0, t1]: spatial to material point."""
-        matrix = np.linalg.inv(np.eye(2) + np.array(self.gradient))
-        return np.concatenate([matrix.ravel(), -matrix @ np.array(self.offset)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from rgbmidic.virtual.camera import Camera
+from rgbmidic.virtual.fields import AffineField
 from rgbmidic.virtual.light import Light, Vector
-from rgbmidic.virtual.scene import AffineField, Plate, Scene, Sphere, State
+from rgbmidic.virtual.scene import Plate, Scene, Sphere, State
 from rgbmidic.virtual.surface import Finish, Surface
 
 __all__ = ["REFERENCE_CROSSTALK", "paint", "plate_scene", "sphere_scene", "strained_plate", "three_lights", "turned"]
@@ -21,7 +22,9 @@ DISTANCE = 600.0
 """mm from the camera to the object's front point."""
 
 
-def three_lights(target: Vector = (0.0, 0.0, DISTANCE), aberration: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> tuple[Light, ...]:
+def three_lights(
+    target: Vector = (0.0, 0.0, DISTANCE), aberration: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> tuple[Light, ...]:
     """Red, green and blue lamps left, right and above the camera, all equally bright at the target.
 
     `aberration`: relative magnification of the lens in red, green and blue.

@@ -64,7 +64,9 @@ class Sensitivities:
     def __post_init__(self) -> None:
         wavelengths, values = np.asarray(self.wavelengths, dtype=float), np.asarray(self.values, dtype=float)
         if wavelengths.ndim != 1 or values.shape != (3, wavelengths.size) or wavelengths.size < 2:
-            raise InputError(f"sensitivities are 3 rows over n wavelengths, not {values.shape} over {wavelengths.shape}")
+            raise InputError(
+                f"sensitivities are 3 rows over n wavelengths, not {values.shape} over {wavelengths.shape}"
+            )
         if not (np.isfinite(values).all() and values.min() >= 0 and np.allclose(np.diff(wavelengths, 2), 0)):
             raise InputError("sensitivities must be finite, not negative, and given at equally spaced wavelengths")
         object.__setattr__(self, "wavelengths", wavelengths)

@@ -221,7 +221,9 @@ def test_reflection_is_erratic_inside_the_lobe_and_smooth_outside():
 
 def test_lateral_aberration_moves_each_colour_along_the_radius():
     plain = sphere_scene(size=96, gloss=0.0, samples=4, focal_px=2000.0, lens_blur=1.0)
-    shifted = replace(plain, lights=tuple(replace(li, magnification=m) for li, m in zip(plain.lights, (-0.01, 0, 0.01), strict=True)))
+    shifted = replace(
+        plain, lights=tuple(replace(li, magnification=m) for li, m in zip(plain.lights, (-0.01, 0, 0.01), strict=True))
+    )
     a, b = render(plain), render(shifted)
     assert np.array_equal(a[1], b[1])
     strip = slice(40, 56)
