@@ -190,15 +190,10 @@ def record(
     """
     signal = _channel_signal(_lit(np.asarray(images), lights, on), camera, lights)
     values = _expose(signal, camera, np.random.default_rng(seed))
+    black = np.array(float(camera.black_level))
     if camera.kind == "bayer":
-        return Mosaic(
-            values=values, cfa=camera.cfa, black_level=_levels(camera, (2, 2)), white_level=camera.white_level
-        )
-    return ChannelFrame(values=values, black_level=_levels(camera, (camera.channels,)), white_level=camera.white_level)
-
-
-def _levels(camera: Camera, shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
-    return np.full(shape, float(camera.black_level))
+        return Mosaic(values=values, cfa=camera.cfa, black_level=black, white_level=camera.white_level)
+    return ChannelFrame(values=values, black_level=black, white_level=camera.white_level)
 
 
 def _lit(
@@ -212,7 +207,7 @@ def _lit(
     names = [light.name for light in lights]
     if unknown := set(on) - set(names):
         raise InputError(f"no light {', '.join(sorted(unknown))}; there are {', '.join(names)}")
-    return images * np.array([name in on for name in names], dtype=images.dtype)[:, None, None]
+    return np.asarray(images * np.array([name in on for name in names], dtype=images.dtype)[:, None, None])
 
 
 def _channel_signal(
@@ -220,7 +215,9 @@ def _channel_signal(
 ) -> npt.NDArray[np.float32]:
     """Noise-free DN above black: (H, W) behind a colour filter array, else (C, H, W)."""
     matrix = camera.mixing(lights)
-    channels = np.einsum("cl,lyx->cyx", matrix.astype(np.float32), images.astype(np.float32, copy=False))
+    channels: npt.NDArray[np.float32] = np.einsum(
+        "cl,lyx->cyx", matrix.astype(np.float32), images.astype(np.float32, copy=False)
+    )
     if camera.kind != "bayer":
         return channels
     mosaic = np.empty(channels.shape[1:], dtype=np.float32)

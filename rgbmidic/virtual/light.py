@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.virtual.spectra import Led
@@ -61,7 +62,7 @@ class Light:
         return replace(self, position=(float(position[0]), float(position[1]), float(position[2])))
 
 
-def rotation(angle_deg: float, axis: Vector) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def rotation(angle_deg: float, axis: Vector) -> npt.NDArray[np.float64]:
     """Rotation matrix by an angle about an axis (Rodrigues)."""
     length = math.hypot(*axis)
     if length == 0:
@@ -69,4 +70,5 @@ def rotation(angle_deg: float, axis: Vector) -> np.ndarray[tuple[int, int], np.d
     x, y, z = (component / length for component in axis)
     skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = math.radians(angle_deg)
-    return np.eye(3) + math.sin(angle) * skew + (1 - math.cos(angle)) * (skew @ skew)
+    turn: npt.NDArray[np.float64] = np.eye(3) + math.sin(angle) * skew + (1 - math.cos(angle)) * (skew @ skew)
+    return turn

@@ -63,7 +63,7 @@ def render(scene: Scene, state: State | None = None) -> npt.NDArray[np.float32]:
 
 
 def material_points(scene: Scene, state: State | None = None) -> Array:
-    """Material point (mm, body axes) seen at the centre of every pixel by an ideal lens, shape (3, H, W); NaN off it."""
+    """Material point (mm, body axes) that an ideal lens sees at every pixel centre, shape (3, H, W); NaN off it."""
     state = state or State()
     x, y = np.meshgrid(np.arange(scene.camera.shape[1], dtype=float), np.arange(scene.camera.shape[0], dtype=float))
     spatial = _intersect(scene, state, x, y)

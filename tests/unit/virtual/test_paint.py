@@ -39,7 +39,7 @@ def test_droplets_have_the_stated_diameter():
     body = Plate().parameters()
     here = surface.sample(points, body)[0]
     for factor, correlated in ((0.5, True), (0.8, True), (1.05, False), (1.5, False)):
-        there = surface.sample(points + [factor * diameter, 0, 0], body)[0]
+        there = surface.sample(points + np.array([factor * diameter, 0, 0]), body)[0]
         correlation = np.corrcoef(here, there)[0, 1]
         assert (correlation > 0.03) == correlated, (factor, correlation)
 
