@@ -1,0 +1,157 @@
+"""Slow, obvious twins of the correlation and interpolation kernels: one pixel at a time, in double precision."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from rgbmidic._kernels.interpolation import PAD
+
+__all__ = [
+    "bspline_coefficients",
+    "element_hessian",
+    "element_moments",
+    "element_right_side",
+    "element_vector",
+    "interpolate_nodal",
+    "pull_back",
+    "sample_with_gradient",
+    "warp",
+]
+
+
+def bspline_coefficients(image):
+    """Coefficients by scipy, with the image's mirror around them."""
+    inner = ndimage.spline_filter(np.asarray(image, dtype=np.float64), order=3, mode="mirror")
+    return np.pad(inner, PAD, mode="reflect")
+
+
+def bspline(t):
+    """Centred cubic B-spline and its derivative."""
+    a = abs(t)
+    if a < 1:
+        return 2 / 3 - a**2 + a**3 / 2, np.sign(t) * (-2 * a + 1.5 * a**2)
+    if a < 2:
+        return (2 - a) ** 3 / 6, -np.sign(t) * (2 - a) ** 2 / 2
+    return 0.0, 0.0
+
+
+def spline(coefficients, x, y):
+    """Value and gradient at a point: all taps that the spline reaches, whatever they hold."""
+    height, width = (size - 2 * PAD for size in coefficients.shape)
+    column, row = min(int(np.floor(x)), width - 1), min(int(np.floor(y)), height - 1)
+    value = gradient_x = gradient_y = 0.0
+    for i in range(row - 1, row + 3):
+        for j in range(column - 1, column + 3):
+            (along, slope_x), (across, slope_y) = bspline(x - j), bspline(y - i)
+            tap = float(coefficients[i + PAD, j + PAD])
+            value += along * across * tap
+            gradient_x += slope_x * across * tap
+            gradient_y += along * slope_y * tap
+    return value, gradient_x, gradient_y
+
+
+def sample_with_gradient(coefficients, x, y):
+    """Values and gradients (3, M) at points clamped to the image."""
+    height, width = (size - 2 * PAD for size in coefficients.shape)
+    points = zip(np.clip(x, 0, width - 1), np.clip(y, 0, height - 1), strict=True)
+    return np.array([spline(coefficients, *point) for point in points]).T
+
+
+def shape_functions(pixels, e, i):
+    """The three shape functions of element e at pixel slot i."""
+    return pixels.barycentric[e].astype(np.float64) @ [1.0, float(pixels.local_x[i]), float(pixels.local_y[i])]
+
+
+def owned(pixels):
+    """(element, slot) of every owned pixel."""
+    return [(e, i) for e in range(len(pixels.offsets) - 1) for i in range(pixels.offsets[e], pixels.offsets[e + 1])]
+
+
+def moved(pixels, mesh, displacement, e, i):
+    """Position (x, y) of a pixel in the deformed image."""
+    u = shape_functions(pixels, e, i) @ displacement[mesh.elements[e]]
+    return pixels.columns[i] + u[0], pixels.rows[i] + u[1]
+
+
+def inside(shape, x, y):
+    return 0 <= x <= shape[1] - 1 and 0 <= y <= shape[0] - 1
+
+
+def warp(coefficients, pixels, mesh, displacement):
+    """g(x + u) at the owned pixels (P,); NaN outside the image."""
+    out = np.full(pixels.rows.size, np.nan)
+    for e, i in owned(pixels):
+        x, y = moved(pixels, mesh, displacement, e, i)
+        if inside(pixels.shape, x, y):
+            out[i] = spline(coefficients, x, y)[0]
+    return out
+
+
+def element_right_side(coefficients, reference, gradient, weight, pixels, mesh, displacement):
+    """Sums (E, 3, 2) of w (f - g) grad f phi, and (E, 3) of w r^2, w and the number of weighted pixels outside."""
+    out, sums = np.zeros((len(mesh.elements), 3, 2)), np.zeros((len(mesh.elements), 3))
+    for e, i in owned(pixels):
+        x, y = moved(pixels, mesh, displacement, e, i)
+        if not inside(pixels.shape, x, y):
+            sums[e, 2] += weight[i] > 0
+            continue
+        residual = float(reference[i]) - spline(coefficients, x, y)[0]
+        for a, phi in enumerate(shape_functions(pixels, e, i)):
+            for c in range(2):
+                out[e, a, c] += float(weight[i]) * residual * float(gradient[c][i]) * phi
+        sums[e, :2] += float(weight[i]) * residual**2, float(weight[i])
+    return out, sums
+
+
+def element_hessian(gradient, weight, pixels):
+    """Sums (E, 3, 3, 3) of w (gx gx, gx gy, gy gy) phi_a phi_b."""
+    out = np.zeros((len(pixels.offsets) - 1, 3, 3, 3))
+    for e, i in owned(pixels):
+        gx, gy, phi = float(gradient[0][i]), float(gradient[1][i]), shape_functions(pixels, e, i)
+        for a in range(3):
+            for b in range(3):
+                out[e, a, b] += float(weight[i]) * phi[a] * phi[b] * np.array([gx * gx, gx * gy, gy * gy])
+    return out
+
+
+def element_moments(reference, warped, weight, pixels):
+    """Sums (E, 6) of w, w f, w g, w f f, w f g, w g g over pixels with weight and a finite g."""
+    out = np.zeros((len(pixels.offsets) - 1, 6))
+    for e, i in owned(pixels):
+        f, g, w = float(reference[i]), float(warped[i]), float(weight[i])
+        if w != 0 and np.isfinite(g):
+            out[e] += w, w * f, w * g, w * f * f, w * f * g, w * g * g
+    return out
+
+
+def pull_back(deformed_weight, reference_weight, pixels, mesh, displacement):
+    """Reference weight times the bilinear deformed weight, 0 where one of its four pixels is 0 or lies outside."""
+    out = np.zeros(pixels.rows.size)
+    height, width = pixels.shape
+    for e, i in owned(pixels):
+        x, y = moved(pixels, mesh, displacement, e, i)
+        if not inside(pixels.shape, x, y):
+            continue
+        column, row = int(np.floor(x)), int(np.floor(y))
+        right, below = min(column + 1, width - 1), min(row + 1, height - 1)
+        corners = np.array([[deformed_weight[r, c] for c in (column, right)] for r in (row, below)], dtype=np.float64)
+        if corners.min() > 0:
+            along, across = x - column, y - row
+            value = [1 - across, across] @ corners @ [1 - along, along]
+            out[i] = float(reference_weight[i]) * value
+    return out
+
+
+def element_vector(first, second, pixels):
+    """Sums (E, 3, 2) of two pixel fields times the shape functions."""
+    out = np.zeros((len(pixels.offsets) - 1, 3, 2))
+    for e, i in owned(pixels):
+        for a, phi in enumerate(shape_functions(pixels, e, i)):
+            out[e, a] += float(first[i]) * phi, float(second[i]) * phi
+    return out
+
+
+def interpolate_nodal(values, pixels, mesh):
+    """A nodal field (N, 2) at the owned pixels, (2, P)."""
+    return np.array([shape_functions(pixels, e, i) @ values[mesh.elements[e]] for e, i in owned(pixels)]).T

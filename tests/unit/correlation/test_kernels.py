@@ -1,0 +1,215 @@
+"""Every correlation and interpolation kernel against its naive twin, at edges, with NaN, and on one and two threads."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import naive_correlation as naive
+import numba
+import numpy as np
+import pytest
+
+from rgbmidic._kernels import correlation as kernels
+from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
+from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+
+SHAPE = (31, 38)
+MOTIONS = ("none", "inside", "over the edge", "far outside")
+
+
+def scene(seed=0, motion="inside", shape=SHAPE, outlined=False):
+    """Random images, weights and displacement on a small mesh."""
+    random = np.random.default_rng(seed)
+    region = Region.from_rectangle((3.4, 2, shape[1] - 4, shape[0] - 3.7), shape)
+    if outlined:
+        region = Region.from_polygon([(2, 3), (35, 6), (30, 28), (5, 24)], shape)
+    mesh = Tri3Mesh.from_region(region, 9)
+    pixels = PixelMap.from_mesh(mesh, region)
+    image = random.uniform(0, 200, shape).astype(np.float32)
+    coefficients = np.empty((shape[0] + 2 * PAD, shape[1] + 2 * PAD), dtype=np.float32)
+    bspline_coefficients(image, coefficients)
+    spread, shift = {"none": (0, 0), "inside": (0.9, 0.3), "over the edge": (2, -4.5), "far outside": (1, 300)}[motion]
+    count = pixels.rows.size
+    weight = random.uniform(0, 1, count).astype(np.float32)
+    weight[random.random(count) < 0.3] = 0
+    return SimpleNamespace(
+        mesh=mesh,
+        pixels=pixels,
+        image=image,
+        coefficients=coefficients,
+        displacement=shift + random.uniform(-spread, spread, mesh.nodes.shape)
+        if spread
+        else np.zeros(mesh.nodes.shape),
+        reference=random.uniform(0, 200, count).astype(np.float32),
+        gradient=random.normal(0, 20, (2, count)).astype(np.float32),
+        weight=weight,
+        on_map=(pixels.local_x, pixels.local_y, pixels.offsets),
+        random=random,
+    )
+
+
+def close(found, expected, scale=None):
+    """Equal to single precision, relative to the largest value (sums of mixed signs cancel)."""
+    scale = np.nanmax(np.abs(expected)) if scale is None else scale
+    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5 * max(scale, 1e-30))
+
+
+def moved(case):
+    """The arguments that describe pixels moved by a displacement."""
+    return (*case.on_map, case.pixels.origin, case.mesh.elements, case.pixels.barycentric, case.displacement)
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (9, 31), (64, 65), (130, 71), (3, 200)])
+def test_coefficients_equal_scipys_with_a_mirrored_border(shape):
+    image = np.random.default_rng(sum(shape)).uniform(0, 4000, shape).astype(np.float32)
+    out = np.full((shape[0] + 2 * PAD, shape[1] + 2 * PAD), np.nan, dtype=np.float32)
+    bspline_coefficients(image, out)
+    np.testing.assert_allclose(out, naive.bspline_coefficients(image), rtol=1e-5, atol=5e-3)
+
+
+def test_the_spline_passes_through_the_pixels_and_an_invalid_one_stays_invalid():
+    case = scene(1)
+    y, x = (axis.ravel().astype(np.float64) for axis in np.mgrid[: SHAPE[0], : SHAPE[1]])
+    out = np.empty((3, x.size), dtype=np.float32)
+    sample_with_gradient(case.coefficients, x, y, *out)
+    np.testing.assert_allclose(out[0], case.image.ravel(), atol=2e-3)
+    case.image[10, 12] = np.nan
+    bspline_coefficients(case.image, case.coefficients)
+    sample_with_gradient(case.coefficients, x, y, *out)
+    assert np.isnan(out[:, 10 * SHAPE[1] + 12]).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_and_gradients_equal_the_naive_twin(seed):
+    case = scene(seed)
+    x = np.concatenate([case.random.uniform(-3, SHAPE[1] + 2, 80), [0, SHAPE[1] - 1, SHAPE[1] - 1, 12]])
+    y = np.concatenate([case.random.uniform(-3, SHAPE[0] + 2, 80), [0, SHAPE[0] - 1, 3.5, SHAPE[0] - 1]])
+    out = np.empty((3, x.size), dtype=np.float32)
+    sample_with_gradient(case.coefficients, x, y, *out)
+    close(out, naive.sample_with_gradient(case.coefficients, x, y))
+
+
+@pytest.mark.parametrize("outlined", [False, True])
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_right_side_equals_the_naive_twin(motion, outlined):
+    case = scene(3, motion, outlined=outlined)
+    out, sums = np.full((len(case.mesh.elements), 3, 2), 7.0), np.full((len(case.mesh.elements), 3), 7.0)
+    kernels.element_right_side(case.coefficients, case.reference, *case.gradient, case.weight, *moved(case), out, sums)
+    expected, expected_sums = naive.element_right_side(
+        case.coefficients, case.reference, case.gradient, case.weight, case.pixels, case.mesh, case.displacement
+    )
+    close(out, expected, scale=1e5)
+    close(sums[:, :2], expected_sums[:, :2])
+    np.testing.assert_array_equal(sums[:, 2], expected_sums[:, 2])
+    assert (sums[:, 2].sum() > 0) == (motion in MOTIONS[2:])
+
+
+def test_an_invalid_coefficient_reaches_the_right_side_of_its_element_only():
+    case = scene(4, "none")
+    clean, dirty = (np.empty((len(case.mesh.elements), 3, 2)) for _ in range(2))
+    sums = np.empty((len(case.mesh.elements), 3))
+    common = (case.reference, *case.gradient, np.ones_like(case.weight), *moved(case))
+    kernels.element_right_side(case.coefficients, *common, clean, sums)
+    case.coefficients[15 + PAD, 18 + PAD] = np.nan
+    kernels.element_right_side(case.coefficients, *common, dirty, sums)
+    touched = naive.element_right_side(
+        case.coefficients, case.reference, case.gradient, np.ones_like(case.weight), case.pixels, case.mesh,
+        case.displacement,
+    )[0]  # fmt: skip
+    np.testing.assert_array_equal(np.isnan(dirty), np.isnan(touched))
+    assert np.isnan(dirty).any()
+    np.testing.assert_array_equal(dirty[~np.isnan(dirty)], clean[~np.isnan(dirty)])
+
+
+@pytest.mark.parametrize("outlined", [False, True])
+def test_hessian_equals_the_naive_twin(outlined):
+    case = scene(5, outlined=outlined)
+    out = np.full((len(case.mesh.elements), 3, 3, 3), 7.0)
+    kernels.element_hessian(*case.gradient, case.weight, *case.on_map, case.pixels.barycentric, out)
+    close(out, naive.element_hessian(case.gradient, case.weight, case.pixels))
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_warp_equals_the_naive_twin(motion):
+    case = scene(6, motion)
+    case.coefficients[9 + PAD, 20 + PAD] = np.nan
+    out = np.full(case.pixels.rows.size, 7, dtype=np.float32)
+    kernels.warp(case.coefficients, *moved(case), out)
+    expected = naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement)
+    np.testing.assert_allclose(out, expected, atol=0.02)
+    assert np.isnan(out).all() == (motion == "far outside")
+
+
+def test_warp_without_motion_gives_the_image_up_to_its_last_row_and_column():
+    region = Region.from_rectangle((0, 0, SHAPE[1] - 1, SHAPE[0] - 1), SHAPE)
+    mesh = Tri3Mesh.from_region(region, 9)
+    pixels = PixelMap.from_mesh(mesh, region)
+    case = scene(7)
+    case.pixels, case.mesh = pixels, mesh
+    case.on_map, case.displacement = (pixels.local_x, pixels.local_y, pixels.offsets), np.zeros(mesh.nodes.shape)
+    out = np.empty(pixels.rows.size, dtype=np.float32)
+    kernels.warp(case.coefficients, *moved(case), out)
+    np.testing.assert_allclose(out, pixels.gather(case.image), atol=2e-3)
+
+
+def test_moments_equal_the_naive_twin_and_leave_out_what_is_unknown():
+    case = scene(8)
+    warped = case.random.uniform(0, 200, case.reference.size).astype(np.float32)
+    warped[case.random.random(warped.size) < 0.1] = np.nan
+    out = np.full((len(case.mesh.elements), 6), 7.0)
+    kernels.element_moments(case.reference, warped, case.weight, case.pixels.offsets, out)
+    expected = naive.element_moments(case.reference, warped, case.weight, case.pixels)
+    np.testing.assert_allclose(out, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_pulled_back_weights_equal_the_naive_twin(motion):
+    case = scene(9, motion)
+    weight = case.random.uniform(0.2, 1, SHAPE).astype(np.float32)
+    weight[case.random.random(SHAPE) < 0.1] = 0
+    out = np.full(case.weight.size, 7, dtype=np.float32)
+    kernels.pull_back(weight, case.weight, *moved(case), out)
+    expected = naive.pull_back(weight, case.weight, case.pixels, case.mesh, case.displacement)
+    np.testing.assert_allclose(out, expected, atol=1e-4)
+    assert (out == 0).all() == (motion == "far outside")
+
+
+def test_projection_and_interpolation_of_pixel_fields_equal_their_naive_twins():
+    case = scene(10, outlined=True)
+    out = np.full((len(case.mesh.elements), 3, 2), 7.0)
+    kernels.element_vector(*case.gradient, *case.on_map, case.pixels.barycentric, out)
+    close(out, naive.element_vector(*case.gradient, case.pixels), scale=1e3)
+    fields = np.full((2, case.reference.size), 7, dtype=np.float32)
+    kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
+    np.testing.assert_allclose(fields, naive.interpolate_nodal(case.displacement, case.pixels, case.mesh), atol=1e-5)
+
+
+def all_outputs(threads):
+    """What every parallel kernel writes, computed on a number of threads."""
+    numba.set_num_threads(threads)
+    case = scene(11, "over the edge", shape=(151, 173))
+    elements, count = len(case.mesh.elements), case.reference.size
+    right, sums, hessian = np.empty((elements, 3, 2)), np.empty((elements, 3)), np.empty((elements, 3, 3, 3))
+    moments, vector = np.empty((elements, 6)), np.empty((elements, 3, 2))
+    warped, weights, fields = np.empty(count, np.float32), np.empty(count, np.float32), np.empty((2, count), np.float32)
+    kernels.element_right_side(
+        case.coefficients, case.reference, *case.gradient, case.weight, *moved(case), right, sums
+    )
+    kernels.element_hessian(*case.gradient, case.weight, *case.on_map, case.pixels.barycentric, hessian)
+    kernels.warp(case.coefficients, *moved(case), warped)
+    kernels.element_moments(case.reference, warped, case.weight, case.pixels.offsets, moments)
+    kernels.pull_back(case.image, case.weight, *moved(case), weights)
+    kernels.element_vector(*case.gradient, *case.on_map, case.pixels.barycentric, vector)
+    kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
+    return [case.coefficients, right, sums, hessian, warped, moments, weights, vector, fields]
+
+
+def test_the_same_bits_on_one_and_two_threads():
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("numba has one thread only")
+    before = numba.get_num_threads()
+    try:
+        for one, two in zip(all_outputs(1), all_outputs(2), strict=True):
+            np.testing.assert_array_equal(one, two)
+    finally:
+        numba.set_num_threads(before)
