@@ -76,6 +76,8 @@ def _open(path: Path) -> Iterator[rawpy.RawPy]:
             yield raw
     except rawpy.LibRawFileUnsupportedError:
         raise _unsupported(path) from None
+    except NotImplementedError:  # rawpy's answer to filters that repeat neither after 2x2 nor after 6x6 pixels
+        raise _not_bayer(path, "that is no mosaic of 2x2 pixels") from None
     except rawpy.LibRawError as error:
         raise _undecodable(path, error) from None
 
@@ -97,6 +99,11 @@ def _unsupported(path: Path) -> FrameError:
     )
 
 
+def _not_bayer(path: Path, what: str) -> FrameError:
+    allowed = ", ".join(BAYER_PATTERNS)
+    return FrameError(f"{path} has a colour filter array {what}; allowed are the Bayer patterns {allowed}")
+
+
 def _undecodable(path: Path, error: Exception) -> FrameError:
     text = error.args[0] if error.args else type(error).__name__
     return damaged(path, f"LibRaw says: {text.decode(errors='replace') if isinstance(text, bytes) else text}")
@@ -104,20 +111,18 @@ def _undecodable(path: Path, error: Exception) -> FrameError:
 
 def _colour_cell(raw: rawpy.RawPy, path: Path) -> npt.NDArray[Any]:
     """Colour numbers of the first visible 2x2 cell; only single-plane sensors, Bayer or without filters, have one."""
-    if raw.raw_type.name != "Flat" or raw.raw_pattern is None:
+    pattern = raw.raw_pattern
+    if raw.raw_type.name != "Flat" or pattern is None:
         raise FrameError(
             f"{path} holds an image that is already demosaiced (linear raw); needed is the mosaic as the sensor "
             "recorded it"
         )
     if raw.num_colors == 1:
         return np.zeros((2, 2), dtype=np.intp)
-    pattern = raw.raw_pattern
     cell = raw.raw_colors_visible[:2, :2].copy()
     if pattern.shape != (2, 2) or _names(raw, cell) not in BAYER_PATTERNS:
-        raise FrameError(
-            f"{path} has a colour filter array of {pattern.shape[0]}x{pattern.shape[1]} pixels with the colours "
-            f"{_names(raw, pattern)}; allowed are the Bayer patterns {', '.join(BAYER_PATTERNS)}"
-        )
+        rows, columns = pattern.shape
+        raise _not_bayer(path, f"of {rows}x{columns} pixels with the colours {_names(raw, pattern)}")
     return cell
 
 

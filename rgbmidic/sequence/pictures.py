@@ -7,14 +7,17 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
 from rgbmidic.sequence.contents import FileContents, damaged
-from rgbmidic.sequence.tiff_structure import cfa_pattern, full_pages, is_stored_as_is, open_tiff, tag
+from rgbmidic.sequence.tiff_structure import cfa_pattern, is_stored_as_is, tag, tiff_pages
+
+if TYPE_CHECKING:
+    from tifffile import TiffPage
 
 __all__ = ["png_shape", "read_headerless", "read_png", "read_tiff", "tiff_shape"]
 
@@ -32,11 +35,8 @@ def read_tiff(path: Path) -> FileContents:
     FrameError
         The file is damaged, has several frames, another sample type or number of channels, or colours in a table.
     """
-    tiff = open_tiff(path)
-    if tiff is None:
-        raise damaged(path, "it is not a TIFF file")
-    with tiff:
-        page = _single_page(tiff, path)
+    with tiff_pages(path) as pages:
+        page = _single_page(pages, path)
         values = _decode_page(page, path)
         if page.photometric == _PALETTE:
             _check_grey_table(page, values.dtype, path)
@@ -48,17 +48,17 @@ def read_tiff(path: Path) -> FileContents:
 
 def tiff_shape(path: Path) -> tuple[int, int]:
     """Rows and columns, from the header alone."""
-    tiff = open_tiff(path)
-    if tiff is None:
-        raise damaged(path, "it is not a TIFF file")
-    with tiff:
-        page = _single_page(tiff, path)
+    with tiff_pages(path) as pages:
+        page = _single_page(pages, path)
         return int(page.imagelength), int(page.imagewidth)
 
 
-def _single_page(tiff: Any, path: Path) -> Any:
-    pages = full_pages(tiff, path)
-    if len(pages) != 1:
+def _single_page(pages: list[TiffPage] | None, path: Path) -> TiffPage:
+    if pages is None:
+        raise damaged(path, "it is not a TIFF file")
+    if not pages:
+        raise damaged(path, "its header leads to no image")
+    if len(pages) > 1:
         raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
     page = pages[0]
     if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
@@ -71,7 +71,7 @@ def _single_page(tiff: Any, path: Path) -> Any:
     return page
 
 
-def _decode_page(page: Any, path: Path) -> npt.NDArray[Any]:
+def _decode_page(page: TiffPage, path: Path) -> npt.NDArray[Any]:
     """Samples of a page, (H, W) or (H, W, C); by OpenCV where tifffile lacks the decompressor (LZW, JPEG)."""
     try:
         values = np.asarray(page.asarray())
@@ -85,7 +85,7 @@ def _decode_page(page: Any, path: Path) -> npt.NDArray[Any]:
     return values
 
 
-def _check_grey_table(page: Any, dtype: np.dtype[Any], path: Path) -> None:
+def _check_grey_table(page: TiffPage, dtype: np.dtype[Any], path: Path) -> None:
     """Some cameras' software writes grey images with a colour table that changes nothing; others are refused."""
     table = np.asarray(page.tags[_COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
     ramp = np.arange(table.shape[1])
@@ -142,11 +142,14 @@ def _opencv(path: Path) -> npt.NDArray[Any] | None:
     """Samples as stored, (H, W) or (H, W, 3) in the order R, G, B; None where OpenCV cannot decode them."""
     import cv2
 
+    previous = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # faults come back as one FrameError
     try:
         # OpenCV opens no non-ASCII names on Windows, hence decoding from memory
         image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
+    finally:
+        cv2.utils.logging.setLogLevel(previous)
     if image is None or image.ndim == 2:
         return image
     return image[..., ::-1] if image.shape[2] == 3 else image

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.errors import RgbmidicError
 from rgbmidic.sequence.contents import damaged
 
 if TYPE_CHECKING:
@@ -24,12 +26,10 @@ if TYPE_CHECKING:
 __all__ = [
     "RawStructure",
     "cfa_pattern",
-    "check_complete",
-    "full_pages",
     "is_dng",
     "is_stored_as_is",
-    "open_tiff",
     "tag",
+    "tiff_pages",
 ]
 
 # A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
@@ -43,46 +43,58 @@ _CFA_REPEAT, _CFA_PATTERN = 33421, 33422
 _ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715, 50716)
 
 
-def open_tiff(path: Path) -> TiffFile | None:
-    """Open a TIFF file, or None where the file has another structure."""
+@contextmanager
+def tiff_pages(path: Path) -> Iterator[list[TiffPage] | None]:
+    """The images of a TIFF file in full resolution, neither thumbnails nor previews; None for other files.
+
+    Raises
+    ------
+    FrameError
+        Image data that the header announces is not in the file, or what is done inside fails over a damaged header.
+    """
     import tifffile
 
     try:
-        return tifffile.TiffFile(path)
-    except OSError:
+        with tifffile.TiffFile(path) as tiff:
+            pages = [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
+            for page in pages:
+                _check_complete(page, path)
+            yield pages
+    except tifffile.TiffFileError as error:
+        if "not a TIFF file" not in str(error):
+            raise damaged(path, error) from None
+        yield None
+    except (RgbmidicError, OSError):
         raise
-    except Exception:  # tifffile meets damaged headers with many kinds of error
-        return None
+    except Exception as error:  # tifffile meets damaged headers with many kinds of error
+        raise damaged(path, error) from None
 
 
 def is_dng(path: Path) -> bool:
-    """Whether the file is a DNG, whatever its name says."""
-    tiff = open_tiff(path)
-    if tiff is None:
-        return False
-    with tiff:
-        return _DNG_VERSION in tiff.pages.first.tags
+    """Whether the file is a DNG, whatever its name says; False where it has no readable first image."""
+    import tifffile
 
-
-def full_pages(tiff: TiffFile, path: Path) -> list[TiffPage]:
-    """The images of the file in full resolution, neither thumbnails nor previews, checked by `check_complete`."""
     try:
-        pages = [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
-    except Exception as error:  # see open_tiff
-        raise damaged(path, error) from None
-    for page in pages:
-        check_complete(page, path)
-    return pages
+        with tifffile.TiffFile(path) as tiff:
+            return _DNG_VERSION in tiff.pages.first.tags
+    except OSError:
+        raise
+    except Exception:  # see tiff_pages; whoever reads the image tells what is wrong
+        return False
 
 
 def _pages(tiff: TiffFile) -> Iterator[TiffPage]:
+    seen: set[int] = set()
     for frame in tiff.pages:
         page = frame.aspage()
+        if page.offset in seen:  # tifffile would go round for ever
+            raise ValueError("its list of images leads back to itself")
+        seen.add(page.offset)
         yield page
         yield from (child.aspage() for child in page.pages or ())
 
 
-def check_complete(page: TiffPage, path: Path) -> None:
+def _check_complete(page: TiffPage, path: Path) -> None:
     """Raise where image data that the page announces lies outside the file or is empty."""
     size = path.stat().st_size
     parts = list(zip(page.dataoffsets, page.databytecounts, strict=False))
@@ -143,14 +155,10 @@ class RawStructure:
         FrameError
             Image data that the header announces is not in the file.
         """
-        tiff = open_tiff(path)
-        if tiff is None:
-            return None
-        with tiff:
-            pages = full_pages(tiff, path)
-            raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
-            if not raw:
+        with tiff_pages(path) as pages:
+            if not pages:
                 return None
+            raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
             page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
             area = tag(page, _ACTIVE_AREA) or (0, 0)
             return cls(stored_as_is=is_stored_as_is(page), black_cell=_black_cell(page), origin=(area[0], area[1]))

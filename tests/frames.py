@@ -1,0 +1,82 @@
+"""Small raw frames for tests of reading and writing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import tifffile
+from hypothesis import strategies as st
+
+from rgbmidic.illumination.mosaic import BAYER_PATTERNS, ChannelFrame, Mosaic
+from rgbmidic.sequence.writers import _cfa_tags, _colour_tags
+
+__all__ = ["channel_frames", "colour_mosaic", "mosaics", "noisy_mosaic", "write_cropped_dng", "write_monochrome_dng"]
+
+_ACTIVE_AREA = 50829
+
+
+def noisy_mosaic(shape: tuple[int, int] = (40, 50), *, seed: int = 0, cfa: str = "RGGB", black: Any = 64) -> Mosaic:
+    """A 12-bit mosaic of random grey levels."""
+    values = np.random.default_rng(seed).integers(70, 4000, shape).astype(np.uint16)
+    return Mosaic(values=values, cfa=cfa, black_level=black, white_level=4095)
+
+
+@st.composite
+def mosaics(draw: st.DrawFn) -> Mosaic:
+    """Mosaics of any phase, odd and even sizes, any whole-numbered levels."""
+    shape = draw(st.tuples(st.integers(22, 60), st.integers(22, 60)))
+    black = draw(st.lists(st.integers(0, 4000), min_size=4, max_size=4))
+    white = draw(st.integers(max(black) + 1, 65535))
+    values = np.random.default_rng(draw(st.integers(0, 2**32 - 1))).integers(1, 65536, shape)
+    return Mosaic(
+        values=values.astype(np.uint16),
+        cfa=draw(st.sampled_from(BAYER_PATTERNS)),
+        black_level=np.reshape(black, (2, 2)).astype(np.float64),
+        white_level=white,
+    )
+
+
+@st.composite
+def channel_frames(draw: st.DrawFn) -> ChannelFrame:
+    """Monochrome and three-channel frames of any size."""
+    shape = (draw(st.sampled_from([1, 3])), draw(st.integers(1, 40)), draw(st.integers(1, 40)))
+    values = np.random.default_rng(draw(st.integers(0, 2**32 - 1))).integers(0, 65536, shape)
+    return ChannelFrame(values=values.astype(np.uint16), black_level=np.zeros(shape[0]), white_level=65535)
+
+
+def colour_mosaic(shape: tuple[int, int], cfa: str) -> npt.NDArray[np.uint16]:
+    """Grey levels that say the colour and the position in the cell: 1000 (channel + 1) + 2 (row % 2) + column % 2."""
+    rows, columns = np.indices(shape) % 2
+    channels = np.array(["RGB".index(letter) for letter in cfa]).reshape(2, 2)[rows, columns]
+    return (1000 * (channels + 1) + 2 * rows + columns).astype(np.uint16)
+
+
+def write_cropped_dng(path: Path, active: npt.NDArray[np.uint16], *, top: int, left: int, cfa: str, black: Any) -> None:
+    """A DNG whose `active` area, with the pattern `cfa`, lies inside masked margins."""
+    rows, columns = active.shape
+    full = np.full((rows + top + 2, columns + left + 3), 50, dtype=np.uint16)
+    full[top : top + rows, left : left + columns] = active
+    mosaic = Mosaic(values=full, cfa=cfa, black_level=black, white_level=4095)
+    area = (_ACTIVE_AREA, "I", 4, (top, left, top + rows, left + columns), True)
+    tags = [*_cfa_tags(mosaic, path), *_colour_tags((1, 1, 1)), area]
+    tifffile.imwrite(path, full, photometric=32803, extratags=tags, metadata=None, rowsperstrip=len(full))
+
+
+def write_monochrome_dng(path: Path, values: npt.NDArray[np.uint16], *, linear_rgb: bool = False) -> None:
+    """A linear raw DNG: one channel as monochrome cameras give, or three as a demosaiced picture."""
+    tags = [
+        (50706, "B", 4, b"\x01\x04\x00\x00", True),
+        (50708, "s", 0, "test", True),
+        (50714, "I", 3 if linear_rgb else 1, (64,) * 3 if linear_rgb else 64, True),
+        (50717, "I", 3 if linear_rgb else 1, (4095,) * 3 if linear_rgb else 4095, True),
+    ]
+    if linear_rgb:
+        values = np.repeat(values[..., None], 3, axis=2)
+        tifffile.imwrite(path, values, photometric=34892, extratags=tags, metadata=None)
+        return
+    tifffile.imwrite(path, values, photometric="minisblack", extratags=tags, metadata=None)
+    with tifffile.TiffFile(path, mode="r+") as tiff:  # tifffile writes a linear raw of one channel only in this way
+        tiff.pages.first.tags[262].overwrite(34892)
