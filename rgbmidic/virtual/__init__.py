@@ -5,7 +5,7 @@ from rgbmidic.virtual.fields import AffineField, MeshField
 from rgbmidic.virtual.light import Light
 from rgbmidic.virtual.rendering import material_points, render, truth
 from rgbmidic.virtual.scene import Cylinder, Plate, Scene, Sphere, State
-from rgbmidic.virtual.scenes import plate_scene, sphere_scene, strained_plate, turned
+from rgbmidic.virtual.scenes import expose, paper_scene, plate_scene, sphere_scene, strained_plate, turned
 from rgbmidic.virtual.spectra import Led, Sensitivities
 from rgbmidic.virtual.surface import Finish, Surface, height_map
 
@@ -23,8 +23,10 @@ __all__ = [
     "Sphere",
     "State",
     "Surface",
+    "expose",
     "height_map",
     "material_points",
+    "paper_scene",
     "plate_scene",
     "record",
     "render",

@@ -80,7 +80,7 @@ class Camera:
         cfa_channels(self.cfa)
         if not (8 <= self.bits <= 16 and 0 <= self.black_level < 2**self.bits - 1):
             raise InputError(f"bits lie in 8 to 16 and black_level below saturation: {self.bits}, {self.black_level}")
-        if not (self.focal_px > 0 and 0 <= self.lens_blur <= 20 and 1 <= (self.samples or 1) <= 64):
+        if not (self.focal_px > 0 and 0 <= self.lens_blur <= 20 and (self.samples is None or 1 <= self.samples <= 64)):
             raise InputError(
                 f"focal_px is positive, lens_blur 0 to 20 px, samples 1 to 64; given are {self.focal_px}, "
                 f"{self.lens_blur}, {self.samples}"
