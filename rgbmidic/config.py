@@ -142,19 +142,20 @@ class RegionSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeightSettings:
-    """How each light is weighted (``[weights]``), the paper's second method by default.
+    """How each light is weighted (``[weights]``).
 
     Attributes
     ----------
     method
-        ``"threshold"``: 0 where the blurred image exceeds `threshold`, 1 elsewhere; ``"none"``: 1 everywhere.
+        ``"statistics"``: inverse variance of each light's own residual around each pixel, robust; ``"threshold"``: the
+        paper's second method, 0 where the blurred image exceeds `threshold`, 1 elsewhere; ``"none"``: 1 everywhere.
     threshold
         Fraction of the camera's dynamic range (the paper: 2/3).
     blur
         Standard deviation of the Gaussian blur in px; several speckles wide.
     """
 
-    method: Literal["threshold", "none"] = "threshold"
+    method: Literal["statistics", "threshold", "none"] = "statistics"
     threshold: float = _bounded(2 / 3, above=0, at_most=1)
     blur: float = _bounded(10.0, above=0)
 
@@ -173,6 +174,11 @@ class SolverSettings:
         carriers) or ``"gaussian"`` (standard deviation 1 px).
     rigid
         Rigid functions per light after the first: ``"none"``, ``"translation"`` or ``"translation+rotation"``.
+    brightness
+        Grey-level correction: ``"global"``, a gain and offset per light; ``"local"``, both as linear shape functions on
+        the mesh.
+    curvature
+        Correct the nodal values for the curvature that linear elements cannot follow.
     search_radius
         Largest motion in px that the coarse start looks for.
     tolerance
@@ -183,6 +189,8 @@ class SolverSettings:
 
     prefilter: Literal["none", "binomial", "gaussian"] | None = None
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
+    brightness: Literal["none", "global", "local"] = "none"
+    curvature: bool = False
     search_radius: float = _bounded(64.0, at_least=0)
     tolerance: float = _bounded(1e-3, above=0)
     max_iterations: int = _bounded(50, at_least=1)

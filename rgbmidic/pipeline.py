@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.config import FrameSettings, RegionSettings, SolverSettings, TestSettings
-from rgbmidic.correlation import Deformed, Reference, Solution, Status, solve
+from rgbmidic.config import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.correlation import Deformed, Reference, Solution, SolveOptions, Status, solve
 from rgbmidic.correlation.start import coarse_start, refine_start
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError, RgbmidicError
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
@@ -133,7 +133,9 @@ def _measure_frame(
         deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
         alone = settings.frames.reference == (index,)
         start = np.zeros((nodes, 2)) if alone else last
-        solution = track(reference, deformed, start, settings.solver)
+        solution = track(
+            reference, deformed, start, _options(settings), search_radius=settings.solver.search_radius
+        )
         inputs = frames.hashes(index)
     except RgbmidicError as error:
         logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)
@@ -142,7 +144,14 @@ def _measure_frame(
     return record, _next_start(reference, solution, last)
 
 
-def track(reference: Reference, deformed: Deformed, start: FloatArray | None, settings: SolverSettings) -> Solution:
+def track(
+    reference: Reference,
+    deformed: Deformed,
+    start: FloatArray | None,
+    options: SolveOptions,
+    *,
+    search_radius: float,
+) -> Solution:
     """Solve one frame from the last frame's displacement, and anew from a search where that does not converge.
 
     Parameters
@@ -151,30 +160,36 @@ def track(reference: Reference, deformed: Deformed, start: FloatArray | None, se
         The two states.
     start : ndarray, shape (N, 2), or None
         Displacement to start from in px; None searches.
-    settings
-        Solver settings.
+    options
+        How to solve.
+    search_radius
+        Largest motion in px that a search looks for.
     """
     solution: Solution | None = None
     attempts = ("last", "refined", "search") if start is not None else ("search",)
     for attempt in attempts:
         if attempt == "search":
-            initial = coarse_start(reference, deformed, settings.search_radius)
+            initial = coarse_start(reference, deformed, search_radius)
         else:
             assert start is not None
             initial = start if attempt == "last" else refine_start(reference, deformed, start)
-        trial = solve(
-            reference,
-            deformed,
-            initial,
-            rigid=settings.rigid,
-            tolerance=settings.tolerance,
-            max_iterations=settings.max_iterations,
-        )
+        trial = solve(reference, deformed, initial, options)
         solution = trial if solution is None or _better(trial, solution) else solution
         if solution.status is Status.CONVERGED and not solution.mismatched_share > _MISMATCH:
             break
     assert solution is not None
     return solution
+
+
+def _options(settings: TestSettings) -> SolveOptions:
+    return SolveOptions(
+        rigid=settings.solver.rigid,
+        brightness=settings.solver.brightness,
+        statistics=settings.weights.method == "statistics",
+        curvature=settings.solver.curvature,
+        tolerance=settings.solver.tolerance,
+        max_iterations=settings.solver.max_iterations,
+    )
 
 
 _MISMATCH = 0.02

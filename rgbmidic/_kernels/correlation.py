@@ -12,7 +12,16 @@ from numba import njit, prange
 
 from rgbmidic._kernels.interpolation import _FAST, PAD
 
-__all__ = ["element_hessian", "element_moments", "element_right_side", "pull_back", "warp"]
+__all__ = [
+    "curvature_deviation",
+    "element_hessian",
+    "element_moments",
+    "element_right_side",
+    "element_vector",
+    "interpolate_nodal",
+    "pull_back",
+    "warp",
+]
 
 _SIXTH = np.float32(1.0 / 6.0)
 _ONE = np.float32(1.0)
@@ -304,3 +313,67 @@ def pull_back(deformed_weight, reference_weight, local_x, local_y, offsets, orig
             value = (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
             # a pixel next to an excluded one would borrow from it through the interpolation
             out[i] = reference_weight[i] * value if min(a, b, c, d) > _ZERO else _ZERO
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
+def element_vector(first, second, local_x, local_y, offsets, barycentric, out):
+    """Projection of two pixel fields on the shape functions: ``out`` (E, 3, 2) receives their sums times phi."""
+    for e in prange(offsets.size - 1):
+        b00 = np.float32(barycentric[e, 0, 0])
+        b01 = np.float32(barycentric[e, 0, 1])
+        b02 = np.float32(barycentric[e, 0, 2])
+        b10 = np.float32(barycentric[e, 1, 0])
+        b11 = np.float32(barycentric[e, 1, 1])
+        b12 = np.float32(barycentric[e, 1, 2])
+        p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
+        for i in range(offsets[e], offsets[e + 1]):
+            l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
+            l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
+            p0 += first[i] * l0
+            p1 += first[i] * l1
+            p2 += first[i]
+            q0 += second[i] * l0
+            q1 += second[i] * l1
+            q2 += second[i]
+        out[e, 0, 0], out[e, 0, 1] = p0, q0
+        out[e, 1, 0], out[e, 1, 1] = p1, q1
+        out[e, 2, 0], out[e, 2, 1] = p2 - p0 - p1, q2 - q0 - q1
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def interpolate_nodal(values, elements, local_x, local_y, offsets, barycentric, out):
+    """Nodal field (N, 2) at the owned pixels: ``out`` (2, P) float32."""
+    for e in prange(elements.shape[0]):
+        for c in range(2):
+            constant = slope_x = slope_y = 0.0
+            for a in range(3):
+                value = values[elements[e, a], c]
+                constant += barycentric[e, a, 0] * value
+                slope_x += barycentric[e, a, 1] * value
+                slope_y += barycentric[e, a, 2] * value
+            for i in range(offsets[e], offsets[e + 1]):
+                out[c, i] = constant + slope_x * local_x[i] + slope_y * local_y[i]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def curvature_deviation(nodes, elements, curvature, local_x, local_y, offsets, barycentric, out):
+    """Deviation of a curved field from its linear interpolant, ``out`` (2, P) float32.
+
+    `curvature` (E, 2, 3) float64 holds the second derivatives (xx, xy, yy) of both components, constant per element:
+    ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H (x_a - x_b)``.
+    """
+    for e in prange(elements.shape[0]):
+        for c in range(2):
+            half = np.zeros(3)
+            for edge in range(3):
+                a = elements[e, edge]
+                b = elements[e, (edge + 1) % 3]
+                dx = nodes[a, 0] - nodes[b, 0]
+                dy = nodes[a, 1] - nodes[b, 1]
+                h = curvature[e, c]
+                half[edge] = -0.5 * (h[0] * dx * dx + 2.0 * h[1] * dx * dy + h[2] * dy * dy)
+            for i in range(offsets[e], offsets[e + 1]):
+                l0 = barycentric[e, 0, 0] + barycentric[e, 0, 1] * local_x[i] + barycentric[e, 0, 2] * local_y[i]
+                l1 = barycentric[e, 1, 0] + barycentric[e, 1, 1] * local_x[i] + barycentric[e, 1, 2] * local_y[i]
+                l2 = 1.0 - l0 - l1
+                out[c, i] = half[0] * l0 * l1 + half[1] * l1 * l2 + half[2] * l2 * l0

@@ -10,9 +10,10 @@ import numpy.typing as npt
 from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.problem import Deformed, Reference
 from rgbmidic.correlation.solution import Solution
-from rgbmidic.correlation.solve import solve
+from rgbmidic.correlation.solve import SolveOptions, solve
 from rgbmidic.correlation.start import coarse_start
 from rgbmidic.errors import InputError
+from rgbmidic.illumination.normalise import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
 
 __all__ = ["as_weights", "correlate", "initial_displacement"]
@@ -30,6 +31,10 @@ def correlate(
     initial: npt.ArrayLike | None = None,
     deformed_weights: npt.ArrayLike | None = None,
     prefilter: str = "binomial",
+    normalise: float | None = None,
+    brightness: str = "none",
+    statistics: bool = False,
+    curvature: bool = False,
     rigid: str = "none",
     search_radius: float = 64.0,
     tolerance: float = 1e-3,
@@ -51,8 +56,14 @@ def correlate(
         Displacement (u, v) in px to start from; None looks for it within `search_radius`.
     deformed_weights
         Like `weights`, on the deformed images.
-    prefilter, rigid, tolerance, max_iterations, search_radius
-        See `rgbmidic.config.SolverSettings`.
+    prefilter
+        Filter on both images: ``"none"``, ``"binomial"`` or ``"gaussian"`` (`rgbmidic.correlation.images.PREFILTERS`).
+    normalise
+        Standard deviation in px of the local mean by which every image is divided first; None leaves grey levels.
+    search_radius
+        Largest motion in px that is looked for where no start is given.
+    brightness, statistics, curvature, rigid, tolerance, max_iterations
+        See `SolveOptions`.
 
     Returns
     -------
@@ -74,12 +85,22 @@ def correlate(
     if not isinstance(region, Region):
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size)
+    options = SolveOptions(
+        rigid=rigid,
+        brightness=brightness,
+        statistics=statistics,
+        curvature=curvature,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+    )
+    if normalise is not None:
+        f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
     first = Reference.prepare(f, region, as_weights(weights, f.shape, "weights"), mesh=mesh, prefilter=prefilter)
     second = Deformed.prepare(g, as_weights(deformed_weights, f.shape, "deformed_weights"), prefilter=prefilter)
     start = initial_displacement(initial, len(mesh.nodes))
     if start is None:
         start = coarse_start(first, second, search_radius)
-    return solve(first, second, start, rigid=rigid, tolerance=tolerance, max_iterations=max_iterations)
+    return solve(first, second, start, options)
 
 
 def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str) -> npt.NDArray[np.float32] | None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
 from rgbmidic._kernels.interpolation import sample_with_gradient
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
 from rgbmidic.correlation.system import NormalEquations
@@ -16,6 +18,7 @@ from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 __all__ = ["Deformed", "Reference"]
 
+FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 
 
@@ -105,6 +108,62 @@ class Reference:
             gradient_y=samples[2],
             pixel_weights=pixels.gather(usable),
             prefilter=prefilter,
+        )
+
+    def blocks(self, weight: FloatImage, gradient_x: FloatImage, gradient_y: FloatImage) -> FloatArray:
+        """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""
+        pixels = self.pixels
+        out = np.zeros((len(self.mesh.elements), 3, 3, 3))
+        element_hessian(
+            gradient_x, gradient_y, weight, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, out
+        )
+        return out
+
+    def hessian_blocks(self, light: int, weight: FloatImage) -> FloatArray:
+        """Element blocks of a light's Hessian with the pixel weights (P,)."""
+        return self.blocks(weight, self.gradient_x[light], self.gradient_y[light])
+
+    def warp(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatImage:
+        """A light's deformed image brought back by a nodal displacement (N, 2): g(x + u) at the owned pixels (P,)."""
+        out = np.empty(self.pixels.rows.size, dtype=np.float32)
+        warp(deformed.coefficients[light], *self._geometry(), displacement, out)
+        return out
+
+    def pull_back(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatImage:
+        """A light's weight (P,): the reference's times the deformed image's at the displaced pixels."""
+        out = np.empty(self.pixels.rows.size, dtype=np.float32)
+        pull_back(deformed.weights[light], self.pixel_weights[light], *self._geometry(), displacement, out)
+        return out
+
+    def right_side(
+        self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """A light's right-hand side (2 N,) for reference grey levels `values` (P,), and its sums
+        (w r^2, w, lost pixels)."""
+        parts = np.zeros((len(self.mesh.elements), 3, 2))
+        sums = np.zeros((len(self.mesh.elements), 3))
+        element_right_side(
+            deformed.coefficients[light],
+            values,
+            self.gradient_x[light],
+            self.gradient_y[light],
+            weight,
+            *self._geometry(),
+            displacement,
+            parts,
+            sums,
+        )
+        return self.equations.vector(parts), np.asarray(sums.sum(axis=0))
+
+    def _geometry(self) -> tuple[npt.NDArray[Any], ...]:
+        pixels = self.pixels
+        return (
+            pixels.local_x,
+            pixels.local_y,
+            pixels.offsets,
+            pixels.origin,
+            self.mesh.elements,
+            pixels.barycentric,
         )
 
 

@@ -43,7 +43,8 @@ class Solution:
     displacement : ndarray, shape (N, 2), float64
         (u, v) in px; NaN where not measured.
     displacement_std : ndarray, shape (N, 2), float64
-        Standard uncertainty in px; NaN where not measured.
+        Standard uncertainty of the nodal values in px, from the residual (noise, demosaicing, erratic reflections) and
+        from the curvature that linear elements cannot follow; NaN where not measured.
     node_status : ndarray, shape (N,), uint8
         See `NodeStatus`.
     status : Status

@@ -21,7 +21,7 @@ FloatImage = npt.NDArray[np.float32]
 
 def light_weights(images: IlluminationImages, settings: WeightSettings) -> FloatImage:
     """Weights (k, H, W) in [0, 1] of one state by the method of `settings`; 0 where an image is not valid."""
-    if settings.method == "none":
+    if settings.method != "threshold":  # the statistics come from the residual, in the solve
         return images.valid.astype(np.float32)
     return threshold_weights(images, threshold=settings.threshold, blur=settings.blur)
 

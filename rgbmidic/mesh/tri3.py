@@ -77,6 +77,31 @@ class Tri3Mesh:
         sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
         return np.asarray(sums, dtype=np.float64)
 
+    def element_gradient(self, values: FloatArray) -> FloatArray:
+        """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2)."""
+        p = self.nodes[self.elements]
+        x, y = p[..., 0], p[..., 1]
+        slopes_x = np.stack([y[:, 1] - y[:, 2], y[:, 2] - y[:, 0], y[:, 0] - y[:, 1]], axis=1)
+        slopes_y = np.stack([x[:, 2] - x[:, 1], x[:, 0] - x[:, 2], x[:, 1] - x[:, 0]], axis=1)
+        slopes = np.stack([slopes_x, slopes_y], axis=-1) / (2 * self.areas)[:, None, None]
+        return np.asarray(np.einsum("eac,ead->ecd", values[self.elements], slopes))
+
+    def nodal_gradient(self, values: FloatArray) -> FloatArray:
+        """Gradient of nodal values (N, C) at the nodes: the area-weighted mean of the elements around; (N, C, 2)."""
+        gradient = self.element_gradient(values) * self.areas[:, None, None]
+        flat = gradient.reshape(len(gradient), -1).T
+        sums = np.stack([self.to_nodes(np.ascontiguousarray(part)) for part in flat], axis=-1)
+        return np.asarray((sums / self.to_nodes(self.areas)[:, None]).reshape(-1, *gradient.shape[1:]))
+
+    @property
+    def on_boundary(self) -> npt.NDArray[np.bool_]:
+        """True for nodes on an edge that belongs to one element only, shape (N,)."""
+        edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
+        pairs, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+        boundary = np.zeros(len(self.nodes), dtype=bool)
+        boundary[pairs[count == 1]] = True
+        return boundary
+
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes joined by an edge, shape (M, 2), each pair once."""

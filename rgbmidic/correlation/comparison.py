@@ -1,0 +1,187 @@
+"""What the two states look like at the displacement found: do they match, how bright, how far apart, where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.correlation import element_moments, element_vector, interpolate_nodal
+from rgbmidic.correlation.problem import Reference
+from rgbmidic.correlation.system import factorise
+
+__all__ = ["Comparison"]
+
+FloatArray = npt.NDArray[np.float64]
+FloatImage = npt.NDArray[np.float32]
+
+_MATCHED = 0.4
+"""Correlation coefficient under which the images of an element do not match; the element then carries no weight
+until its neighbours have brought it to a displacement at which they do."""
+_FREEDOM = 4.0
+"""Degrees of freedom of the Student distribution taken for the residual."""
+_RANGE = 8.0
+"""Standard deviation (px) of the window in which the variance of the residual is estimated."""
+_BLOCK = 9
+"""Side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
+_SCORE_RANGE = 20.0
+"""Standard deviation (px) of the window over which block sums are averaged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """Both states at the owned pixels of the reference.
+
+    Attributes
+    ----------
+    reference
+        The reference state.
+    values : ndarray, shape (k, P), float32
+        Grey levels f of the reference, corrected for brightness.
+    warped : ndarray, shape (k, P), float32
+        Grey levels g(x + u); NaN outside the image.
+    weights : ndarray, shape (k, P), float32
+        Weights given, brought back by the displacement.
+    """
+
+    reference: Reference
+    values: FloatImage
+    warped: FloatImage
+    weights: FloatImage
+
+    @property
+    def residual(self) -> FloatImage:
+        """f - g(x + u), shape (k, P); 0 where g is not known."""
+        return np.nan_to_num(self.values - self.warped, nan=0.0)
+
+    def matched(self) -> npt.NDArray[np.bool_]:
+        """Elements (E,) whose images match: zero-mean correlation coefficient of all lights together.
+
+        Elements without weight or texture say nothing and count as matched.
+        """
+        mesh = self.reference.mesh
+        moments = np.zeros((len(mesh.elements), 6))
+        fg, ff, gg = np.zeros((3, len(mesh.elements)))
+        for value, warped, weight in zip(self.values, self.warped, self.weights, strict=True):
+            element_moments(value, warped, weight, self.reference.pixels.offsets, moments)
+            total, f, g, f2, product, g2 = moments.T
+            total = np.maximum(total, 1e-30)
+            fg += product - f * g / total
+            ff += f2 - f * f / total
+            gg += g2 - g * g / total
+        own = _correlation(fg, ff, gg)
+        # a few speckles can match by chance; those of all elements around a node hardly
+        around = _correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
+        return np.asarray(np.minimum(own, np.median(around[mesh.elements], axis=1)) >= _MATCHED)
+
+    def brightness(self, kind: str) -> FloatImage:
+        """Reference grey levels (k, P) brought to the brightness and contrast of the deformed images.
+
+        ``"global"``: one gain and offset per light. ``"local"``: gain and offset as linear shape functions on the
+        mesh (grey-level correction, paper, section 2.2). In both, f is taken as ``a g + b``; what is returned is
+        ``(f - b) / a`` of the uncorrected reference.
+        """
+        correct = {"global": self._global, "local": self._local}[kind]
+        return np.stack([correct(light) for light in range(len(self.values))])
+
+    def _global(self, light: int) -> FloatImage:
+        f, g = self.reference.values[light], self.warped[light]
+        weight = np.where(np.isfinite(g), self.weights[light], np.float32(0)).astype(np.float64)
+        total = weight.sum()
+        if not total:
+            return f
+        g = np.nan_to_num(g)
+        mean_f, mean_g = (weight * f).sum() / total, (weight * g).sum() / total
+        # both images carry the same noise: the ratio of the deviations is not attenuated by it
+        spread_f, spread_g = (float((weight * (i - m) ** 2).sum()) for i, m in ((f, mean_f), (g, mean_g)))
+        gain = np.sqrt(spread_f / spread_g) if spread_f > 0 and spread_g > 0 else 1.0
+        return np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32)
+
+    def _local(self, light: int) -> FloatImage:
+        reference, pixels = self.reference, self.reference.pixels
+        f, g = reference.values[light], np.nan_to_num(self.warped[light])
+        weight = np.where(np.isfinite(self.warped[light]), self.weights[light], np.float32(0))
+        if not weight.any():
+            return f
+        scale = float(np.sqrt((weight * g * g).sum() / weight.sum())) or 1.0
+        g = g / np.float32(scale)
+        system = reference.equations.matrix(reference.blocks(weight, g, np.ones_like(g)))
+        smooth = 1e-3 * system.diagonal().mean() * reference.equations.smoothness
+        parts = np.zeros((len(reference.mesh.elements), 3, 2))
+        wf = weight * f
+        element_vector(wf * g, wf, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, parts)
+        nodal = factorise((system + smooth).tocsc())(reference.equations.vector(parts)).reshape(-1, 2)
+        fields = np.empty((2, f.size), dtype=np.float32)
+        interpolate_nodal(
+            nodal, reference.mesh.elements, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, fields
+        )
+        gain = np.maximum(fields[0] / np.float32(scale), np.float32(0.05))
+        return np.asarray((f - fields[1]) / gain, dtype=np.float32)
+
+    def precision(self) -> tuple[FloatImage, FloatImage]:
+        """Factor (k, P) on the weights: inverse variance of the residual around each pixel, and robust at the pixel;
+        and the derivative of the robust loss over that factor (k, P), which the uncertainty needs.
+
+        The variance holds whatever spoils a light there: camera noise, demosaicing, the erratic part of a reflection.
+        Its unit is the median over all lights. The pixel's own factor is that of a Student distribution, so that
+        dust or a fragment does not spoil a node.
+        """
+        squares = self.residual**2
+        variance = np.stack([self._local_mean(*pair) for pair in zip(squares, self.weights, strict=True)])
+        seen = self.weights > 0
+        typical = float(np.median(variance[seen][:: max(1, int(seen.sum()) // 100_000)])) if seen.any() else 0.0
+        if typical <= 0:
+            return np.ones_like(self.weights), np.ones_like(self.weights)
+        variance = np.maximum(variance, 0.1 * typical)
+        ratio = squares / variance
+        robust = (_FREEDOM + 1) / (_FREEDOM + ratio)
+        bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
+        return np.asarray(typical / variance * robust, dtype=np.float32), np.asarray(bend, dtype=np.float32)
+
+    def _local_mean(self, values: FloatImage, weight: FloatImage) -> FloatImage:
+        pixels = self.reference.pixels
+        total = _blur(pixels.scatter(values * weight), _RANGE)
+        share = _blur(pixels.scatter(weight), _RANGE)
+        return pixels.gather(total / np.maximum(share, np.float32(1e-6)))
+
+    def score_covariance(self, step_weights: FloatImage, measured: int) -> FloatArray:
+        """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side, from the residual itself.
+
+        The score ``q = sum_j w_j r_j grad f_j`` of a pixel is correlated over the reach of filters, demosaicing and
+        speckle and between the lights; the variance of its sum over blocks wider than that reach holds all of it
+        (the block estimator of the long-run variance). Fitting `measured` nodes has taken their share out of it.
+        """
+        reference, pixels = self.reference, self.reference.pixels
+        score = np.zeros((2, pixels.rows.size), dtype=np.float32)
+        for light, (weight, residual) in enumerate(zip(step_weights, self.residual, strict=True)):
+            score[0] += weight * residual * reference.gradient_x[light]
+            score[1] += weight * residual * reference.gradient_y[light]
+        used = pixels.scatter(step_weights.any(axis=0).astype(np.float32))
+        area = float(_BLOCK**2)
+        sums = [area * cv2.blur(pixels.scatter(q), (_BLOCK, _BLOCK)) for q in score]
+        count = _blur(area * cv2.blur(used, (_BLOCK, _BLOCK)), _SCORE_RANGE)
+        fitted = min(area * measured / max(float(used.sum()), 1.0), 0.75)
+        floor = np.float32(1e-3 * area)
+        products = (sums[0] * sums[0], sums[0] * sums[1], sums[1] * sums[1])
+        xx, xy, yy = (
+            pixels.gather(_blur(p, _SCORE_RANGE) / np.maximum(count, floor)) / np.float32(1 - fitted) for p in products
+        )
+        # the kernel takes squares of vectors: the covariance is the sum of two
+        first = np.sqrt(np.maximum(xx, 0))
+        along = np.divide(xy, first, out=np.zeros_like(xy), where=first > 0)
+        rest = np.sqrt(np.maximum(yy - along * along, 0))
+        one = pixels.gather(used)
+        return reference.blocks(one, first, along) + reference.blocks(one, np.zeros_like(rest), rest)
+
+
+def _blur(image: FloatImage, sigma: float) -> FloatImage:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT), dtype=np.float32)
+
+
+def _correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
+    """Correlation coefficient from centred products; 1 where there is nothing to compare."""
+    scale = np.sqrt(np.maximum(ff, 0) * np.maximum(gg, 0))
+    empty = scale <= 1e-9 * scale.max(initial=0.0)
+    return np.where(empty, 1.0, fg / np.where(empty, 1.0, scale))

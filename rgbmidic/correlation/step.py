@@ -1,0 +1,131 @@
+"""The linear algebra of one pass: Hessian, smoothness for what nobody sees, rigid motions of the lights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from rgbmidic.correlation.problem import Reference
+from rgbmidic.correlation.system import factorise
+from rgbmidic.errors import InputError
+
+__all__ = ["RIGID", "Step", "rigid_functions"]
+
+FloatArray = npt.NDArray[np.float64]
+FloatImage = npt.NDArray[np.float32]
+
+RIGID = ("none", "translation", "translation+rotation")
+"""Choices of rigid functions."""
+
+_SMOOTHNESS = 1e-4
+"""Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
+_SEEN = 0.05
+"""A node is measured if it has this share of the median texture around a node of its area."""
+
+
+def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
+    """Nodal values (2 N, m) of the rigid motions: shifts in x and y (px), rotation (rad) about the mesh's middle.
+
+    Raises
+    ------
+    InputError
+        `rigid` is not one of `RIGID`.
+    """
+    if rigid not in RIGID:
+        raise InputError(f"unknown rigid functions {rigid!r}; allowed are {', '.join(RIGID)}")
+    arm = nodes - nodes.mean(axis=0)
+    columns = np.zeros((len(nodes), 2, 3))
+    columns[:, 0, 0] = columns[:, 1, 1] = 1
+    columns[:, 0, 2], columns[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    return columns.reshape(-1, 3)[:, : (0, 2, 3)[RIGID.index(rigid)]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """Factorised normal equations for given weights.
+
+    Attributes
+    ----------
+    weights : ndarray, shape (k, P), float32
+    hessian, smoothness : csc_matrix, shape (2 N, 2 N)
+    solve
+        Solves ``(hessian + smoothness) x = b``.
+    border, border_solved : ndarray, shape (2 N, (k - 1) m)
+        Hessian of each further light times the rigid functions, and the solution for it.
+    schur : ndarray
+        Schur complement of the rigid unknowns.
+    measured : ndarray, shape (N,), bool
+        Nodes that see enough texture.
+    """
+
+    weights: FloatImage
+    hessian: sp.csc_matrix
+    smoothness: sp.csc_matrix
+    solve: Callable[[FloatArray], FloatArray]
+    border: FloatArray
+    border_solved: FloatArray
+    schur: FloatArray
+    measured: npt.NDArray[np.bool_]
+
+    @classmethod
+    def build(cls, reference: Reference, weights: FloatImage, functions: FloatArray) -> Step:
+        """Assemble and factorise for pixel weights (k, P) and rigid functions (2 N, m)."""
+        equations = reference.equations
+        per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
+        hessian = equations.matrix(np.sum(per_light, axis=0))
+        measured, scale = _observability(hessian, equations.nodal_area)
+        smoothness = sp.csc_matrix((_SMOOTHNESS * scale) * equations.smoothness)
+        # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
+        anchor = 1e-9 * max(scale, 1e-30) * sp.eye(equations.size, format="csc")
+        solve = factorise(sp.csc_matrix(hessian + smoothness + anchor))
+        border, corner = _border([equations.matrix(blocks) for blocks in per_light[1:]], functions)
+        solved = solve(border) if border.shape[1] else border
+        return cls(
+            weights=weights,
+            hessian=hessian,
+            smoothness=smoothness,
+            solve=solve,
+            border=border,
+            border_solved=solved,
+            schur=corner - border.T @ solved,
+            measured=measured,
+        )
+
+    def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Solve for the motion of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
+        free = self.solve(right_side)
+        if not self.border.shape[1]:
+            return free, np.empty(0)
+        rigid = np.linalg.lstsq(self.schur, rigid_side - self.border.T @ free, rcond=1e-9)[0]
+        return free - self.border_solved @ rigid, np.asarray(rigid, dtype=np.float64)
+
+
+def _border(hessians: list[sp.csc_matrix], functions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Coupling of the nodes with the rigid unknowns of the further lights, and these with themselves."""
+    count = functions.shape[1]
+    columns = [hessian @ functions for hessian in hessians] if count else []
+    corner = np.zeros((count * len(columns),) * 2)
+    for i, column in enumerate(columns):
+        part = slice(i * count, (i + 1) * count)
+        corner[part, part] = functions.T @ column
+    return np.concatenate(columns, axis=1) if columns else np.empty((len(functions), 0)), corner
+
+
+def _observability(hessian: sp.csc_matrix, area: FloatArray) -> tuple[npt.NDArray[np.bool_], float]:
+    """Which nodes see enough texture, and the typical diagonal entry of the Hessian.
+
+    The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
+    """
+    diagonal = hessian.diagonal().reshape(-1, 2)
+    nodes = np.arange(len(diagonal))
+    mixed = np.asarray(hessian[2 * nodes, 2 * nodes + 1]).ravel()
+    half = diagonal.sum(axis=1) / 2
+    smallest = half - np.hypot((diagonal[:, 0] - diagonal[:, 1]) / 2, mixed)
+    density = smallest / area
+    typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
+    seen = density > _SEEN * typical if typical > 0 else np.zeros(len(density), dtype=bool)
+    return seen, float(np.median(half[seen])) if seen.any() else 0.0
