@@ -1,0 +1,127 @@
+"""`correlate`: what it takes, what it refuses, and how it says that it could not measure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from textures import Affine, Texture
+
+from rgbmidic import NodeStatus, Region, Status, correlate
+from rgbmidic.errors import InputError, RegionError
+
+SHAPE = (90, 100)
+SHIFT = (0.7, -0.4)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    texture = Texture.random(0)
+    return texture.image(SHAPE), texture.image(SHAPE, Affine(shift=SHIFT))
+
+
+def test_plain_arrays_give_a_mesh_a_field_and_its_uncertainty(pair):
+    found = correlate(*pair)
+    assert found.status is Status.CONVERGED
+    assert found.reason == ""
+    assert found.nodes.shape == found.displacement.shape == found.displacement_std.shape
+    assert found.elements.shape[1] == 3
+    assert found.history[-1] <= 1e-3
+    assert found.iterations == len(found.history)
+    np.testing.assert_array_equal(found.nodes.min(axis=0), (0, 0))
+    np.testing.assert_array_equal(found.nodes.max(axis=0), (SHAPE[1] - 1, SHAPE[0] - 1))
+    inner = ((found.nodes > 10) & (found.nodes < 80)).all(axis=1)
+    np.testing.assert_allclose(found.displacement[inner], np.broadcast_to(SHIFT, (inner.sum(), 2)), atol=3e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64, np.int32])
+def test_any_real_number_type_is_taken(pair, dtype):
+    images = [np.round(image / 2).clip(0, 255).astype(dtype) for image in pair]
+    found = correlate(*images, region=(12, 12, 85, 75))
+    np.testing.assert_allclose(found.displacement, np.broadcast_to(SHIFT, found.displacement.shape), atol=0.03)
+
+
+def test_a_region_may_be_a_mask_or_polygon(pair):
+    polygon = Region.from_polygon([(12, 12), (85, 20), (60, 76), (15, 70)], SHAPE)
+    found = correlate(*pair, region=polygon, element_size=15)
+    assert found.measured.all()
+    np.testing.assert_allclose(found.displacement, np.broadcast_to(SHIFT, found.displacement.shape), atol=0.01)
+
+
+def test_a_stack_of_one_light_is_that_light(pair):
+    f, g = pair
+    np.testing.assert_array_equal(correlate(f[None], g[None]).displacement, correlate(f, g).displacement)
+
+
+@pytest.mark.parametrize("initial", [SHIFT, "nodes"])
+def test_a_start_may_be_one_motion_or_one_per_node(pair, initial):
+    blank = correlate(*pair, region=(12, 12, 85, 75))
+    start = blank.displacement if initial == "nodes" else initial
+    found = correlate(*pair, region=(12, 12, 85, 75), initial=start)
+    np.testing.assert_allclose(found.displacement, blank.displacement, atol=2e-3)
+
+
+def test_the_largest_number_of_iterations_is_kept_and_told():
+    texture = Texture.random(0)
+    pair = texture.image(SHAPE), texture.image(SHAPE, Affine(shift=(2.4, 0)))
+    found = correlate(*pair, initial=(0, 0), max_iterations=1)
+    assert found.iterations == 1
+    assert found.status is Status.NOT_CONVERGED
+    assert "px" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"deformed": np.ones((90, 99))}, r"one shape.*90, 100.*90, 99"),
+        ({"reference": np.ones(100)}, "reference must be a real image"),
+        ({"reference": np.ones((90, 100), complex)}, "reference must be a real image"),
+        ({"reference": np.ones((7, 100)), "deformed": np.ones((7, 100))}, "at least 8 x 8 px"),
+        ({"reference": np.ones((0, 90, 100)), "deformed": np.ones((0, 90, 100))}, "at least one image"),
+        ({"weights": np.ones((90, 99))}, "weights must have shape"),
+        ({"weights": -np.ones(SHAPE)}, "weights must be finite and not negative"),
+        ({"weights": np.full(SHAPE, np.nan)}, "weights must be finite and not negative"),
+        ({"deformed_weights": np.full(SHAPE, np.inf)}, "deformed_weights must be finite"),
+        ({"initial": (1, 2, 3)}, "initial must be finite with shape"),
+        ({"initial": (np.nan, 0)}, "initial must be finite"),
+        ({"prefilter": "median"}, "unknown prefilter 'median'; allowed are none, binomial, gaussian"),
+        ({"rigid": "scale"}, "unknown rigid functions 'scale'"),
+        ({"element_size": 2}, "at least 4 px"),
+        ({"region": Region.from_rectangle((0, 0, 50, 50), (80, 80))}, "region is for images"),
+    ],
+)
+def test_bad_input_is_refused_in_words(pair, change, message):
+    arguments = {"reference": pair[0], "deformed": pair[1], **change}
+    with pytest.raises(InputError, match=message):
+        correlate(arguments.pop("reference"), arguments.pop("deformed"), **arguments)
+
+
+def test_a_region_outside_the_images_is_refused(pair):
+    with pytest.raises(RegionError, match="does not overlap"):
+        correlate(*pair, region=(200, 0, 300, 50))
+
+
+FLAT, UNKNOWN = np.full(SHAPE, 200.0), np.full(SHAPE, np.nan)
+
+
+@pytest.mark.parametrize(
+    ("reference", "deformed", "options", "reason"),
+    [
+        (FLAT, FLAT, {}, "no texture"),
+        (FLAT, None, {}, "no texture"),
+        (UNKNOWN, None, {}, "no light sees"),
+        (None, UNKNOWN, {}, "no light sees"),
+        (None, None, {"weights": np.zeros(SHAPE)}, "no light sees"),
+        (None, None, {"deformed_weights": np.zeros(SHAPE)}, "no light sees"),
+        (None, FLAT, {}, "do not match"),
+        (None, Texture.random(5).image(SHAPE), {}, "do not match"),
+    ],
+)
+def test_what_cannot_be_measured_is_nan_with_a_reason_and_no_crash(pair, reference, deformed, options, reason):
+    images = (pair[0] if reference is None else reference, pair[1] if deformed is None else deformed)
+    found = correlate(*images, **options)
+    assert found.status is Status.FAILED
+    assert reason in found.reason
+    assert np.isnan(found.displacement).all()
+    assert np.isnan(found.displacement_std).all()
+    assert (found.node_status != NodeStatus.MEASURED).all()
+    assert np.isnan(found.residual).all()
