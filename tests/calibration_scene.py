@@ -59,3 +59,26 @@ def captures(
         lights[name] = [expose(picture, matrix[:, index], rng, cfa, **camera) for _ in range(count)]
     dark = [expose(np.zeros(shape), matrix[:, 0], rng, cfa, **camera) for _ in range(darks)]
     return lights, dark
+
+
+def wave_texture(x, y, rng, size=4.2, count=250):
+    """A speckle that is known between the pixels too: a sum of waves at points x, y (px), albedo 0.1 to 0.8."""
+    wave_x, wave_y = rng.normal(0, 1 / (0.9 * size), (2, count))
+    phase = rng.uniform(0, 2 * np.pi, count)
+    total = np.zeros_like(x)
+    for kx, ky, start in zip(wave_x, wave_y, phase, strict=True):
+        total += np.cos(kx * x + ky * y + start)
+    return 0.1 + 0.7 / (1 + np.exp(-3 * total / np.sqrt(count / 2)))
+
+
+def registered_pictures(registration, shape, seed):
+    """The target as each light sees it: light j sees at x + rho_j(x) what the first sees at x."""
+    y, x = np.indices(shape, dtype=float)
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    pictures = []
+    for light in range(len(registration.lights)):
+        origin = points
+        for _ in range(4):
+            origin = points - registration.displacement(origin)[light]
+        pictures.append(wave_texture(*origin.T.reshape(2, *shape), np.random.default_rng(seed)))
+    return pictures

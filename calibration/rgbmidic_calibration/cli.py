@@ -117,6 +117,34 @@ def noise(
 
 
 @app.command()
+def registration(
+    light: Light,
+    out: Out = Path("registration.json"),
+    dark: Dark = None,
+    region: Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")] = None,
+    element_size: Annotated[float, typer.Option(help="Side of the elements, px; several speckles.")] = 25.0,
+    cfa: Cfa = None,
+    black_level: Black = None,
+    white_level: White = None,
+    kind: Kind = None,
+    shape: Shape = None,
+    dtype: Dtype = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Lateral colour registration: where each light sees what the first light sees."""
+    from rgbmidic_calibration import display, jobs
+    from rgbmidic_calibration.captures import check_output, named_patterns
+
+    check_output(out, overwrite=overwrite)
+    statement = jobs.statement(kind, cfa, black_level, white_level, shape, dtype)
+    calibration, estimate = jobs.calibrate_registration(
+        named_patterns(light, "--light"), dark, statement, region=jobs.rectangle(region), element_size=element_size
+    )
+    calibration.write(out)
+    display.registration(estimate, out)
+
+
+@app.command()
 def merge(
     files: Annotated[list[Path], typer.Argument(help="Calibration files; every section from one of them.")],
     out: Out = Path("calibration.json"),

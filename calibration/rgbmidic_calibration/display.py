@@ -16,8 +16,9 @@ from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.registration import Registration
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.noise import NoiseEstimate
+from rgbmidic_calibration.registration import RegistrationEstimate
 
-__all__ = ["calibration", "crosstalk", "merged", "noise", "registration_table"]
+__all__ = ["calibration", "crosstalk", "merged", "noise", "registration", "registration_table"]
 
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
@@ -42,6 +43,19 @@ def noise(estimate: NoiseEstimate, out: Path) -> None:
     _warnings(console, estimate.warnings)
     console.print(_noise_table(estimate.camera_noise))
     console.print(_defect_words(estimate.camera_noise))
+    _written(console, out)
+
+
+def registration(estimate: RegistrationEstimate, out: Path) -> None:
+    """Print the parameters of every light, how well they fit, and the warnings."""
+    console = _console()
+    _warnings(console, estimate.warnings)
+    console.print(registration_table(estimate.registration))
+    for match in estimate.matches:
+        share = 100 * float(match.used.mean())
+        console.print(
+            f"{escape(match.name)}: residual {match.rms:.3f} px rms per node, {share:.0f} % of the nodes used"
+        )
     _written(console, out)
 
 
@@ -80,7 +94,7 @@ def calibration(result: Calibration, path: Path) -> None:
 def registration_table(result: Registration) -> Table:
     """Table of the parameters of every light with their uncertainties."""
     table = Table(title=f"Registration against {escape(result.lights[0])}", title_justify="left")
-    for head in ("light", "shift x, px", "shift y, px", "rotation, mrad", "scale, 1e-3", "radial at corner, 1e-3"):
+    for head in ("light", "x, px", "y, px", "rotation, mrad", "scale, 1e-3", "radial, 1e-3"):
         table.add_column(head, justify="left" if head == "light" else "right")
     factors = np.array([1, 1, 1e3, 1e3, 1e3])
     for index, name in enumerate(result.lights[1:], start=1):

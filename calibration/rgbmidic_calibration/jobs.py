@@ -14,9 +14,18 @@ from rgbmidic_calibration.blocks import BlockMeans, block_means
 from rgbmidic_calibration.captures import CaptureFiles, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
+from rgbmidic_calibration.registration import ELEMENT, RegistrationEstimate, estimate_registration
 from rgbmidic_calibration.stacks import stack_frames
 
-__all__ = ["calibrate_crosstalk", "calibrate_noise", "field_order", "find_groups", "statement"]
+__all__ = [
+    "calibrate_crosstalk",
+    "calibrate_noise",
+    "calibrate_registration",
+    "field_order",
+    "find_groups",
+    "rectangle",
+    "statement",
+]
 
 KINDS = ("bayer", "rgb", "monochrome")
 DTYPES = ("uint8", "uint16", ">u2")
@@ -138,6 +147,45 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
         provenance={"noise": provenance("noise", all_files, details)},
         **_camera(frame),
     ), estimate
+
+
+def calibrate_registration(
+    lights: Mapping[str, str],
+    dark: str | None,
+    told: FrameSettings,
+    *,
+    region: Sequence[float] | None = None,
+    element_size: float = ELEMENT,
+) -> tuple[Calibration, RegistrationEstimate]:
+    """Registration section from capture files of a speckled target: patterns by light, the first is the reference."""
+    found, dark_files = find_groups(lights, dark, told)
+    dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames") if dark_files else None
+    stacks = {name: stack_frames(files.frames(), name=files.role) for name, files in found.items()}
+    estimate = estimate_registration(stacks, dark_stack, region=region, element_size=element_size)
+    groups = [*found.values(), *([dark_files] if dark_files else [])]
+    details = {
+        "warnings": list(estimate.warnings),
+        "region": None if region is None else list(region),
+        "element_size": element_size,
+        "residual_rms_px": {match.name: match.rms for match in estimate.matches},
+    }
+    frame = next(groups[0].frames())
+    return Calibration(
+        registration=estimate.registration,
+        provenance={"registration": provenance("registration", groups, details)},
+        **_camera(frame),
+    ), estimate
+
+
+def rectangle(text: str | None) -> tuple[float, float, float, float] | None:
+    """Rectangle that ``--region`` states as x0,y0,x1,y1 in px."""
+    if text is None:
+        return None
+    try:
+        x0, y0, x1, y1 = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigurationError(f"--region is x0,y0,x1,y1 in px, not {text!r}") from None
+    return x0, y0, x1, y1
 
 
 def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float | None]]:

@@ -139,3 +139,15 @@ def test_show_of_a_file_that_is_none(run, tmp_path):
     code, _, error = run("show", str(tmp_path / "x.json"))
     assert code == 2
     assert "is not a calibration file" in error
+
+
+def test_registration_of_speckled_captures(run, tmp_path):
+    out = str(tmp_path / "r.json")
+    code, shown, error = run("registration", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", out)
+    assert code == 0, error
+    assert "Registration against red" in shown
+    found = Calibration.read(out).registration
+    assert np.abs(found.parameters[:, :2]).max() < 0.05  # the bench's captures are registered
+    code, _, error = run("registration", *LIGHTS, *STATED, "--out", out + "2", "--region", "here")
+    assert code == 2
+    assert "--region is x0,y0,x1,y1" in error

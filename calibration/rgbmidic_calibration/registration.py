@@ -1,0 +1,346 @@
+"""Lateral colour registration of the lights: DIC between single-light captures of a speckled target at rest.
+
+With one light on, every colour plane of the camera shows the same picture, each with its own strength. Each plane
+divided by its local mean gives that picture at every pixel, with no demosaicing and no crosstalk matrix. The
+displacement between the pictures of two lights (`rgbmidic.correlation.correlate`) is then fitted by shift, rotation,
+scale and a radial term (`rgbmidic.illumination.registration`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from rgbmidic.correlation.correlate import correlate
+from rgbmidic.correlation.solution import NodeStatus, Solution
+from rgbmidic.errors import CalibrationError, RgbmidicError
+from rgbmidic.illumination.registration import PARAMETERS, Registration, frame_geometry, registration_basis
+from rgbmidic_calibration.stacks import TemporalStack, same_camera
+
+__all__ = ["ELEMENT", "LightMatch", "RegistrationEstimate", "estimate_registration", "jitter", "light_picture"]
+
+Floats = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+
+LOCAL = 8.0
+"""Standard deviation (px) of the neighbourhood whose mean a plane is divided by: several speckles."""
+
+CLEAR = 15.0
+"""Signal over noise of the mean frame below which a plane is not used for the light."""
+
+BORDER = 8
+"""Pixels at the frame's edge that are left out."""
+
+ELEMENT = 25.0
+"""Side of the elements of the DIC between lights, px."""
+OUTLIER = 5.0
+MEASURED_LIMIT = 0.5
+RESIDUAL_LIMIT = 0.3
+MISFIT_WARNING = 0.05
+MOTION_WARNING = 0.03
+MIN_SAMPLES = 1000
+SATURATED_LIMIT = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LightMatch:
+    """What the DIC between the first light and another gave.
+
+    Attributes
+    ----------
+    name : str
+    nodes, displacement : ndarray, shape (N, 2)
+        Where the first light's picture was compared (px), and the displacement to the other light's (px).
+    residual : ndarray, shape (N, 2)
+        Displacement minus the fitted registration (px).
+    used : ndarray, shape (N,), bool
+        Nodes that were measured and are no outliers.
+    """
+
+    name: str
+    nodes: Floats
+    displacement: Floats
+    residual: Floats
+    used: npt.NDArray[np.bool_]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residual's components over the nodes used, px."""
+        return float(np.sqrt((self.residual[self.used] ** 2).mean()))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegistrationEstimate:
+    """Result of `estimate_registration`: the registration, one match per light after the first, and warnings."""
+
+    registration: Registration
+    matches: tuple[LightMatch, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Image:
+    """The picture of the one light that is on, relative to its local mean, at every pixel.
+
+    Parameters
+    ----------
+    stack
+        Captures with one light on.
+    dark
+        Captures with all lights off; None: the stated black level.
+
+    Returns
+    -------
+    ndarray, shape (H, W), float32
+        About 1 on average; NaN where a sample is saturated. Planes too faint for the light are interpolated from the
+        others.
+
+    Raises
+    ------
+    CalibrationError
+        No plane has enough signal.
+    """
+    height, width = stack.shape
+    picture = np.full((height, width), np.nan, dtype=np.float32)
+    used = np.zeros((height, width), dtype=np.float32)
+    shares = []
+    for plane in range(len(stack.names)):
+        signal = stack.mean[plane] - (0 if dark is None else dark.mean[plane])
+        level = float(signal.mean(dtype=np.float64))
+        shares.append((level, plane, signal))
+    brightest = max(level for level, *_ in shares)
+    if brightest < 0.005 * (stack.white - float(stack.black.min())):
+        raise CalibrationError(f"the light gives {brightest:.1f} DN above dark only: was the lamp on?")
+    if stack.step == 1:
+        _, plane, signal = max(shares, key=lambda share: share[0])
+        return _relative(signal, stack.clipped[plane], LOCAL)
+    for level, plane, signal in shares:
+        if not _clear(stack, dark, plane, level, brightest):
+            continue
+        row, column = stack.origins[plane]
+        place = (slice(row, 2 * signal.shape[0], 2), slice(column, 2 * signal.shape[1], 2))
+        picture[place] = _relative(signal, stack.clipped[plane], LOCAL / 2)
+        used[place] = 1
+    return _filled(picture, used)
+
+
+def _clear(stack: TemporalStack, dark: TemporalStack | None, plane: int, level: float, brightest: float) -> bool:
+    """Is a plane bright enough for its own noise? With a single frame: a tenth of the brightest plane."""
+    if level < 0.1 * brightest and stack.count < 2:
+        return False
+    noise = float(stack.variance[plane].mean(dtype=np.float64)) / stack.count
+    if dark is not None and dark.count > 1:
+        noise += float(dark.variance[plane].mean(dtype=np.float64)) / dark.count
+    return level > CLEAR * float(np.sqrt(noise))
+
+
+def _relative(signal: npt.NDArray[np.floating], clipped: npt.NDArray[np.bool_], sigma: float) -> Image:
+    """Signal over its local mean; NaN where clipped."""
+    weight = (~clipped).astype(np.float32)
+    total = ndimage.gaussian_filter(signal * weight, sigma)
+    mean = total / np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-3)
+    floor = 1e-3 * max(float(signal.mean()), 1.0)
+    return np.where(clipped, np.nan, signal / np.maximum(mean, floor)).astype(np.float32)
+
+
+def _filled(picture: Image, used: Image) -> Image:
+    """Pixels of planes not used: the mean of their neighbours, symmetric so that nothing shifts."""
+    if used.all():
+        return picture
+    known = used * np.isfinite(picture)
+    kernel = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32)
+    total = ndimage.convolve(np.nan_to_num(picture) * known, kernel)
+    count = ndimage.convolve(known, kernel)
+    expected = ndimage.convolve(used, kernel)
+    # A neighbourhood that lost a saturated sample is not symmetric any more.
+    mean = np.where(count == expected, total / np.maximum(count, 1), np.nan)
+    return np.where(used > 0, picture, mean).astype(np.float32)
+
+
+def estimate_registration(
+    lights: Mapping[str, TemporalStack],
+    dark: TemporalStack | None = None,
+    *,
+    region: Sequence[float] | None = None,
+    element_size: float = ELEMENT,
+) -> RegistrationEstimate:
+    """Registration of every light against the first.
+
+    Parameters
+    ----------
+    lights
+        Captures of a speckled target at rest with one light on at a time, by the light's name.
+    dark
+        Captures with all lights off.
+    region
+        Rectangle (x0, y0, x1, y1) in px where the target is; None: the whole frame.
+    element_size
+        Side of the elements of the DIC, px.
+
+    Raises
+    ------
+    CalibrationError
+        Fewer than two lights, frames of different cameras, a target without texture, or pictures that do not match.
+    """
+    if len(lights) < 2:
+        raise CalibrationError("a registration needs the captures of at least two lights")
+    same_camera([*lights.values(), *([dark] if dark else [])])
+    shape = next(iter(lights.values())).shape
+    centre, radius = frame_geometry(shape)
+    pictures = {name: _picture(name, stack, dark) for name, stack in lights.items()}
+    names = tuple(lights)
+    motion = {name: np.nan_to_num(jitter(stack, pictures[name]) ** 2 / stack.count) for name, stack in lights.items()}
+    parameters = np.zeros((len(names), len(PARAMETERS)))
+    covariance = np.zeros((len(names), len(PARAMETERS), len(PARAMETERS)))
+    matches = []
+    for index, name in enumerate(names[1:], start=1):
+        solution = _match(pictures[names[0]], pictures[name], region, element_size, (names[0], name))
+        parameters[index], covariance[index], match = _fit(name, solution, centre, radius, element_size)
+        covariance[index, :2, :2] += np.diag(motion[names[0]] + motion[name])
+        matches.append(match)
+    registration = Registration(
+        lights=names, parameters=parameters, centre=centre, radius=radius, covariance=covariance
+    )
+    return RegistrationEstimate(
+        registration=registration, matches=tuple(matches), warnings=tuple(_warnings(lights, dark, motion, matches))
+    )
+
+
+def _warnings(
+    lights: Mapping[str, TemporalStack],
+    dark: TemporalStack | None,
+    motion: Mapping[str, Floats],
+    matches: Sequence[LightMatch],
+) -> list[str]:
+    warnings = [] if dark else ["no dark frames: the sensor's own pattern stays in the pictures"]
+    for name, stack in lights.items():
+        if (moved := float(np.sqrt(motion[name].max() * stack.count))) > MOTION_WARNING:
+            warnings.append(
+                f"light {name}: the picture moves by {moved:.2f} px (standard deviation) from capture to capture: "
+                "something vibrates or drifts; the stated uncertainty of the shift covers it"
+            )
+    return warnings + _misfits(matches)
+
+
+def _picture(name: str, stack: TemporalStack, dark: TemporalStack | None) -> Image:
+    try:
+        picture = light_picture(stack, dark)
+    except CalibrationError as error:
+        raise CalibrationError(f"light {name}: {error}") from None
+    if (lost := float(np.isnan(picture).mean())) > SATURATED_LIMIT:
+        raise CalibrationError(f"light {name}: {100 * lost:.0f} % of the picture is saturated; shorten the exposure")
+    return picture
+
+
+def _match(
+    reference: Image, other: Image, region: Sequence[float] | None, element_size: float, names: tuple[str, str]
+) -> Solution:
+    height, width = reference.shape
+    inside = region if region is not None else (BORDER, BORDER, width - 1 - BORDER, height - 1 - BORDER)
+    told = f"the pictures of lights {names[0]} and {names[1]}"
+    try:
+        solution = correlate(reference, other, region=inside, element_size=element_size, search_radius=32.0)
+    except RgbmidicError as error:
+        raise CalibrationError(
+            f"the pictures of lights {names[0]} and {names[1]} cannot be compared: {error}"
+        ) from None
+    measured = float((solution.node_status == NodeStatus.MEASURED).mean())
+    if measured < MEASURED_LIMIT:
+        raise CalibrationError(
+            f"{told} match in {100 * measured:.0f} % of the field only: is the target speckled and at rest, sharp "
+            "under both lights, and not saturated?"
+        )
+    return solution
+
+
+def _fit(
+    name: str, solution: Solution, centre: tuple[float, float], radius: float, element_size: float
+) -> tuple[Floats, Floats, LightMatch]:
+    """Parameters (5,), covariance (5, 5) and residuals: weighted least squares without outliers, cluster sandwich."""
+    value = solution.displacement
+    basis = registration_basis(solution.nodes, centre, radius)
+    weight = np.nan_to_num(1 / solution.displacement_std**2, posinf=0.0)
+    used = good = np.asarray((np.isfinite(value) & (weight > 0)).all(axis=1))
+    for _ in range(10):
+        parameters, inverse, residual = _least_squares(basis, value, weight * used[:, None])
+        size = np.linalg.norm(residual, axis=1)
+        limit = OUTLIER * np.median(size[good]) / 1.1774
+        update = good & (np.nan_to_num(size, nan=np.inf) <= limit)
+        if (update == used).all():
+            break
+        used = update
+    score = np.einsum("ndp,nd->np", basis * (weight * used[:, None])[..., None], np.nan_to_num(residual))
+    sums = _cell_sums(score, solution.nodes, 2 * element_size)
+    covariance = inverse @ (sums.T @ sums) @ inverse * len(sums) / max(len(sums) - 1, 1)
+    match = LightMatch(name=name, nodes=solution.nodes, displacement=value, residual=residual, used=used)
+    if match.rms > RESIDUAL_LIMIT:
+        raise CalibrationError(
+            f"the picture of light {name} departs from a shift, rotation and magnification of the first light's by "
+            f"{match.rms:.2f} px rms: did the target deform or move, or is it another target?"
+        )
+    return parameters, covariance, match
+
+
+def _least_squares(basis: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]:
+    """Parameters, inverse of the normal matrix and residuals; values of weight 0 may be NaN."""
+    scaled = basis * weight[..., None]
+    inverse = np.linalg.inv(np.einsum("ndp,ndq->pq", scaled, basis))
+    parameters = inverse @ np.einsum("ndp,nd->p", scaled, np.nan_to_num(value))
+    return parameters, inverse, value - basis @ parameters
+
+
+def _cell_sums(values: Floats, nodes: Floats, side: float) -> Floats:
+    """Sums (cells, Q) of values (N, Q) over square cells: neighbouring nodes share pixels and errors."""
+    _, cell = np.unique(np.floor(nodes / side).astype(int), axis=0, return_inverse=True)
+    return np.stack([np.bincount(cell.ravel(), weights=column) for column in values.T], axis=1)
+
+
+def _misfits(matches: Sequence[LightMatch]) -> list[str]:
+    """What the model leaves, averaged over cells of 4 x 4 nodes: noise is small there, a misfit is not."""
+    warnings = []
+    for match in matches:
+        side = 4 * max(float(np.median(np.diff(np.unique(match.nodes[:, 0].round(2))))), 1.0)
+        residual = match.residual[match.used]
+        sums = _cell_sums(np.column_stack([residual, np.ones(len(residual))]), match.nodes[match.used], side)
+        means = (sums[:, :2] / sums[:, 2:])[sums[:, 2] >= 8]
+        if means.size and (smooth := float(np.sqrt((means**2).mean()))) > MISFIT_WARNING:
+            warnings.append(
+                f"light {match.name}: a smooth misfit of {smooth:.2f} px rms is left: the target was not at rest, or "
+                "the lens needs more than shift, rotation, scale and radial term"
+            )
+    return warnings
+
+
+def jitter(stack: TemporalStack, picture: Image) -> Floats:
+    """How much the picture moved from frame to frame: standard deviation (2,) in x and y, px; NaN for a single frame.
+
+    The temporal variance of a sample that moves by d is ``r^2 + K mu + (d . gradient)^2``; the coefficients of the
+    squared gradients are fitted over the brightest plane.
+
+    Parameters
+    ----------
+    stack
+        Captures with one light on.
+    picture
+        Their picture (`light_picture`), whose gradients are finer than those of a plane.
+    """
+    if stack.count < 2:
+        return np.full(2, np.nan)
+    plane = int(stack.strength.mean(axis=0).argmax())
+    mean = stack.mean[plane].astype(np.float64)
+    local = ndimage.gaussian_filter(mean, LOCAL / stack.step)
+    row, column = stack.origins[plane]
+    place = (slice(row, row + stack.step * mean.shape[0], stack.step), slice(column, None, stack.step))
+    stencil = np.array([1, -8, 0, 8, -1]) / 12
+    slopes = [ndimage.correlate1d(picture, stencil, axis=axis)[place][:, : mean.shape[1]] * local for axis in (1, 0)]
+    columns = np.stack([np.ones_like(mean), mean, slopes[0] ** 2, slopes[1] ** 2], axis=-1)
+    use = np.isfinite(columns).all(axis=-1) & ~stack.clipped[plane]
+    if use.sum() < MIN_SAMPLES:
+        return np.full(2, np.nan)
+    weight = 1 / np.maximum(mean[use], 0.02 * float(mean[use].mean()))
+    moments = (columns[use] * weight[:, None]).T
+    solution = np.linalg.solve(moments @ columns[use], moments @ stack.variance[plane][use])
+    return np.asarray(np.sqrt(np.maximum(solution[2:], 0)))
