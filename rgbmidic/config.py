@@ -359,7 +359,13 @@ def _check_names(given: Iterable[str], allowed: Iterable[str], what: str, where:
             raise ConfigurationError(f'unknown {what} "{name}" in {where}{hint}; allowed are {", ".join(allowed)}')
 
 
-_WORDS = {float: "a number", int: "a whole number", str: "a text in quotes", Path: "a file name in quotes"}
+_WORDS = {
+    bool: "true or false",
+    float: "a number",
+    int: "a whole number",
+    str: "a text in quotes",
+    Path: "a file name in quotes",
+}
 
 
 def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
