@@ -45,11 +45,12 @@ def main() -> None:
 
 def _run(arguments: list[str], *, debug: bool) -> int:
     try:
-        return app(args=arguments, standalone_mode=False) or 0
-    except KeyboardInterrupt:
+        status = app(args=arguments, standalone_mode=False) or 0
+        if status != INTERRUPTED:  # typer's own answer to Ctrl-C
+            return int(status)
+        raise KeyboardInterrupt
+    except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted; what was finished is kept", INTERRUPTED)
-    except typer.Abort:
-        return _fail("aborted", FAILURE)
     except Exception as error:  # the last resort of a command: whatever it is becomes one line and an exit status
         if debug:
             traceback.print_exc()
@@ -137,8 +138,10 @@ def virtual(
 @contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one."""
+    # only for people who watch: an error stays one line, a log file stays short
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.fields[line]}", markup=False), console=_messages) as bar:
+    last = TextColumn("{task.fields[line]}", markup=False)
+    with Progress(*columns, last, console=_messages, transient=True, disable=not _messages.is_terminal) as bar:
         task = bar.add_task(what, total=None, line="")
         yield lambda done, total, line: bar.update(task, completed=done, total=total, line=line)
 
@@ -149,7 +152,7 @@ def _print_summary(result: Result, seconds: float) -> None:
     table.add_row("frames", f"{len(result)}, {int((result.status == _CONVERGED).sum())} converged")
     table.add_row("nodes", f"{len(result.nodes)}, {measured:.1%} measured")
     for light, share in zip(result.lights, result.weight_share[result.status != _FAILED].T, strict=True):
-        table.add_row(f"light {light}", f"mean weight {share.mean():.2f}" if share.size else "-")
+        table.add_row(light, f"mean weight {share.mean():.2f}" if share.size else "-")
     table.add_row("time", f"{seconds:.1f} s")
     table.add_row("result", str(result.path))
     Console(soft_wrap=True).print(table)

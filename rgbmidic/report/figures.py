@@ -119,9 +119,8 @@ def residual_figure(result: Result) -> Figure:
         for axis, values, label in zip(axes, (result.residual, result.weight_share), labels, strict=True):
             for light, series in zip(result.lights, values.T, strict=True):
                 axis.plot(series, marker="o", markersize=2.5, linewidth=1, label=light, color=_LIGHT_COLOURS.get(light))
+            axis.set_ylim(bottom=0)
             _finish_plot(axis, "frame", label)
-        axes[0].set_ylim(bottom=0)
-        axes[1].set_ylim(0, 1.05)
         axes[1].legend(loc="lower left")
 
     return _figure(draw, count=2, aspect=0.75, colour_bars=False)

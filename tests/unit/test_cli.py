@@ -1,0 +1,212 @@
+"""The command `rgbmidic`: one clear line for a wrong input, the right exit status, nothing lost."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from results import make_result, random_record
+
+from rgbmidic import __version__, cli
+from rgbmidic.errors import FrameError
+from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
+
+TEST = '[frames]\npath = "f*.tif"\nkind = "monochrome"\n[region]\nrectangle = [40, 40, 160, 120]\n'
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run the command in this process: exit status, standard output, standard error."""
+
+    def run(*arguments: object, debug: bool = False) -> tuple[int, str, str]:
+        status = cli._run([str(argument) for argument in arguments], debug=debug)
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def test_file(tmp_path: Path) -> Path:
+    path = tmp_path / "test.toml"
+    path.write_text(TEST)
+    return path
+
+
+def _replace_pipeline(monkeypatch: pytest.MonkeyPatch, measure: Callable[..., Result]) -> None:
+    module = ModuleType("rgbmidic.pipeline")
+    module.measure = measure  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "rgbmidic.pipeline", module)
+
+
+def test_version_and_help(command: Run) -> None:
+    assert command("--version") == (0, f"rgbmidic {__version__}\n", "")
+    for arguments in ((), ("--help",)):
+        status, out, _ = command(*arguments)
+        assert status == 0
+        assert all(word in out for word in ("run", "export", "demo", "virtual"))
+    for name in ("run", "export", "demo", "virtual"):
+        assert command(name, "--help")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["bogus"], "bogus"),
+        (["run"], "TEST.toml"),
+        (["run", "none.toml"], "--out"),
+        (["run", "none.toml", "--out", "out"], "none.toml"),
+        (["run", "none.toml", "--out", "out", "--bogus"], "--bogus"),
+        (["export", "none", "--to", "npz", "--out", "a"], "none is not a result folder"),
+        (["virtual", "none.toml", "--out", "out"], "none.toml"),
+    ],
+)
+def test_wrong_input_is_one_line_and_status_2(
+    command: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str], word: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, out, error = command(*arguments)
+    assert (status, out) == (2, "")
+    assert error.startswith("error: ")
+    assert word in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_failure_is_one_line_and_status_1(command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path) -> None:
+    def measure(*_: Any, **__: Any) -> Result:
+        raise ZeroDivisionError("a fault\nof ours")
+
+    _replace_pipeline(monkeypatch, measure)
+    status, _, error = command("run", test_file, "--out", test_file.parent / "out")
+    assert (status, error.count("\n")) == (1, 1)
+    assert error.startswith("error: ZeroDivisionError: a fault of ours")
+    status, _, error = command("run", test_file, "--out", test_file.parent / "out", debug=True)
+    assert status == 1
+    assert "Traceback" in error
+
+
+def test_bad_frames_are_status_2_and_an_interruption_130(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    for raised, expected in ((FrameError("f1.dng is damaged"), 2), (KeyboardInterrupt(), 130)):
+
+        def measure(*_: Any, raised: BaseException = raised, **__: Any) -> Result:
+            raise raised
+
+        _replace_pipeline(monkeypatch, measure)
+        status, _, error = command("run", test_file, "--out", test_file.parent / "out")
+        assert status == expected
+        assert error.splitlines()[-1].startswith("error: ")
+
+
+def test_run_passes_everything_on_and_tells_what_came_out(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    calls: list[dict[str, Any]] = []
+
+    def measure(settings: Any, out: Path, *, overwrite: bool, progress: Callable[[int, int, str], None]) -> Result:
+        calls.append({"path": settings.frames.path, "overwrite": overwrite})
+        progress(1, 2, "f1.tif: [converged]")
+        return make_result(out, frames=2, overwrite=overwrite)
+
+    _replace_pipeline(monkeypatch, measure)
+    out = test_file.parent / "out"
+    status, printed, _ = command("run", test_file, "--out", out, "--no-figures")
+    assert status == 0
+    assert "2, 1 converged" in printed
+    assert str(out) in printed
+    assert not (out / "figures").exists()
+    assert command("run", test_file, "--out", out, "--overwrite")[0] == 0
+    assert (out / "figures" / "convergence.png").is_file()
+    assert [call["overwrite"] for call in calls] == [False, True]
+    assert {call["path"] for call in calls} == {("f*.tif",)}
+
+
+def test_run_in_which_every_frame_failed_is_a_failure(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    def measure(_: Any, out: Path, **__: Any) -> Result:
+        store = ResultStore.create(
+            out, nodes=np.zeros((3, 2)), elements=[[0, 1, 2]], names=["f1"], lights=["light"], overwrite=False
+        )
+        store.write_frame(0, FrameRecord.failed("f1.tif is damaged", nodes=3, lights=1))
+        return Result.open(out)
+
+    _replace_pipeline(monkeypatch, measure)
+    status, _, error = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
+    assert status == 1
+    assert "f1.tif is damaged" in error
+
+
+def test_export(command: Run, tmp_path: Path) -> None:
+    result = make_result(tmp_path / "result")
+    assert command("export", result.path, "--to", "npz", "--out", tmp_path / "a.npz") == (0, "", "")
+    with np.load(tmp_path / "a.npz") as archive:
+        np.testing.assert_array_equal(archive["u"], result.u)
+    content = (tmp_path / "a.npz").read_bytes()
+    status, _, error = command("export", result.path, "--out", tmp_path / "a.npz")
+    assert (status, (tmp_path / "a.npz").read_bytes()) == (2, content)
+    assert "already exists" in error
+    assert command("export", result.path, "--to", "csv", "--out", tmp_path / "a.npz", "--overwrite")[0] == 0
+    assert (tmp_path / "a.npz").read_text().startswith("frame,")
+
+
+def test_export_of_an_interrupted_run(command: Run, tmp_path: Path) -> None:
+    names = ["f0", "f1", "f2"]
+    result = make_result(tmp_path / "whole")
+    store = ResultStore.create(
+        tmp_path / "out", nodes=result.nodes, elements=result.elements, names=names, lights=result.lights
+    )
+    store.write_frame(0, random_record(0))
+    assert command("export", tmp_path / "out", "--out", tmp_path / "a.npz")[0] == 2
+    assert command("export", tmp_path / "out", "--out", tmp_path / "a.npz", "--partial")[0] == 0
+    with np.load(tmp_path / "a.npz") as archive:
+        assert archive["names"].tolist() == ["f0"]
+
+
+def test_from_frames_to_export(command: Run, test_file: Path) -> None:
+    """The whole way with the real pipeline: three frames of one pattern, each one pixel further to the right."""
+    random = np.random.default_rng(0)
+    texture = random.integers(0, 4, (40, 54)).repeat(4, 0).repeat(4, 1) * 800 + 300
+    for index in range(3):
+        frame = np.roll(texture, index, 1)[:160, 8:208] + random.normal(0, 12, (160, 200))
+        tifffile.imwrite(test_file.with_name(f"f{index}.tif"), frame.round().astype(np.uint16))
+    out = test_file.parent / "out"
+    status, printed, error = command("run", test_file, "--out", out, "--no-figures")
+    assert status == 0, error
+    assert "3, 3 converged" in printed
+    assert command("export", out, "--to", "npz", "--out", out / "fields.npz")[0] == 0
+    with np.load(out / "fields.npz") as archive:
+        np.testing.assert_allclose(archive["u"].mean(axis=1), [0, 1, 2], atol=0.02)
+        np.testing.assert_allclose(archive["v"].mean(axis=1), [0, 0, 0], atol=0.02)
+    status, _, error = command("run", test_file, "--out", out)
+    assert status == 2
+    assert "already holds a result" in error
+
+
+def test_installed_command_ends_with_the_status_and_without_traceback(tmp_path: Path) -> None:
+    code = "from rgbmidic.cli import main; main()"
+    for extra, traces in (([], False), (["--debug"], True)):
+        done = subprocess.run(
+            [sys.executable, "-c", code, "run", "none.toml", "--out", str(tmp_path / "out"), *extra],
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 2
+        assert done.stderr.splitlines()[-1] == "error: settings file not found: none.toml"
+        assert ("Traceback" in done.stderr) is traces
+
+
+def test_the_package_needs_neither_typer_nor_matplotlib() -> None:
+    code = "import sys, rgbmidic; print({'typer', 'rich', 'matplotlib', 'colour'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
