@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from rgbmidic.errors import FrameError
 from rgbmidic.illumination.mosaic import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.sequence import camera_raw
 from rgbmidic.sequence.readers import frame_shape, read_frame, tells_camera
 from rgbmidic.sequence.writers import write_dng
 
@@ -163,3 +164,23 @@ def test_damaged_header_never_gives_another_error(dng: Path, seed: int) -> None:
     except FrameError as error:
         named = str(error)
         assert "bad.dng" in named
+
+
+@pytest.mark.parametrize(("black", "fill"), [(0, 0), (64, 0), (64, 64), (64, 128)])
+def test_rows_without_noise_mean_that_nothing_was_decoded(black: int, fill: int) -> None:
+    """Compressed raws whose data end early: LibRaw leaves rows of one value (a truncated Panasonic, a Sony)."""
+    values = noisy_mosaic((200, 50)).values.copy()
+    level = np.full((2, 2), float(black))
+    for damage, refused in (
+        (slice(0, 0), False),
+        (slice(7, 8), False),
+        (slice(100, 110), True),
+        (slice(198, 200), True),
+    ):
+        broken = values.copy()
+        broken[damage] = fill
+        if refused:
+            with pytest.raises(FrameError, match="empty"):
+                camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
+        else:
+            camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
