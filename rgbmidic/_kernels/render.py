@@ -353,12 +353,8 @@ def _trace_tile(out, x0, y0, lens, frame, body, affine, material, lights, paint,
     work = np.empty((_FIELDS, samples * samples * across))
     grid, cells = np.empty((7, work.shape[1]), dtype=np.float32), np.empty((3, work.shape[1]), dtype=np.int32)
     shape = (samples, samples, across)
-    cx, cy, mx, my = (
-        work[_CX].reshape(shape),
-        work[_CY].reshape(shape),
-        work[_MX].reshape(shape),
-        work[_MY].reshape(shape),
-    )
+    cx, cy = work[_CX].reshape(shape), work[_CY].reshape(shape)
+    mx, my = work[_MX].reshape(shape), work[_MY].reshape(shape)
     for r in range(samples):
         for q in range(samples):
             for c in range(across):

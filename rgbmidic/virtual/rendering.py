@@ -34,7 +34,7 @@ def samples_needed(scene: Scene) -> int:
     needed = 6.0
     for paint in (scene.surface.white, scene.surface.black):
         if paint.slope_deg > 0:
-            sharpness = 2 * max(1.0, 4 / paint.lobe_deg) if paint.gloss > 0 else 1.0
+            sharpness = 2 * max(1.0, 4 / paint.lobe_deg) ** 0.75 if paint.gloss > 0 else 1.0
             needed = max(needed, 2.7 * pixel / paint.spacing * sharpness)
     return min(math.ceil(needed - 0.1), 24)
 

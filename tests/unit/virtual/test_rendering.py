@@ -27,6 +27,7 @@ from rgbmidic.virtual import (
 )
 from rgbmidic.virtual.light import NOMINAL_DISTANCE
 from rgbmidic.virtual.rendering import _aperture, samples_needed
+from rgbmidic.virtual.scenes import paint
 
 FULL = 4095 - 64
 FRONT = (0.0, 0.0, 600.0)
@@ -155,13 +156,14 @@ def test_the_number_of_threads_does_not_change_a_bit():
         (plate_scene(size=48, lens_blur=0.45), 0.1),
         (plate_scene(size=48, gloss=1.5, glare="green"), 0.6),
         (sphere_scene(size=48, droplet=0.16), 0.6),
+        (replace(plate_scene(size=48, glare="green"), surface=paint(gloss=3.0, lobe_deg=2.0)), 0.8),
     ],
-    ids=["mat", "glare", "sphere"],
+    ids=["mat", "glare", "sphere", "sharp"],
 )
 def test_sampling_pattern_leaves_no_trace(scene, limit):
     """The error of the default sampling is below the shot noise, and has no peak in its spectrum."""
     image = render(scene)
-    fine = render(replace(scene, camera=replace(scene.camera, samples=2 * samples_needed(scene))))
+    fine = render(replace(scene, camera=replace(scene.camera, samples=int(1.7 * samples_needed(scene)))))
     shot = np.sqrt(fine.mean() / scene.camera.gain)
     for error in image - fine:
         assert error.std() < limit * shot
