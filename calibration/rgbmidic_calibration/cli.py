@@ -145,6 +145,45 @@ def registration(
 
 
 @app.command()
+def check(
+    file: Annotated[Path, typer.Argument(help="Calibration file.")],
+    light: Light,
+    dark: Dark = None,
+    together: Annotated[
+        list[str] | None, typer.Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
+    ] = None,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=VALUE: leakage, additivity, strength, noise (in %), registration (in px)."),
+    ] = None,
+    region: Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")] = None,
+    cfa: Cfa = None,
+    black_level: Black = None,
+    white_level: White = None,
+    kind: Kind = None,
+    shape: Shape = None,
+    dtype: Dtype = None,
+) -> None:
+    """Does a calibration hold on captures that did not make it? Exit status 1 where it does not."""
+    from rgbmidic_calibration import display, jobs
+    from rgbmidic_calibration.captures import named_patterns
+    from rgbmidic_calibration.verdict import check_calibration, read_limits
+
+    verdict = check_calibration(
+        file,
+        named_patterns(light, "--light"),
+        dark,
+        named_patterns(together or (), "--together"),
+        jobs.statement(kind, cfa, black_level, white_level, shape, dtype),
+        limits=read_limits(limit or ()),
+        region=jobs.rectangle(region),
+    )
+    display.verdict(verdict)
+    if not verdict.passed:
+        raise typer.Exit(1)
+
+
+@app.command()
 def merge(
     files: Annotated[list[Path], typer.Argument(help="Calibration files; every section from one of them.")],
     out: Out = Path("calibration.json"),

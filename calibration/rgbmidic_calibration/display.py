@@ -17,8 +17,9 @@ from rgbmidic.illumination.registration import Registration
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.noise import NoiseEstimate
 from rgbmidic_calibration.registration import RegistrationEstimate
+from rgbmidic_calibration.verdict import Verdict
 
-__all__ = ["calibration", "crosstalk", "merged", "noise", "registration", "registration_table"]
+__all__ = ["calibration", "crosstalk", "merged", "noise", "registration", "registration_table", "verdict"]
 
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
@@ -57,6 +58,31 @@ def registration(estimate: RegistrationEstimate, out: Path) -> None:
             f"{escape(match.name)}: residual {match.rms:.3f} px rms per node, {share:.0f} % of the nodes used"
         )
     _written(console, out)
+
+
+def verdict(result: Verdict) -> None:
+    """Print every figure with its limit, and the verdict."""
+    console = _console()
+    _warnings(console, result.warnings)
+    table = Table(title="Check of the calibration", title_justify="left")
+    table.add_column("figure")
+    for head in ("value", "limit", ""):
+        table.add_column(head, justify="right")
+    for item in result.items:
+        figure = f"{item.value:+.3f}" + (f" ± {item.std:.3f}" if item.std else "") + f" {item.unit}"
+        word = "[green]passed[/]" if item.passed else "[bold red]failed[/]"
+        table.add_row(escape(item.name), figure, f"{item.limit:g} {item.unit}", word)
+    console.print(table)
+    for total in result.sums:
+        console.print(
+            f"{'+'.join(total.lights)} minus the sum of the single captures: {total.mean:+.2f} DN on average, scatter "
+            f"{total.spread:.2f} DN where noise explains {total.noise:.2f} DN; offset {total.offset:+.2f} DN"
+        )
+    for text in result.skipped:
+        console.print(f"[dim]{escape(text)}[/]")
+    failed = sum(not item.passed for item in result.items)
+    words = f"[bold red]FAILED[/]: {failed} of {len(result.items)} figures break their limit"
+    console.print("[bold green]PASSED[/]" if result.passed else words)
 
 
 def merged(result: Calibration, out: Path) -> None:

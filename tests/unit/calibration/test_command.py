@@ -151,3 +151,31 @@ def test_registration_of_speckled_captures(run, tmp_path):
     code, _, error = run("registration", *LIGHTS, *STATED, "--out", out + "2", "--region", "here")
     assert code == 2
     assert "--region is x0,y0,x1,y1" in error
+
+
+def test_check_passes_on_held_back_captures_and_fails_on_a_wrong_matrix(run, bench, tmp_path):
+    lights, dark = captures(
+        MATRIX, np.random.default_rng(77), target=speckle_target, shape=(128, 160), count=2, darks=2
+    )
+    for name, frames in {**lights, "dark": dark}.items():
+        (tmp_path / name).mkdir()
+        for index, frame in enumerate(frames):
+            write_tiff(tmp_path / name / f"{index}.tif", frame)
+    good, bad = str(tmp_path / "good.json"), str(tmp_path / "bad.json")
+    assert run("crosstalk", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", good)[0] == 0
+    held_back = ["--dark", str(tmp_path / "dark")]
+    held_back += [part for name in lights for part in ("--light", f"{name}={tmp_path / name}")]
+    code, shown, error = run("check", good, *held_back)
+    assert code == 0, error + shown
+    assert "PASSED" in shown
+    assert "noise was not checked" in shown
+    code, shown, _ = run("check", good, "--dark", "dark/*.tif", *LIGHTS)
+    assert "made the calibration" in " ".join(shown.split())
+    document = json.loads((tmp_path / "good.json").read_text())
+    document["crosstalk"]["matrix"][1][0] += 0.02
+    (tmp_path / "bad.json").write_text(json.dumps(document))
+    code, shown, _ = run("check", bad, *held_back)
+    assert code == 1
+    assert "FAILED" in shown
+    assert run("check", bad, *held_back, "--limit", "leakage=5")[0] == 0
+    assert run("check", good, *held_back, "--together", "red+violet=dark")[0] == 2

@@ -1,0 +1,361 @@
+"""Does a calibration hold on captures that were not used to make it? Leakage, additivity, noise, registration left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.camera_noise import QUANTISATION
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.mosaic import NoiseModel
+from rgbmidic.illumination.registration import Registration
+from rgbmidic_calibration.blocks import BlockMeans, block_centres
+from rgbmidic_calibration.registration import estimate_registration
+from rgbmidic_calibration.stacks import TemporalStack, same_camera
+
+__all__ = [
+    "Additivity",
+    "CheckItem",
+    "Leakage",
+    "Limits",
+    "additivity",
+    "leakage",
+    "noise_ratio",
+    "registration_left",
+]
+
+Floats = npt.NDArray[np.float64]
+
+BLOCK = 16
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What a calibration may leave and still pass.
+
+    Attributes
+    ----------
+    leakage
+        Light left where it should not be, % of the light that is alone.
+    additivity
+        Departure of all lights together from the sum of the single ones, % of the signal, once offset and strengths
+        are taken out.
+    strength
+        Change of a light's strength between the single and the common capture, %.
+    registration
+        Misregistration left anywhere in the frame, px.
+    noise
+        Observed noise against the predicted one, %.
+    """
+
+    leakage: float = 0.3
+    additivity: float = 0.5
+    strength: float = 5.0
+    registration: float = 0.03
+    noise: float = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckItem:
+    """One line of the verdict: a figure, its uncertainty and its limit, all in `unit`."""
+
+    name: str
+    value: float
+    std: float
+    limit: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        """The figure keeps its limit."""
+        return bool(abs(self.value) <= self.limit)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Leakage:
+    """What unmixing leaves of light j (column) in the image of light i (row).
+
+    Attributes
+    ----------
+    lights : tuple of str, length k
+        Lights of the calibration.
+    alone : tuple of str, length m
+        Lights that were captured alone.
+    mean, std : ndarray, shape (k, m)
+        Ratio of the sums over the field, and its standard uncertainty; the light itself gives 1.
+    local : ndarray, shape (k, m)
+        Root mean square over the blocks of the ratio to the light's mean.
+    """
+
+    lights: tuple[str, ...]
+    alone: tuple[str, ...]
+    mean: Floats
+    std: Floats
+    local: Floats
+
+    def items(self, limit: float) -> list[CheckItem]:
+        """One line per pair of lights."""
+        return [
+            CheckItem(
+                name=f"{alone} left in {light}",
+                value=100 * float(self.mean[row, column]),
+                std=100 * float(self.std[row, column]),
+                limit=limit,
+                unit="%",
+            )
+            for column, alone in enumerate(self.alone)
+            for row, light in enumerate(self.lights)
+            if light != alone
+        ]
+
+
+def leakage(
+    crosstalk: Crosstalk, lights: Mapping[str, Sequence[BlockMeans]], dark: Sequence[BlockMeans] = ()
+) -> Leakage:
+    """Unmix captures with one light on and see what is left in the other lights' images.
+
+    Parameters
+    ----------
+    crosstalk
+        The calibration under test.
+    lights
+        Block averages of the captures, by light.
+    dark
+        Block averages of the dark frames; none: the stated black level.
+
+    Raises
+    ------
+    CalibrationError
+        A light that the calibration does not know, or captures that are saturated everywhere.
+    """
+    if unknown := [name for name in lights if name not in crosstalk.lights]:
+        raise CalibrationError(
+            f"the calibration knows the lights {', '.join(crosstalk.lights)}, not {', '.join(unknown)}"
+        )
+    level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
+    columns = [_unmixed(crosstalk, name, captures, level) for name, captures in lights.items()]
+    mean, std, local = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
+    return Leakage(lights=crosstalk.lights, alone=tuple(lights), mean=mean, std=std, local=local)
+
+
+def _unmixed(
+    crosstalk: Crosstalk, name: str, captures: Sequence[BlockMeans], level: npt.NDArray[np.floating] | np.float64
+) -> tuple[Floats, Floats, Floats]:
+    """Ratios (k,) of every light's sum to that of light `name`, their uncertainty and their local spread."""
+    first = captures[0]
+    clear = ~np.any([frame.saturated for frame in captures], axis=0)
+    if clear.sum() < 4:
+        raise CalibrationError(f"light {name}: nearly every block holds saturated samples; shorten the exposure")
+    channels = np.mean([frame.channels for frame in captures], axis=0) - level
+    unmixing = crosstalk.unmixing_at(block_centres(first.shape, first.block))
+    values = np.einsum("rskc,crs->krs", unmixing, channels)[:, clear]
+    own = crosstalk.lights.index(name)
+    total = float(values[own].sum())
+    brightest = int(values.sum(axis=1).argmax())
+    if total <= 0 or brightest != own:
+        raise CalibrationError(
+            f"the captures of light {name} show most light in {crosstalk.lights[brightest]} after unmixing: are the "
+            "captures swapped, was the lamp off, or is the calibration of another camera?"
+        )
+    ratio = values.sum(axis=1) / total
+    scatter = values - ratio[:, None] * values[own]
+    std = np.sqrt((scatter**2).sum(axis=1)) / total
+    local = np.sqrt(((values / values[own].mean()) ** 2).mean(axis=1))
+    return ratio, std, local
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Additivity:
+    """All lights together against the sum of the single ones, ``together - sum = offset + sum of change_j light_j``.
+
+    Attributes
+    ----------
+    lights : tuple of str, length k
+    mean, spread : float
+        Mean and standard deviation of the difference over all samples, DN.
+    noise : float
+        Standard deviation of the difference that the camera's noise explains, DN; rounding alone where the noise is
+        not known.
+    offset : float
+        DN; what a wrong black level leaves.
+    change, change_std : ndarray, shape (k,)
+        Relative change of every light's strength between its own and the common capture.
+    left : float
+        Rms over blocks of what remains, as a share of the mean signal, noise taken out.
+    signal : float
+        Mean of the sum, DN.
+    """
+
+    lights: tuple[str, ...]
+    mean: float
+    spread: float
+    noise: float
+    offset: float
+    change: Floats
+    change_std: Floats
+    left: float
+    signal: float
+
+    def items(self, limits: Limits) -> list[CheckItem]:
+        """Lines of the verdict."""
+        together = "+".join(self.lights)
+        items = [
+            CheckItem(name=f"{together} not the sum", value=100 * self.left, std=0.0, limit=limits.additivity, unit="%")
+        ]
+        for name, change, std in zip(self.lights, self.change, self.change_std, strict=True):
+            items.append(
+                CheckItem(
+                    name=f"strength of {name} in {together}",
+                    value=100 * float(change),
+                    std=100 * float(std),
+                    limit=limits.strength,
+                    unit="%",
+                )
+            )
+        return items
+
+
+def additivity(
+    together: TemporalStack,
+    singles: Mapping[str, TemporalStack],
+    dark: TemporalStack | None = None,
+    *,
+    noise: NoiseModel | None = None,
+) -> Additivity:
+    """Compare captures of several lights together with the sum of their single captures, sample by sample.
+
+    The same scene must be at rest in all of them: a camera that is linear and lamps that do not influence each other
+    give the sum exactly, whatever the crosstalk.
+
+    Parameters
+    ----------
+    together
+        Captures with these lights on.
+    singles
+        Captures of each of them alone.
+    dark
+        Captures with all lights off; none: the stated black level.
+    noise
+        Camera noise; None: from the captures where each group has two or more, else rounding to grey levels alone.
+    """
+    same_camera([together, *singles.values(), *([dark] if dark else [])])
+    images = [_difference(together, singles, dark, plane, noise) for plane in range(len(together.names))]
+    samples = np.concatenate([image[:, np.isfinite(image[0])] for image in images], axis=1)
+    if samples.shape[1] < BLOCK**2:
+        raise CalibrationError("nearly every sample is saturated in one of the captures; shorten the exposure")
+    blocks = np.concatenate([_blocks(image) for image in images], axis=1)
+    difference, variance, lights = blocks[0], blocks[1], blocks[2:]
+    design = np.concatenate([np.ones((1, len(difference))), lights]).T
+    inverse = np.linalg.pinv(design.T @ design)
+    solution = inverse @ (design.T @ difference)
+    residual = difference - design @ solution
+    score = design * residual[:, None]
+    std = np.sqrt(np.diag(inverse @ (score.T @ score) @ inverse))
+    signal = float(lights.sum(axis=0).mean())
+    left = max(float((residual**2).mean() - variance.mean()), 0.0)
+    return Additivity(
+        lights=tuple(singles),
+        mean=float(samples[0].mean()),
+        spread=float(samples[0].std()),
+        noise=float(np.sqrt(samples[1].mean())),
+        offset=float(solution[0]),
+        change=solution[1:],
+        change_std=std[1:],
+        left=float(np.sqrt(left)) / max(signal, 1e-9),
+        signal=signal,
+    )
+
+
+def _difference(
+    together: TemporalStack,
+    singles: Mapping[str, TemporalStack],
+    dark: TemporalStack | None,
+    plane: int,
+    noise: NoiseModel | None,
+) -> Floats:
+    """Difference, its noise variance, and every light's image, (2 + k, h, w) with NaN where saturated, of one plane."""
+    level = dark.mean[plane] if dark else 0.0
+    lights = [stack.mean[plane] - level for stack in singles.values()]
+    stacks = [together, *singles.values()]
+    variance = np.sum([_variance(stack, plane, noise) for stack in stacks], axis=0)
+    if dark:
+        variance = variance + (len(lights) - 1) ** 2 * _variance(dark, plane, noise)
+    rows = np.stack([together.mean[plane] - level - np.sum(lights, axis=0), variance, *lights]).astype(np.float64)
+    rows[:, np.any([stack.clipped[plane] for stack in stacks], axis=0)] = np.nan
+    return rows
+
+
+def _variance(stack: TemporalStack, plane: int, noise: NoiseModel | None) -> npt.NDArray[np.floating]:
+    """Noise variance of the mean over the frames: from the noise model, from the frames themselves, or of rounding."""
+    if noise is not None:
+        return np.asarray(noise.variance(stack.mean[plane]) / stack.count)
+    if stack.count > 1:
+        return np.asarray(stack.variance[plane] / stack.count)
+    return np.full(stack.mean[plane].shape, QUANTISATION)
+
+
+def _blocks(rows: Floats) -> Floats:
+    """Means over blocks without saturated samples, (2 + k, blocks); the variance row becomes that of the mean."""
+    count, height, width = rows.shape
+    size = min(BLOCK, height, width)
+    cut = rows[:, : height // size * size, : width // size * size]
+    means = cut.reshape(count, height // size, size, width // size, size).mean(axis=(2, 4)).reshape(count, -1)
+    means[1] /= size**2
+    return np.asarray(means[:, np.isfinite(means[0])])
+
+
+def registration_left(
+    registration: Registration,
+    lights: Mapping[str, TemporalStack],
+    dark: TemporalStack | None = None,
+    *,
+    region: Sequence[float] | None = None,
+) -> list[tuple[str, float, float]]:
+    """What the registration leaves of captures of a speckled target.
+
+    Returns
+    -------
+    list of (str, float, float)
+        Light, largest displacement left on a grid over the frame (px), and its standard uncertainty there.
+    """
+    ordered = {name: lights[name] for name in registration.lights if name in lights}
+    found = estimate_registration(ordered, dark, region=region).registration
+    height, width = next(iter(ordered.values())).shape
+    x0, y0, x1, y1 = region if region is not None else (0, 0, width - 1, height - 1)
+    grid = np.stack(np.meshgrid(np.linspace(x0, x1, 9), np.linspace(y0, y1, 9)), axis=-1).reshape(-1, 2)
+    known = registration.displacement(grid)[[registration.lights.index(name) for name in ordered]]
+    # The first of the captured lights need not be the calibration's first.
+    left = np.linalg.norm(found.displacement(grid) - (known - known[0]), axis=2)
+    std = found.displacement_std(grid)
+    places = left.argmax(axis=1)
+    errors = (
+        np.zeros(len(left)) if std is None else [float(np.linalg.norm(s[p])) for s, p in zip(std, places, strict=True)]
+    )
+    return [
+        (name, float(value.max()), float(error))
+        for name, value, error in list(zip(ordered, left, errors, strict=True))[1:]
+    ]
+
+
+def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
+    """Observed over predicted noise of captures at rest (standard deviations), and its uncertainty.
+
+    Raises
+    ------
+    CalibrationError
+        Fewer than two captures.
+    """
+    if stack.count < 2:
+        raise CalibrationError("noise needs at least two captures of the same scene")
+    observed = predicted = 0.0
+    samples = 0
+    for mean, variance, clipped in zip(stack.mean, stack.variance, stack.clipped, strict=True):
+        observed += float(variance[~clipped].sum(dtype=np.float64))
+        predicted += float(noise.variance(mean[~clipped]).sum(dtype=np.float64))
+        samples += int((~clipped).sum())
+    ratio = float(np.sqrt(observed / max(predicted, 1e-12)))
+    return ratio, ratio / np.sqrt(2 * max(samples, 1) * (stack.count - 1))

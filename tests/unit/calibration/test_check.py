@@ -1,0 +1,166 @@
+"""`check`: held-back captures pass a good calibration and fail a wrong one; real captures add up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from calibration_scene import BLACK, GAIN, MATRICES, READ, WHITE, captures, expose, registered_pictures, speckle_target
+
+from rgbmidic.errors import CalibrationError, ConfigurationError
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.mosaic import Mosaic, NoiseModel
+from rgbmidic.illumination.registration import Registration, frame_geometry
+from rgbmidic.sequence.readers import read_frame
+from rgbmidic_calibration.blocks import block_means
+from rgbmidic_calibration.stacks import stack_frames
+from rgbmidic_calibration.verdict import read_limits
+from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, registration_left
+
+MATRIX = MATRICES[1.5]
+LIGHTS = ("red", "green", "blue")
+SHAPE = (128, 160)
+LIMITS = Limits()
+
+
+@pytest.fixture(scope="module")
+def held_back():
+    lights, dark = captures(MATRIX, np.random.default_rng(21), target=speckle_target, shape=SHAPE, count=2, darks=2)
+    return {n: [block_means(f) for f in frames] for n, frames in lights.items()}, [block_means(f) for f in dark]
+
+
+def test_true_matrix_leaves_nothing(held_back):
+    found = leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), *held_back)
+    assert np.diag(found.mean) == pytest.approx(1)
+    off = ~np.eye(3, dtype=bool)
+    assert np.abs(found.mean[off]).max() < 0.003
+    assert (np.abs(found.mean[off]) < 5 * found.std[off]).all()
+    assert all(item.passed for item in found.items(LIMITS.leakage))
+
+
+def test_wrong_entry_shows_as_leakage(held_back):
+    wrong = MATRIX.copy()
+    wrong[1, 0] += 0.01
+    found = leakage(Crosstalk(matrix=wrong, lights=LIGHTS), *held_back)
+    expected = -np.linalg.solve(wrong, [0, 0.01, 0])
+    assert found.mean[1:, 0] == pytest.approx(expected[1:], abs=1e-3)
+    failed = [item.name for item in found.items(LIMITS.leakage) if not item.passed]
+    assert failed == ["red left in green"]
+
+
+def test_swapped_and_unknown_lights(held_back):
+    lights, dark = held_back
+    swapped = {"red": lights["green"], "green": lights["red"], "blue": lights["blue"]}
+    with pytest.raises(CalibrationError, match="light red show most light in green"):
+        leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), swapped, dark)
+    with pytest.raises(CalibrationError, match="knows the lights red, green, blue, not violet"):
+        leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), {"violet": lights["red"]}, dark)
+
+
+def scene_of_three(rng, *, bend=0.0, strengths=(1, 1, 1), level=900, count=2):
+    pictures = [level * speckle_target(SHAPE, np.random.default_rng(1)) * (0.8 + 0.2 * i) for i in range(3)]
+    lit = [MATRIX[:, i, None, None] * picture for i, picture in enumerate(pictures)]
+
+    def capture(channels):
+        return expose(channels - bend * channels**2, np.ones(3), rng)
+
+    singles = {name: stack_frames([capture(lit[i]) for _ in range(count)]) for i, name in enumerate(LIGHTS)}
+    total = np.sum([s * image for s, image in zip(strengths, lit, strict=True)], axis=0)
+    dark = stack_frames([capture(0 * total) for _ in range(3)], drifts=False)
+    return stack_frames([capture(total) for _ in range(count)]), singles, dark
+
+
+def test_sum_of_lights_adds_up():
+    found = additivity(*scene_of_three(np.random.default_rng(2)))
+    assert found.mean == pytest.approx(0, abs=0.3)
+    assert found.spread == pytest.approx(found.noise, rel=0.1)
+    assert all(item.passed for item in found.items(LIMITS))
+
+
+def test_noise_of_the_sum_from_the_noise_model():
+    scene = scene_of_three(np.random.default_rng(3), count=1)
+    found = additivity(*scene, noise=NoiseModel(gain=GAIN, read_noise=READ))
+    assert found.spread == pytest.approx(found.noise, rel=0.05)
+
+
+def test_changed_lamp_is_named():
+    found = additivity(*scene_of_three(np.random.default_rng(4), strengths=(1, 1.1, 1)))
+    failed = [item.name for item in found.items(LIMITS) if not item.passed]
+    assert failed == ["strength of green in red+green+blue"]
+    assert found.change[1] == pytest.approx(0.1, abs=0.01)
+
+
+def test_bent_camera_does_not_add_up():
+    found = additivity(*scene_of_three(np.random.default_rng(5), bend=1e-4))
+    assert not all(item.passed for item in found.items(LIMITS))
+
+
+def test_offset_is_told_from_light():
+    together, singles, _ = scene_of_three(np.random.default_rng(6))
+    lifted = {n: stack_frames([lift(s) for s in two_frames(stack)]) for n, stack in singles.items()}
+    found = additivity(stack_frames([lift(f) for f in two_frames(together)]), lifted)
+    assert found.offset == pytest.approx(2 * BLACK, abs=1)  # three black levels in the sum, one in the other
+    assert np.abs(found.change).max() < 0.01
+
+
+def two_frames(stack):
+    values = np.empty(stack.shape, np.uint16)
+    for (row, column), mean in zip(stack.origins, stack.mean, strict=True):
+        values[row::2, column::2] = np.rint(mean + BLACK)
+    return [values]
+
+
+def lift(values):
+    return Mosaic(values=values, cfa="RGGB", black_level=2 * BLACK, white_level=WHITE)
+
+
+def test_noise_against_prediction():
+    stack = scene_of_three(np.random.default_rng(7))[0]
+    ratio, std = noise_ratio(stack, NoiseModel(gain=GAIN, read_noise=np.sqrt(READ**2 + 1 / 12)))
+    assert ratio == pytest.approx(1, abs=4 * std)
+    assert noise_ratio(stack, NoiseModel(gain=2 * GAIN, read_noise=READ))[0] > 1.2
+    with pytest.raises(CalibrationError, match="at least two"):
+        noise_ratio(scene_of_three(np.random.default_rng(7), count=1)[0], NoiseModel(gain=GAIN, read_noise=READ))
+
+
+def test_registration_left():
+    shape = (200, 200)
+    centre, radius = frame_geometry(shape)
+    parameters = np.array([[0] * 5, [0.2, -0.1, 0, 5e-4, 0], [-0.3, 0.1, 1e-4, -8e-4, 2e-4]])
+    truth = Registration(lights=LIGHTS, parameters=parameters, centre=centre, radius=radius)
+    rng = np.random.default_rng(8)
+    stacks = {
+        name: stack_frames([expose(3000 * picture, MATRIX[:, i], rng) for _ in range(2)])
+        for i, (name, picture) in enumerate(zip(LIGHTS, registered_pictures(truth, shape, 3), strict=True))
+    }
+    assert all(left < 0.03 for _, left, _ in registration_left(truth, stacks))
+    none = Registration.identity(LIGHTS, shape)
+    assert [left > 0.1 for _, left, _ in registration_left(none, stacks)] == [True, True]
+    two = registration_left(truth, {"green": stacks["green"], "blue": stacks["blue"]})
+    assert [name for name, *_ in two] == ["blue"]
+    assert two[0][1] < 0.03
+
+
+def test_limits_from_options():
+    assert read_limits(["leakage=1", "registration=0.1"]) == Limits(leakage=1, registration=0.1)
+    for text in ("leakage", "leakage=-1", "colour=1", "leakage=x"):
+        with pytest.raises(ConfigurationError, match="--limit takes NAME=VALUE"):
+            read_limits([text])
+
+
+@pytest.mark.parametrize(
+    ("together", "single", "mean", "spread"), [("03", ("01", "02"), 0.17, 0.86), ("07", ("01", "02", "04"), 0.33, 1.05)]
+)
+def test_coin_captures_add_up(shared_data, together, single, mean, spread):
+    """Real single-light captures and their sums: 8 bit, dim (10 to 17 DN), one frame each, no dark frames."""
+    folder = shared_data / "multilight_raw_coin_italy"
+
+    def stack(number):
+        frame = read_frame(folder / f"I_{number}.png", kind="bayer", cfa="RGGB", black_level=0, white_level=255)
+        middle = Mosaic(values=frame.values[600:2200, 1000:2600], cfa="RGGB", black_level=0, white_level=255)
+        return stack_frames([middle])
+
+    found = additivity(stack(together), {number: stack(number) for number in single})
+    assert abs(found.mean) < 2.5 * mean
+    assert found.spread < 2 * spread
+    assert found.left < 0.03
+    assert np.abs(found.change).max() < 0.05
