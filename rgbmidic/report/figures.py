@@ -145,7 +145,7 @@ def convergence_figure(result: Result) -> Figure:
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         _finish_plot(axis, "iteration", "largest motion of a node (px)")
         if len(records) <= _MANY_FRAMES:
-            axis.legend(loc="upper right")
+            figure.legend(loc="outside right upper")
 
     return _figure(draw, count=1, aspect=0.6, colour_bars=False)
 
@@ -173,7 +173,7 @@ def _figure(
 
     stacked = aspect < 0.5 and count > 1
     rows, columns = (count, 1) if stacked else (1, count)
-    width = min(_WIDTH, 4.5 * columns) / columns
+    width = min(_WIDTH, max(6.0, 4.5 * columns)) / columns
     height = (width * (0.8 if colour_bars else 0.9) * aspect + 0.55) * rows + (0.3 if title else 0)
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(width * columns, min(height, 9.5)), layout="compressed")
