@@ -184,6 +184,36 @@ def check(
 
 
 @app.command()
+def design(
+    camera: Annotated[
+        str,
+        typer.Option(help="FILE.json (rawtoaces), FILE.csv, FILE.csv#NAME, or a camera of colour-science."),
+    ],
+    light: Annotated[
+        list[str],
+        typer.Option(help="NAME=CENTRE:WIDTH in nm, NAME=FILE.csv[#COLUMN], or NAME=source of colour-science."),
+    ],
+    choose: Annotated[int, typer.Option(help="Lamps in a set; of more candidates the best sets are found.")] = 3,
+    show_sets: Annotated[int, typer.Option("--sets", help="How many of the best sets to list.")] = 5,
+    picture: Annotated[Path | None, typer.Option(help="Picture of spectra and matrix of the best set.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Before buying lamps: the crosstalk, condition number and noise that spectra predict, and the best set."""
+    from rgbmidic_calibration import design as designs
+    from rgbmidic_calibration import display
+    from rgbmidic_calibration.captures import check_output, named_patterns
+
+    if picture is not None:
+        check_output(picture, overwrite=overwrite, option="--picture")
+    lamps = {name: designs.read_lamp(text) for name, text in named_patterns(light, "--light").items()}
+    sensitivities = designs.read_camera(camera)
+    found = designs.best_sets(sensitivities, lamps, min(choose, len(lamps)))
+    display.designs(found[:show_sets])
+    if picture is not None:
+        designs.draw_design(found[0], sensitivities, lamps, picture)
+
+
+@app.command()
 def merge(
     files: Annotated[list[Path], typer.Argument(help="Calibration files; every section from one of them.")],
     out: Out = Path("calibration.json"),

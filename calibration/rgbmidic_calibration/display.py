@@ -15,11 +15,12 @@ from rgbmidic.illumination.camera_noise import CameraNoise, Quantity
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.registration import Registration
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
+from rgbmidic_calibration.design import Design
 from rgbmidic_calibration.noise import NoiseEstimate
 from rgbmidic_calibration.registration import RegistrationEstimate
 from rgbmidic_calibration.verdict import Verdict
 
-__all__ = ["calibration", "crosstalk", "merged", "noise", "registration", "registration_table", "verdict"]
+__all__ = ["calibration", "crosstalk", "designs", "merged", "noise", "registration", "registration_table", "verdict"]
 
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
@@ -83,6 +84,28 @@ def verdict(result: Verdict) -> None:
     failed = sum(not item.passed for item in result.items)
     words = f"[bold red]FAILED[/]: {failed} of {len(result.items)} figures break their limit"
     console.print("[bold green]PASSED[/]" if result.passed else words)
+
+
+def designs(found: Sequence[Design]) -> None:
+    """Print the predicted matrix of the best set of lamps, and how the other sets compare."""
+    console = _console()
+    best = found[0]
+    table = _matrix_table(best.crosstalk)
+    table.title = "Predicted crosstalk of the best set" if len(found) > 1 else "Predicted crosstalk"
+    table.add_row("relative lamp power", *(f"{value:.2f}" for value in best.power))
+    console.print(table)
+    console.print(_matrix_words(best.crosstalk))
+    console.print(f"with all lights on, each may reach {100 * best.headroom:.0f} % of full scale")
+    if len(found) == 1:
+        return
+    ranking = Table(title="Sets of lamps, least noise first", title_justify="left")
+    for head in ("lamps", "condition number", "noise amplification"):
+        ranking.add_column(head)
+    for candidate in found:
+        crosstalk = candidate.crosstalk
+        amplification = " ".join(f"{value:.2f}" for value in crosstalk.noise_amplification)
+        ranking.add_row(escape(", ".join(crosstalk.lights)), f"{crosstalk.condition_number:.2f}", amplification)
+    console.print(ranking)
 
 
 def merged(result: Calibration, out: Path) -> None:

@@ -179,3 +179,18 @@ def test_check_passes_on_held_back_captures_and_fails_on_a_wrong_matrix(run, ben
     assert "FAILED" in shown
     assert run("check", bad, *held_back, "--limit", "leakage=5")[0] == 0
     assert run("check", good, *held_back, "--together", "red+violet=dark")[0] == 2
+
+
+def test_design_lists_the_best_set(run, tmp_path):
+    rows = [f"{nm},{int(nm >= 600)},{int(500 <= nm < 600)},{int(nm < 500)}" for nm in range(400, 700, 10)]
+    (tmp_path / "camera.csv").write_text("\n".join(["nm,R,G,B", *rows]))
+    lamps = ["--light", "red=640:18", "--light", "green=540:30", "--light", "blue=460:20", "--light", "amber=600:18"]
+    picture = str(tmp_path / "d.png")
+    code, shown, error = run("design", "--camera", str(tmp_path / "camera.csv"), *lamps, "--picture", picture)
+    assert code == 0, error
+    assert "red, green, blue" in shown
+    assert shown.index("red, green, blue") < shown.index("amber")
+    assert (tmp_path / "d.png").is_file()
+    code, _, error = run("design", "--camera", "no.json", *lamps)
+    assert code == 2
+    assert "not found" in error

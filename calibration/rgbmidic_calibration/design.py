@@ -1,0 +1,235 @@
+"""Before buying lamps: the crosstalk that camera sensitivities and lamp spectra predict, and the best set of lamps.
+
+``response[c, l] = sum over wavelengths of S_c E_l``; every column divided by its largest entry is the predicted A. What
+the lamps reflect on (paint, specimen) is taken as grey.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.virtual.spectra import Led, Sensitivities
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["Design", "Lamp", "MeasuredLamp", "best_sets", "design", "draw_design", "read_camera", "read_lamp"]
+
+Floats = npt.NDArray[np.float64]
+
+
+UNSEEN = 1e-3
+"""Response to a lamp, relative to that to the best wavelength, below which the camera does not see it."""
+
+
+class Lamp(Protocol):
+    """Anything with a spectrum."""
+
+    def power(self, wavelengths: Floats) -> Floats:
+        """Spectral power at equally spaced wavelengths (nm), of unit sum."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredLamp:
+    """A lamp with a measured spectrum.
+
+    Attributes
+    ----------
+    wavelengths : ndarray, shape (n,)
+        Rising, nm.
+    values : ndarray, shape (n,)
+        Power per nm, any unit.
+    """
+
+    wavelengths: Floats
+    values: Floats
+
+    def __post_init__(self) -> None:
+        wavelengths = np.asarray(self.wavelengths, dtype=np.float64)
+        values = np.maximum(np.asarray(self.values, dtype=np.float64), 0)
+        rising = wavelengths.ndim == 1 and wavelengths.size > 1 and (np.diff(wavelengths) > 0).all()
+        if not (rising and values.shape == wavelengths.shape and np.isfinite(values).all() and values.max() > 0):
+            raise InputError("a spectrum needs rising wavelengths and as many finite values, not all zero")
+        object.__setattr__(self, "wavelengths", wavelengths)
+        object.__setattr__(self, "values", values)
+
+    def power(self, wavelengths: Floats) -> Floats:
+        """Spectral power at equally spaced wavelengths (nm), of unit sum; zero outside the measured range."""
+        values = np.interp(wavelengths, self.wavelengths, self.values, left=0.0, right=0.0)
+        if not values.sum() > 0:
+            raise InputError(f"the lamp emits nothing within {wavelengths[0]:g} to {wavelengths[-1]:g} nm")
+        return np.asarray(values / values.sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Design:
+    """What a camera makes of a set of lamps.
+
+    Attributes
+    ----------
+    crosstalk : Crosstalk
+        Predicted A.
+    response : ndarray, shape (3, k)
+        Response of every channel to every lamp of unit radiant power.
+    power : ndarray, shape (k,)
+        Radiant power that every lamp needs for equal grey levels, relative to the largest.
+    headroom : float
+        Grey level that each light may reach when all shine, as a share of full scale: the fullest channel just
+        saturates.
+    """
+
+    crosstalk: Crosstalk
+    response: Floats
+    power: Floats
+    headroom: float
+
+    @property
+    def noise(self) -> float:
+        """Root mean square of the lights' noise amplification: what the sets are ranked by."""
+        return float(np.sqrt((self.crosstalk.noise_amplification**2).mean()))
+
+
+def design(camera: Sensitivities, lamps: Mapping[str, Lamp]) -> Design:
+    """Predict the crosstalk of a camera under a set of lamps.
+
+    Raises
+    ------
+    CalibrationError
+        The camera cannot tell the lamps apart, or does not see one of them.
+    """
+    spectra = np.stack([lamp.power(camera.wavelengths) for lamp in lamps.values()], axis=1)
+    response = camera.values @ spectra
+    seen = response.max(axis=0)
+    if unseen := [name for name, value in zip(lamps, seen, strict=True) if value < UNSEEN * camera.values.max()]:
+        raise CalibrationError(f"the camera does not see {', '.join(unseen)}")
+    crosstalk = Crosstalk(matrix=response / seen, lights=tuple(lamps))
+    return Design(
+        crosstalk=crosstalk,
+        response=response,
+        power=(1 / seen) / (1 / seen).max(),
+        headroom=float(1 / crosstalk.matrix.sum(axis=1).max()),
+    )
+
+
+def best_sets(camera: Sensitivities, lamps: Mapping[str, Lamp], count: int = 3) -> list[Design]:
+    """All sets of `count` lamps that the camera can tell apart, those with the least noise first.
+
+    Raises
+    ------
+    CalibrationError
+        Fewer lamps than wanted, or no set that works.
+    """
+    if not 1 <= count <= 3 or len(lamps) < count:
+        raise CalibrationError(f"cannot choose {count} of {len(lamps)} lamps: a colour camera separates one to three")
+    found = []
+    for names in combinations(lamps, count):
+        try:
+            found.append(design(camera, {name: lamps[name] for name in names}))
+        except CalibrationError:  # a set that cannot be told apart is no candidate
+            continue
+    if not found:
+        raise CalibrationError("the camera can tell no set of these lamps apart")
+    return sorted(found, key=lambda candidate: candidate.noise)
+
+
+def read_lamp(text: str) -> Lamp:
+    """A lamp from CENTRE or CENTRE:WIDTH in nm, FILE.csv, FILE.csv#COLUMN, or a name that colour-science knows.
+
+    Raises
+    ------
+    ConfigurationError
+        The text is none of these.
+    """
+    centre, _, width = text.partition(":")
+    try:
+        return Led(centre=float(centre), width=float(width) if width else 25.0)
+    except InputError:
+        raise
+    except ValueError:
+        pass
+    if ".csv" in text.lower():
+        wavelengths, columns = _read_table(text)
+        return MeasuredLamp(wavelengths=wavelengths, values=columns[0])
+    return _lamp_of_colour(text)
+
+
+def read_camera(text: str) -> Sensitivities:
+    """Camera sensitivities from FILE.json (rawtoaces), FILE.csv, FILE.csv#NAME, or a name that colour-science knows.
+
+    ``FILE.csv#NAME`` takes the columns ``NAME R``, ``NAME G`` and ``NAME B``.
+    """
+    if "#" in text:
+        wavelengths, columns = _read_table(text, (" R", " G", " B"))
+        return Sensitivities(wavelengths=wavelengths, values=np.maximum(columns, 0))
+    if Path(text).suffix.lower() in (".json", ".csv"):
+        return Sensitivities.read(text)
+    return Sensitivities.from_colour(text)
+
+
+def _lamp_of_colour(name: str) -> MeasuredLamp:
+    import colour
+
+    known = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
+    if name not in known:
+        leds = ", ".join(sorted(key for key in known if "LED" in key))
+        raise ConfigurationError(
+            f"a lamp is CENTRE:WIDTH in nm, a CSV file, or a light source of colour-science ({leds} ...), not {name!r}"
+        )
+    return MeasuredLamp(wavelengths=known[name].wavelengths, values=known[name].values)
+
+
+def _read_table(text: str, endings: Sequence[str] = ("",)) -> tuple[Floats, Floats]:
+    """Wavelengths and the columns that a text FILE.csv#NAME means, shape (columns, n)."""
+    file, _, column = text.partition("#")
+    try:
+        with Path(file).open(newline="", encoding="utf-8") as stream:
+            rows = [row for row in csv.reader(stream) if row]
+        head = [] if _is_number(rows[0][0]) else [cell.strip() for cell in rows.pop(0)]
+        table = np.array(rows, dtype=np.float64).T
+    except FileNotFoundError:
+        raise ConfigurationError(f"file of spectra not found: {file}") from None
+    except (OSError, ValueError, IndexError) as error:
+        raise ConfigurationError(f"{file} is not a table of numbers with the wavelength first: {error}") from None
+    names = [column + ending for ending in endings]
+    if column and not set(names) <= set(head):
+        raise ConfigurationError(
+            f"{file} has no column {', '.join(names)}; it has {', '.join(head[1:]) or 'no heading'}"
+        )
+    if table.ndim != 2 or len(table) < 2:
+        raise ConfigurationError(f"{file} needs a column of wavelengths and at least one more")
+    return table[0], table[[head.index(name) for name in names] if column else [1]]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def draw_design(result: Design, camera: Sensitivities, lamps: Mapping[str, Lamp], path: Path) -> None:
+    """Picture of the spectra over the camera's sensitivities, and of the predicted matrix."""
+    from rgbmidic_calibration.pictures import draw_matrix, save
+
+    def spectra(axes: Axes) -> None:
+        for name, values, colour in zip("RGB", camera.values, ("#c0392b", "#27823b", "#2457a6"), strict=True):
+            axes.plot(camera.wavelengths, values / camera.values.max(), color=colour, label=f"camera {name}")
+        for name in result.crosstalk.lights:
+            power = lamps[name].power(camera.wavelengths)
+            axes.fill_between(camera.wavelengths, power / power.max(), alpha=0.25, label=name)
+        axes.set(xlabel="wavelength, nm", ylabel="relative")
+        axes.legend(fontsize="small")
+
+    save([spectra, lambda axes: draw_matrix(axes, result.crosstalk)], path)

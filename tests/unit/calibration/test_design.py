@@ -1,0 +1,128 @@
+"""`design`: predicted crosstalk of real cameras under LEDs, the best set of lamps, and what cannot be told apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
+from rgbmidic.virtual.spectra import Led, Sensitivities
+from rgbmidic_calibration.design import MeasuredLamp, best_sets, design, draw_design, read_camera, read_lamp
+
+LEDS = {"red": Led(centre=630, width=18), "green": Led(centre=525, width=30), "blue": Led(centre=465, width=20)}
+LOWEST, HIGHEST = 1.55, 3.55
+"""Condition numbers of the nine shared cameras under LEDs of equal peak power, rows divided by the diagonal."""
+
+
+def boxes():
+    """A camera whose channels are boxes 600-700, 500-600, 400-500 nm."""
+    wavelengths = np.arange(380, 781, 5.0)
+    edges = ((600, 700), (500, 600), (400, 500))
+    return Sensitivities(
+        wavelengths=wavelengths,
+        values=np.array([(wavelengths >= a) & (wavelengths < b) for a, b in edges], dtype=float),
+    )
+
+
+def test_lamps_inside_the_boxes_have_no_crosstalk():
+    lamps = {name: Led(centre=centre, width=15) for name, centre in (("red", 650), ("green", 550), ("blue", 450))}
+    found = design(boxes(), lamps)
+    assert found.crosstalk.matrix == pytest.approx(np.eye(3), abs=0.01)
+    assert found.crosstalk.condition_number == pytest.approx(1, abs=0.02)
+    assert found.power == pytest.approx(np.ones(3), abs=0.02)
+    assert found.headroom == pytest.approx(1, abs=0.02)
+
+
+def test_lamp_on_the_border_of_two_boxes_is_shared():
+    found = design(boxes(), {"red": Led(centre=650, width=5), "amber": Led(centre=597.5, width=5)})
+    assert found.crosstalk.matrix[:2, 1] == pytest.approx(1, abs=0.02)
+    assert found.headroom == pytest.approx(0.5, abs=0.01)
+
+
+def test_best_set_of_candidates():
+    lamps = {**LEDS, "amber": Led(centre=595, width=18), "cyan": Led(centre=500, width=30)}
+    found = best_sets(boxes(), lamps)
+    assert 6 <= len(found) <= 10
+    assert set(found[0].crosstalk.lights) == {"red", "green", "blue"}
+    assert [candidate.noise for candidate in found] == sorted(candidate.noise for candidate in found)
+
+
+def test_what_cannot_be_told_apart():
+    twins = {"one": Led(centre=640, width=18), "two": Led(centre=641, width=18)}
+    with pytest.raises(CalibrationError, match="no set of these lamps"):
+        best_sets(boxes(), twins, 2)
+    with pytest.raises(CalibrationError, match="does not see infrared"):
+        design(boxes(), {"infrared": Led(centre=760, width=5)})
+    with pytest.raises(CalibrationError, match="cannot choose 3 of 2"):
+        best_sets(boxes(), twins, 3)
+
+
+def test_lamps_and_cameras_from_text(tmp_path):
+    assert read_lamp("630:18") == LEDS["red"]
+    assert read_lamp("525").width == 25
+    (tmp_path / "lamp.csv").write_text("nm,a,b\n400,0,1\n500,1,1\n600,0,1\n")
+    one, other = (read_lamp(str(tmp_path / "lamp.csv") + column) for column in ("", "#b"))
+    wavelengths = np.arange(400, 601, 50.0)
+    assert one.power(wavelengths) == pytest.approx(np.array([0, 0.5, 1, 0.5, 0]) / 2)
+    assert other.power(wavelengths) == pytest.approx(np.full(5, 0.2))
+    (tmp_path / "camera.csv").write_text("nm,x R,x G,x B\n400,0,0,1\n500,0,1,-1e-19\n600,1,0,0\n")
+    assert read_camera(f"{tmp_path / 'camera.csv'}#x").values.min() == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "message"),
+    [
+        ("nothing.csv", ConfigurationError, "file of spectra not found"),
+        ("5000:10", InputError, "200 to 1200 nm"),
+        ("lava lamp", ConfigurationError, "a lamp is CENTRE:WIDTH"),
+    ],
+)
+def test_lamps_that_are_none(text, error, message):
+    with pytest.raises(error, match=message):
+        read_lamp(text)
+
+
+def test_tables_that_are_none(tmp_path):
+    (tmp_path / "bad.csv").write_text("nm,a\n400,x\n")
+    with pytest.raises(ConfigurationError, match="not a table of numbers"):
+        read_lamp(str(tmp_path / "bad.csv"))
+    (tmp_path / "good.csv").write_text("nm,a\n400,1\n500,1\n")
+    with pytest.raises(ConfigurationError, match="has no column c; it has a"):
+        read_lamp(f"{tmp_path / 'good.csv'}#c")
+    with pytest.raises(InputError, match="rising wavelengths"):
+        MeasuredLamp(wavelengths=[2, 1], values=[1, 1])
+
+
+def test_picture(tmp_path):
+    draw_design(design(boxes(), LEDS), boxes(), LEDS, tmp_path / "d.png")
+    assert (tmp_path / "d.png").stat().st_size > 10_000
+
+
+def rows_by_diagonal(camera):
+    """Matrix for LEDs of equal peak power with every row divided by its diagonal."""
+    found = design(camera, LEDS)
+    peak = np.array([1 / lamp.power(camera.wavelengths).max() for lamp in LEDS.values()])
+    response = found.response * peak
+    return response / np.diag(response)[:, None]
+
+
+def test_nine_real_cameras(shared_data):
+    files = sorted((shared_data / "camera_sensitivities").glob("*.json"))
+    assert len(files) == 9
+    for file in files:
+        camera = read_camera(str(file))
+        assert LOWEST < np.linalg.cond(rows_by_diagonal(camera)) < HIGHEST
+        found = design(camera, LEDS).crosstalk
+        assert 1.5 < found.condition_number < 2.6
+        assert (found.matrix.argmax(axis=0) == [0, 1, 2]).all()
+
+
+def test_nikon_5100_of_two_sources(shared_data):
+    expected = [[1, 0.27, 0.09], [0.04, 1, 0.24], [0, 0.39, 1]]
+    from_json = read_camera(str(shared_data / "camera_sensitivities" / "nikon_d5100_380_780_5.json"))
+    table = shared_data / "led_and_camera_spectra" / "colour_science_0.4.7_spectra.csv"
+    from_csv = read_camera(f"{table}#Nikon 5100 (NPL)")
+    for camera in (from_json, from_csv):
+        assert rows_by_diagonal(camera) == pytest.approx(np.array(expected), abs=0.01)
+    measured = read_lamp(f"{table}#Ohno2005_red_630_18").power(from_csv.wavelengths)
+    assert measured == pytest.approx(LEDS["red"].power(from_csv.wavelengths), abs=1e-4)
