@@ -87,6 +87,7 @@ def measure(
         names=[frames.name(index) for index in range(len(frames))],
         lights=images.names,
         settings=settings,
+        reference=images.values,
         overwrite=overwrite,
     )
     last: FloatArray | None = None
@@ -133,9 +134,7 @@ def _measure_frame(
         deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
         alone = settings.frames.reference == (index,)
         start = np.zeros((nodes, 2)) if alone else last
-        solution = track(
-            reference, deformed, start, _options(settings), search_radius=settings.solver.search_radius
-        )
+        solution = track(reference, deformed, start, _options(settings), search_radius=settings.solver.search_radius)
         inputs = frames.hashes(index)
     except RgbmidicError as error:
         logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)

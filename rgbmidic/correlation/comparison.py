@@ -17,9 +17,10 @@ __all__ = ["Comparison"]
 FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 
-_MATCHED = 0.4
-"""Correlation coefficient under which the images of an element do not match; the element then carries no weight
-until its neighbours have brought it to a displacement at which they do."""
+_MATCHED = (0.4, 0.6)
+"""Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
+_WORSE = 8.0
+"""In between: how many times farther from 1 than the median of the elements."""
 _FREEDOM = 4.0
 """Degrees of freedom of the Student distribution taken for the residual."""
 _RANGE = 8.0
@@ -54,12 +55,13 @@ class Comparison:
     @property
     def residual(self) -> FloatImage:
         """f - g(x + u), shape (k, P); 0 where g is not known."""
-        return np.nan_to_num(self.values - self.warped, nan=0.0)
+        return np.asarray(np.nan_to_num(self.values - self.warped, nan=0.0), dtype=np.float32)
 
-    def matched(self) -> npt.NDArray[np.bool_]:
+    def matched(self, least: float | None = None) -> npt.NDArray[np.bool_]:
         """Elements (E,) whose images match: zero-mean correlation coefficient of all lights together.
 
-        Elements without weight or texture say nothing and count as matched.
+        Elements without weight or texture in the reference say nothing and count as matched. `least` is the
+        coefficient from which an element matches; None judges it by what the others reach.
         """
         mesh = self.reference.mesh
         moments = np.zeros((len(mesh.elements), 6))
@@ -74,7 +76,12 @@ class Comparison:
         own = _correlation(fg, ff, gg)
         # a few speckles can match by chance; those of all elements around a node hardly
         around = _correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
-        return np.asarray(np.minimum(own, np.median(around[mesh.elements], axis=1)) >= _MATCHED)
+        coefficient = np.minimum(own, np.median(around[mesh.elements], axis=1))
+        if least is None:
+            textured = coefficient[ff > 0]
+            typical = float(np.median(textured)) if textured.size else 1.0
+            least = float(np.clip(1 - _WORSE * (1 - typical), *_MATCHED))
+        return np.asarray(coefficient >= least)
 
     def brightness(self, kind: str) -> FloatImage:
         """Reference grey levels (k, P) brought to the brightness and contrast of the deformed images.
@@ -92,12 +99,12 @@ class Comparison:
         total = weight.sum()
         if not total:
             return f
-        g = np.nan_to_num(g)
+        g = np.asarray(np.nan_to_num(g))
         mean_f, mean_g = (weight * f).sum() / total, (weight * g).sum() / total
         # both images carry the same noise: the ratio of the deviations is not attenuated by it
         spread_f, spread_g = (float((weight * (i - m) ** 2).sum()) for i, m in ((f, mean_f), (g, mean_g)))
         gain = np.sqrt(spread_f / spread_g) if spread_f > 0 and spread_g > 0 else 1.0
-        return np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32)
+        return np.asarray((f - mean_f) / gain + mean_g).astype(np.float32)
 
     def _local(self, light: int) -> FloatImage:
         reference, pixels = self.reference, self.reference.pixels
@@ -118,7 +125,7 @@ class Comparison:
             nodal, reference.mesh.elements, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, fields
         )
         gain = np.maximum(fields[0] / np.float32(scale), np.float32(0.05))
-        return np.asarray((f - fields[1]) / gain, dtype=np.float32)
+        return np.asarray((f - fields[1]) / gain).astype(np.float32)
 
     def precision(self) -> tuple[FloatImage, FloatImage]:
         """Factor (k, P) on the weights: inverse variance of the residual around each pixel, and robust at the pixel;
@@ -134,7 +141,8 @@ class Comparison:
         typical = float(np.median(variance[seen][:: max(1, int(seen.sum()) // 100_000)])) if seen.any() else 0.0
         if typical <= 0:
             return np.ones_like(self.weights), np.ones_like(self.weights)
-        variance = np.maximum(variance, 0.1 * typical)
+        texture = float(np.var(self.values[seen], dtype=np.float64))
+        variance = np.maximum(variance, np.float32(max(0.1 * typical, 1e-6 * texture)))
         ratio = squares / variance
         robust = (_FREEDOM + 1) / (_FREEDOM + ratio)
         bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
@@ -144,7 +152,7 @@ class Comparison:
         pixels = self.reference.pixels
         total = _blur(pixels.scatter(values * weight), _RANGE)
         share = _blur(pixels.scatter(weight), _RANGE)
-        return pixels.gather(total / np.maximum(share, np.float32(1e-6)))
+        return pixels.gather(np.asarray(total / np.maximum(share, np.float32(1e-6)), dtype=np.float32))
 
     def score_covariance(self, step_weights: FloatImage, measured: int) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side, from the residual itself.
@@ -158,15 +166,17 @@ class Comparison:
         for light, (weight, residual) in enumerate(zip(step_weights, self.residual, strict=True)):
             score[0] += weight * residual * reference.gradient_x[light]
             score[1] += weight * residual * reference.gradient_y[light]
-        used = pixels.scatter(step_weights.any(axis=0).astype(np.float32))
+        used = pixels.scatter(np.asarray(step_weights.any(axis=0), dtype=np.float32))
         area = float(_BLOCK**2)
-        sums = [area * cv2.blur(pixels.scatter(q), (_BLOCK, _BLOCK)) for q in score]
-        count = _blur(area * cv2.blur(used, (_BLOCK, _BLOCK)), _SCORE_RANGE)
+        sums = [_block_sum(pixels.scatter(q)) for q in score]
+        count = _blur(_block_sum(used), _SCORE_RANGE)
         fitted = min(area * measured / max(float(used.sum()), 1.0), 0.75)
         floor = np.float32(1e-3 * area)
         products = (sums[0] * sums[0], sums[0] * sums[1], sums[1] * sums[1])
         xx, xy, yy = (
-            pixels.gather(_blur(p, _SCORE_RANGE) / np.maximum(count, floor)) / np.float32(1 - fitted) for p in products
+            pixels.gather(np.asarray(_blur(p, _SCORE_RANGE) / np.maximum(count, floor), dtype=np.float32))
+            / np.float32(1 - fitted)
+            for p in products
         )
         # the kernel takes squares of vectors: the covariance is the sum of two
         first = np.sqrt(np.maximum(xx, 0))
@@ -176,12 +186,18 @@ class Comparison:
         return reference.blocks(one, first, along) + reference.blocks(one, np.zeros_like(rest), rest)
 
 
+def _block_sum(image: FloatImage) -> FloatImage:
+    return np.asarray(cv2.boxFilter(image, -1, (_BLOCK, _BLOCK), normalize=False), dtype=np.float32)
+
+
 def _blur(image: FloatImage, sigma: float) -> FloatImage:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT), dtype=np.float32)
 
 
 def _correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
-    """Correlation coefficient from centred products; 1 where there is nothing to compare."""
+    """Correlation coefficient from centred products; 1 where the reference has nothing to compare, 0 where only the
+    deformed image has nothing."""
+    empty = ff <= 1e-9 * ff.max(initial=0.0)
+    blank = gg <= 1e-9 * ff
     scale = np.sqrt(np.maximum(ff, 0) * np.maximum(gg, 0))
-    empty = scale <= 1e-9 * scale.max(initial=0.0)
-    return np.where(empty, 1.0, fg / np.where(empty, 1.0, scale))
+    return np.where(empty, 1.0, np.where(blank, 0.0, fg / np.where(empty | blank, 1.0, scale)))

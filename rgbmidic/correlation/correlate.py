@@ -33,7 +33,7 @@ def correlate(
     prefilter: str = "binomial",
     normalise: float | None = None,
     brightness: str = "none",
-    statistics: bool = False,
+    statistics: bool = True,
     curvature: bool = False,
     rigid: str = "none",
     search_radius: float = 64.0,

@@ -3,7 +3,8 @@
 A least-squares fit of linear elements to a curved field passes above and below it: its nodes are off by about
 ``h^2/12`` times the second derivative (on a sphere turned by 8 degrees 0.02 px with 25 px elements, several times the
 noise). The second derivatives are recovered from the solution; the deviation of the curved field from its linear
-interpolant is projected like any other residual and taken off the nodal values, which then are those of the curved field; between the nodes it is not linear any more.
+interpolant is projected like any other residual and taken off the nodal values, which then are those of the curved
+field; between the nodes that field is not linear any more.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 __all__ = ["Deformed", "Reference"]
 
+_Array = npt.NDArray[Any]
 FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 
@@ -94,6 +95,8 @@ class Reference:
         if region.mask.shape != images.shape[1:]:
             raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
         ready, usable = _prepare(images, weights, prefilter)
+        if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
+            usable = usable * usable_pixels(region.mask, prefilter)
         pixels = PixelMap.from_mesh(mesh, region)
         samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
         return cls(
@@ -155,7 +158,7 @@ class Reference:
         )
         return self.equations.vector(parts), np.asarray(sums.sum(axis=0))
 
-    def _geometry(self) -> tuple[npt.NDArray[Any], ...]:
+    def _geometry(self) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array]:
         pixels = self.pixels
         return (
             pixels.local_x,
@@ -170,9 +173,9 @@ class Reference:
 def _prepare(images: FloatImage, weights: FloatImage | None, prefilter: str) -> tuple[FloatImage, FloatImage]:
     """Filtered images without holes, and the weight of each pixel, 0 where it or its neighbourhood is invalid."""
     valid = np.isfinite(images)
-    ready = np.stack(
-        [apply_prefilter(fill_holes(image, known), prefilter) for image, known in zip(images, valid, strict=True)]
-    )
+    if weights is not None:
+        valid &= weights > 0
+    ready = np.stack([apply_prefilter(fill_holes(image, np.isfinite(image)), prefilter) for image in images])
     usable = np.stack([usable_pixels(known, prefilter) for known in valid]).astype(np.float32)
     return ready, usable if weights is None else usable * weights
 

@@ -57,7 +57,8 @@ class Solution:
         Weighted rms of ``f - g(x + u)`` of each light, in grey levels of the filtered images; NaN where a light has
         no weight.
     weight_share : ndarray, shape (k,), float64
-        Mean weight of each light over the pixels of the region.
+        Mean over the pixels of the region of each light's share in the sum of the weights; adds up to the part of the
+        region that any light sees.
     history : ndarray, shape (iterations,), float64
         Largest motion of a measured node in each iteration, px.
     """

@@ -39,6 +39,13 @@ _PASSES = 8
 _REFINED = 2
 """Passes after the first whose residual still changes the weights and grey levels."""
 _PASS_ITERATIONS = 12
+_LOST = 0.5
+"""Uncertainty (px) from which a node is lost: a position uncertain by half a pixel is not within reach of a match."""
+_WANDERING = 0.1
+"""Motion (px) in the last iteration of a pass from which a node is lost."""
+_PATIENCE = 5
+_STARTED = 0.25
+"""Correlation coefficient at the start under which an element waits until its neighbours have brought it nearer."""
 _SETTLED = 1e-3
 """Share of the weight that may still change for the passes to end."""
 
@@ -68,7 +75,7 @@ class SolveOptions:
 
     rigid: str = "none"
     brightness: str = "none"
-    statistics: bool = False
+    statistics: bool = True
     curvature: bool = False
     tolerance: float = 1e-3
     max_iterations: int = 50
@@ -140,6 +147,7 @@ class _Run:
     matched: npt.NDArray[np.bool_] = field(init=False)
     history: list[float] = field(default_factory=list)
     sums: FloatArray = field(init=False)
+    motion: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         lights = len(self.reference.images)
@@ -147,13 +155,16 @@ class _Run:
         self.values = self.reference.values
         self.matched = np.ones(len(self.reference.mesh.elements), dtype=bool)
         self.sums = np.zeros((lights, 3))
+        self.motion = np.zeros(len(self.displacement))
 
     def passes(self) -> Solution:
         """Passes until the weights have settled, then the result."""
         step: Step | None = None
         tolerance = self.options.tolerance
+        first = self._compare()
+        self.matched = first.matched(_STARTED)
         if self.options.brightness != "none":
-            self.values = self._compare().brightness("global")
+            self.values = first.brightness("global")
         for number in range(_PASSES):
             weights = self._weights()
             if not weights.any():
@@ -167,7 +178,7 @@ class _Run:
             self._iterate(step, max(tolerance, _FIRST_PASS) if number == 0 else tolerance)
             if not np.isfinite(self.displacement).all():
                 return self._failed("the iteration diverged")
-            self._learn(number)
+            self._learn(number, step)
         assert step is not None
         if self.history[-1] > tolerance:
             self._iterate(step, tolerance)
@@ -200,10 +211,16 @@ class _Run:
             weights=self._pull_back(),
         )
 
-    def _learn(self, number: int) -> None:
+    def _learn(self, number: int, step: Step) -> None:
         """What the displacement found says about matching, brightness and precision."""
         comparison = self._compare()
         self.matched = comparison.matched()
+        if not self.matched.all() or self.history[-1] > _FIRST_PASS:
+            # a node whose own pixels match nothing wanders, though its elements match as a whole
+            lost = self._std(comparison, step).max(axis=1) > _LOST
+            if len(self.history) < self.options.max_iterations:
+                lost |= self.motion > _WANDERING
+            self.matched &= ~lost[self.reference.mesh.elements].any(axis=1)
         if number >= _REFINED:
             return
         if self.options.brightness != "none":
@@ -213,12 +230,13 @@ class _Run:
 
     def _iterate(self, step: Step, tolerance: float) -> None:
         """Gauss-Newton iterations with one Hessian until no measured node moves by more than `tolerance` px."""
-        for _ in range(min(_PASS_ITERATIONS, self.options.max_iterations - len(self.history))):
+        for turn in range(min(_PASS_ITERATIONS, self.options.max_iterations - len(self.history))):
             right_side, rigid_side = self._right_sides(step)
             motion, rigid = step.increment(right_side, rigid_side)
             motion = motion.reshape(-1, 2)
             length = np.hypot(*motion.T)
             self.displacement += motion * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
+            self.motion = length
             longest = float(length[step.measured].max())
             if rigid.size:
                 shifts = rigid.reshape(self.rigid[1:].shape)
@@ -226,6 +244,9 @@ class _Run:
                 longest = max(longest, float(np.abs(self.functions @ shifts.T).max()))
             self.history.append(longest)
             if not np.isfinite(longest) or longest <= tolerance:
+                return
+            # a few nodes that wander where nothing matches must not keep the others waiting
+            if turn >= _PATIENCE and np.quantile(length[step.measured], 0.9) <= tolerance:
                 return
 
     def _right_sides(self, step: Step) -> tuple[FloatArray, FloatArray]:
@@ -242,38 +263,48 @@ class _Run:
 
     def _conclude(self, step: Step) -> Solution:
         elements = self.reference.mesh.elements
-        node_status = np.where(step.measured, NodeStatus.MEASURED, NodeStatus.NOT_SEEN).astype(np.uint8)
-        beside_mismatch = np.zeros(len(node_status), dtype=bool)
+        std = self._std(self._compare(), step)
+        lost = step.measured & (std.max(axis=1) > _LOST)
+        measured = step.measured & ~lost
+        if not measured.any():
+            return self._failed("the images do not match anywhere in the region")
+        beside_mismatch = np.zeros(len(measured), dtype=bool)
         beside_mismatch[elements[~self.matched]] = True
-        node_status[beside_mismatch & ~step.measured] = NodeStatus.DECORRELATED
-        with np.errstate(invalid="ignore", divide="ignore"):
-            variance = self.sums[:, 0] / self.sums[:, 1]
-        scores = self._compare().score_covariance(step.weights, int(step.measured.sum()))
-        std = nodal_std(step.solve, self.reference.equations.matrix(scores), self.reference.probing)
-        std *= self._robust_loss(step)
+        decorrelated = lost | (beside_mismatch & ~measured)
+        node_status = np.where(measured, NodeStatus.MEASURED, NodeStatus.NOT_SEEN).astype(np.uint8)
+        node_status[decorrelated] = NodeStatus.DECORRELATED
         displacement = self.displacement
         offset = curvature_correction(self.reference, step, displacement)
         if self.options.curvature:
             displacement = displacement - offset
         else:
             std = np.hypot(std, offset)
-        converged = self.history[-1] <= self.options.tolerance
+        with np.errstate(invalid="ignore", divide="ignore"):
+            residual = np.sqrt(self.sums[:, 0] / self.sums[:, 1])
+        last = float(self.motion[measured].max())
+        converged = last <= self.options.tolerance
         return Solution(
             nodes=self.reference.mesh.nodes,
             elements=elements,
-            displacement=np.where(step.measured[:, None], displacement, np.nan),
-            displacement_std=np.where(step.measured[:, None], std, np.nan),
+            displacement=np.where(measured[:, None], displacement, np.nan),
+            displacement_std=np.where(measured[:, None], std, np.nan),
             node_status=node_status,
             status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
-            reason="" if converged else f"the last iteration still moved a node by {self.history[-1]:.3g} px",
+            reason="" if converged else f"the last iteration still moved a node by {last:.3g} px",
             rigid=self.rigid,
-            residual=np.sqrt(variance),
-            weight_share=step.weights.mean(axis=1, dtype=np.float64),
+            residual=residual,
+            weight_share=_shares(step.weights),
             history=np.array(self.history),
         )
 
+    def _std(self, comparison: Comparison, step: Step) -> FloatArray:
+        """Standard uncertainty (N, 2) in px from the scores."""
+        scores = comparison.score_covariance(step.weights, int(step.measured.sum()))
+        std = nodal_std(step.solve, self.reference.equations.matrix(scores), self.reference.probing)
+        return std * self._robust_loss(step)
+
     def _robust_loss(self, step: Step) -> float:
-        """Factor on the uncertainty: a robust loss bends less than its weights say (its derivative is not the weight)."""
+        """Factor on the uncertainty: a robust loss bends less than its weights say."""
         if self.bend is None:
             return 1.0
         total = float(step.weights.sum(dtype=np.float64))
@@ -302,3 +333,9 @@ class _Run:
             weight_share=np.zeros(lights),
             history=np.array(self.history),
         )
+
+
+def _shares(weights: FloatImage) -> FloatArray:
+    """Mean share (k,) of each light in the sum of the weights (k, P)."""
+    total = weights.sum(axis=0)
+    return np.asarray((weights / np.where(total > 0, total, np.float32(1))).mean(axis=1, dtype=np.float64))

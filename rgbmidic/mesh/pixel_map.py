@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -13,6 +14,9 @@ from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
 
 __all__ = ["PixelMap"]
+
+_RIM = 3.0
+"""Farthest (px) that a pixel of the region may lie from the element that owns it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +50,9 @@ class PixelMap:
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
-        """Give every pixel of `region` that a triangle covers to the first such triangle.
+        """Give every pixel of `region` to the first triangle that covers it.
+
+        Pixels that the chords of a curved outline leave out go with their nearest covered pixel, up to 3 px away.
 
         Raises
         ------
@@ -56,6 +62,8 @@ class PixelMap:
         owner = np.where(region.mask, np.int32(-1), np.int32(-2))
         counts = np.zeros(len(mesh.elements), dtype=np.int64)
         claim_pixels(mesh.nodes, mesh.elements, owner, counts)
+        if region.rectangle is None:
+            counts = _claim_rim(owner, counts)
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         if offsets[-1] == 0:
             raise RegionError("no pixel of the region of interest lies in the mesh")
@@ -85,6 +93,18 @@ class PixelMap:
         image = np.full(self.shape, fill, dtype=np.float32)
         image[self.rows, self.columns] = values
         return image
+
+
+def _claim_rim(owner: npt.NDArray[np.int32], counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Give free pixels of the region near an owned one to its element, in place; the new number of each element."""
+    free = (owner < 0).astype(np.uint8)
+    distance, label = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    owned = owner >= 0
+    element_of_label = np.full(int(label.max()) + 1, -1, dtype=np.int32)
+    element_of_label[label[owned]] = owner[owned]
+    rim = (owner == -1) & (np.asarray(distance) <= _RIM)
+    owner[rim] = element_of_label[label[rim]]
+    return np.bincount(owner[owner >= 0], minlength=len(counts)).astype(np.int64)
 
 
 def _shape_functions(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
