@@ -19,7 +19,7 @@ from rgbmidic.correlation import Deformed, Reference, SolveOptions
 from rgbmidic.errors import CalibrationError, ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import Separator, measure, read_region, texture, track
+from rgbmidic.pipeline import Separator, Start, measure, read_region, texture, track
 from rgbmidic.sequence.frames import open_frames
 from rgbmidic.sequence.store import Result
 
@@ -169,10 +169,12 @@ def _each_light_alone(settings: TestSettings, mesh: Tri3Mesh) -> list[list[Float
         stacks = [image[light : light + 1] for image in images]
         reference = Reference.prepare(stacks[0], region, mesh=mesh, prefilter="binomial")
         fields = [np.zeros((len(mesh.nodes), 2))]
+        start = Start(displacement=fields[0])
         for stack in stacks[1:]:
-            start = np.where(np.isfinite(fields[-1]), fields[-1], 0.0)
             deformed = Deformed.prepare(stack, prefilter="binomial")
-            fields.append(track(reference, deformed, start, SolveOptions(), search_radius=64.0).displacement)
+            solution = track(reference, deformed, start, SolveOptions(), search_radius=64.0)
+            start = start.after(solution)
+            fields.append(solution.displacement)
         singles.append(fields)
     return singles
 

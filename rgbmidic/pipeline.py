@@ -7,7 +7,7 @@ its uncertainty, frame after frame, each kept as it finishes.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from rgbmidic.sequence.frames import FrameSequence, list_frames, open_frames
 from rgbmidic.sequence.readers import read_frame, tells_camera
 from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
 
-__all__ = ["Separator", "average", "measure", "read_region", "texture", "track"]
+__all__ = ["Separator", "Start", "average", "measure", "read_region", "texture", "track"]
 
 logger = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ def measure(
         reference=images.values,
         overwrite=overwrite,
     )
-    last: FloatArray | None = None
+    last = Start(displacement=None)
     for index in range(len(frames)):
         record, last = _measure_frame(index, frames, separator, settings, reference, last)
         store.write_frame(index, record)
@@ -120,9 +120,9 @@ def _measure_frame(
     separator: Separator,
     settings: TestSettings,
     reference: Reference,
-    last: FloatArray | None,
-) -> tuple[FrameRecord, FloatArray | None]:
-    """Record of one frame, and the displacement from which the next one starts."""
+    last: Start,
+) -> tuple[FrameRecord, Start]:
+    """Record of one frame, and from where the next one starts."""
     nodes, lights = len(reference.mesh.nodes), len(reference.images)
     try:
         images = separator(frames.read(index))
@@ -132,52 +132,78 @@ def _measure_frame(
             )
         weights = light_weights(images, settings.weights)
         deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
-        alone = settings.frames.reference == (index,)
-        start = np.zeros((nodes, 2)) if alone else last
+        start = Start(displacement=np.zeros((nodes, 2))) if settings.frames.reference == (index,) else last
         solution = track(reference, deformed, start, _options(settings), search_radius=settings.solver.search_radius)
         inputs = frames.hashes(index)
     except RgbmidicError as error:
         logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)
         return FrameRecord.failed(str(error), nodes=nodes, lights=lights), last
     record = FrameRecord.from_solution(solution, weights_thumbnail=_thumbnail(weights), inputs=inputs)
-    return record, _next_start(reference, solution, last)
+    return record, last.after(solution)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """From where a frame starts.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (N, 2), or None
+        The last frame's displacement in px, gaps filled; None where there is none yet.
+    unmeasured : float
+        Share of the nodes that the last frame could not measure.
+    """
+
+    displacement: FloatArray | None
+    unmeasured: float = 0.0
+
+    def after(self, solution: Solution) -> Start:
+        """The start of the frame after `solution`: gaps get the displacement of the nearest measured node."""
+        from scipy.spatial import cKDTree
+
+        measured = solution.measured
+        if not measured.any():
+            return self
+        nearest = cKDTree(solution.nodes[measured]).query(solution.nodes)[1]
+        filled = np.where(measured[:, None], solution.displacement, solution.displacement[measured][nearest])
+        return Start(displacement=filled, unmeasured=solution.unmeasured_share)
 
 
 def track(
-    reference: Reference,
-    deformed: Deformed,
-    start: FloatArray | None,
-    options: SolveOptions,
-    *,
-    search_radius: float,
+    reference: Reference, deformed: Deformed, start: Start, options: SolveOptions, *, search_radius: float
 ) -> Solution:
-    """Solve one frame from the last frame's displacement, and anew from a search where that does not converge.
+    """Solve one frame from the last frame's displacement, and from a search where that fails or loses nodes.
 
     Parameters
     ----------
     reference, deformed
         The two states.
-    start : ndarray, shape (N, 2), or None
-        Displacement to start from in px; None searches.
+    start
+        The last frame's end; without a displacement the start is searched.
     options
         How to solve.
     search_radius
         Largest motion in px that a search looks for.
     """
-    solution: Solution | None = None
-    attempts = ("last", "refined", "search") if start is not None else ("search",)
-    for attempt in attempts:
-        if attempt == "search":
-            initial = coarse_start(reference, deformed, search_radius)
-        else:
-            assert start is not None
-            initial = start if attempt == "last" else refine_start(reference, deformed, start)
+    best: Solution | None = None
+    for initial in _starts(reference, deformed, start.displacement, search_radius):
         trial = solve(reference, deformed, initial, options)
-        solution = trial if solution is None or _better(trial, solution) else solution
-        if solution.status is Status.CONVERGED and not solution.mismatched_share > _MISMATCH:
+        if best is None or (trial.status, trial.unmeasured_share) < (best.status, best.unmeasured_share):
+            best = trial
+        if best.status is Status.CONVERGED and best.unmeasured_share <= start.unmeasured + _LOSS:
             break
-    assert solution is not None
-    return solution
+    assert best is not None
+    return best
+
+
+def _starts(
+    reference: Reference, deformed: Deformed, last: FloatArray | None, search_radius: float
+) -> Iterator[FloatArray]:
+    """Displacements to start from, cheapest first, each made only when it is asked for."""
+    if last is not None:
+        yield last
+        yield refine_start(reference, deformed, last)
+    yield coarse_start(reference, deformed, search_radius)
 
 
 def _options(settings: TestSettings) -> SolveOptions:
@@ -191,24 +217,8 @@ def _options(settings: TestSettings) -> SolveOptions:
     )
 
 
-_MISMATCH = 0.02
-"""Share of the nodes that may have lost their match before another start is tried."""
-
-
-def _better(trial: Solution, best: Solution) -> bool:
-    return (trial.status, trial.mismatched_share) < (best.status, best.mismatched_share)
-
-
-def _next_start(reference: Reference, solution: Solution, last: FloatArray | None) -> FloatArray | None:
-    """The solution with its gaps filled from the nearest measured nodes; the last start where nothing was measured."""
-    from scipy.spatial import cKDTree
-
-    measured = solution.measured
-    if not measured.any():
-        return last
-    nodes = reference.mesh.nodes
-    nearest = cKDTree(nodes[measured]).query(nodes)[1]
-    return np.where(measured[:, None], solution.displacement, solution.displacement[measured][nearest])
+_LOSS = 0.003
+"""Share of the nodes that may be lost from one frame to the next before another start is tried."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

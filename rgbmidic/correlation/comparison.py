@@ -104,7 +104,8 @@ class Comparison:
         # both images carry the same noise: the ratio of the deviations is not attenuated by it
         spread_f, spread_g = (float((weight * (i - m) ** 2).sum()) for i, m in ((f, mean_f), (g, mean_g)))
         gain = np.sqrt(spread_f / spread_g) if spread_f > 0 and spread_g > 0 else 1.0
-        return np.asarray((f - mean_f) / gain + mean_g).astype(np.float32)
+        corrected: FloatImage = np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32)
+        return corrected
 
     def _local(self, light: int) -> FloatImage:
         reference, pixels = self.reference, self.reference.pixels
@@ -125,7 +126,8 @@ class Comparison:
             nodal, reference.mesh.elements, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, fields
         )
         gain = np.maximum(fields[0] / np.float32(scale), np.float32(0.05))
-        return np.asarray((f - fields[1]) / gain).astype(np.float32)
+        corrected: FloatImage = np.asarray((f - fields[1]) / gain, dtype=np.float32)
+        return corrected
 
     def precision(self) -> tuple[FloatImage, FloatImage]:
         """Factor (k, P) on the weights: inverse variance of the residual around each pixel, and robust at the pixel;

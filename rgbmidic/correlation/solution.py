@@ -86,6 +86,6 @@ class Solution:
         return np.asarray(self.node_status == NodeStatus.MEASURED)
 
     @property
-    def mismatched_share(self) -> float:
-        """Share of the nodes around which the images do not match."""
-        return float((self.node_status == NodeStatus.DECORRELATED).mean())
+    def unmeasured_share(self) -> float:
+        """Share of the nodes that are not measured."""
+        return float((self.node_status != NodeStatus.MEASURED).mean())

@@ -214,6 +214,7 @@ class _Run:
     def _learn(self, number: int, step: Step) -> None:
         """What the displacement found says about matching, brightness and precision."""
         comparison = self._compare()
+        before = self.matched
         self.matched = comparison.matched()
         if not self.matched.all() or self.history[-1] > _FIRST_PASS:
             # a node whose own pixels match nothing wanders, though its elements match as a whole
@@ -221,7 +222,8 @@ class _Run:
             if len(self.history) < self.options.max_iterations:
                 lost |= self.motion > _WANDERING
             self.matched &= ~lost[self.reference.mesh.elements].any(axis=1)
-        if number >= _REFINED:
+        # where elements have come back, what was learnt from their wrong match must be learnt anew
+        if number >= _REFINED and (before | ~self.matched).all():
             return
         if self.options.brightness != "none":
             self.values = comparison.brightness(self.options.brightness)
