@@ -211,7 +211,7 @@ def test_nodes_without_texture_are_flagged_and_the_others_measured(sigma):
     blank = found.nodes[:, 0] < 80
     assert (found.node_status[blank] != NodeStatus.MEASURED).all()
     assert np.isnan(found.displacement[blank]).all()
-    assert found.measured[found.nodes[:, 0] > 100.5].all()
+    assert found.measured[found.nodes[:, 0] > 100 + 27].all()
     assert rms(error(found)[found.nodes[:, 0] > 110]) <= (SEEN_RMS if sigma == 0 else 0.02)
 
 

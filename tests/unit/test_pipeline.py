@@ -1,0 +1,306 @@
+"""The main job end to end on tiny virtual tests: every kind of frame, and everything that can go wrong with them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import tifffile
+from small_tests import REGION, SHAPE, colour_test, grey_frame, toml
+
+from rgbmidic import Calibration, NodeStatus, Result, Status, measure, read_test
+from rgbmidic.errors import (
+    CalibrationError,
+    ConfigurationError,
+    FrameError,
+    InputError,
+    RegionError,
+    ResultError,
+    RgbmidicError,
+)
+from rgbmidic.sequence.frames import file_hash
+from rgbmidic.sequence.writers import write_tiff
+
+BAYER_RMS = 0.015
+"""px: Malvar demosaicing and the noise of a 12-bit camera on a plate without reflections."""
+COLOUR_RMS = 0.008
+"""px: three samples per pixel, no demosaicing."""
+GREY_RMS = 0.01
+"""px: one monochrome light, noise of 8 in a contrast of 500 grey levels."""
+
+
+@pytest.fixture(scope="module")
+def bayer(tmp_path_factory):
+    return colour_test(tmp_path_factory.mktemp("bayer") / "test")
+
+
+@pytest.fixture(scope="module")
+def bayer_result(bayer, tmp_path_factory):
+    return measure(bayer.settings(), tmp_path_factory.mktemp("bayer_result") / "result")
+
+
+@pytest.fixture
+def copy(bayer, tmp_path):
+    """The Bayer test, free to be damaged: the function gives the path of frame `index` in the copy."""
+    shutil.copytree(bayer.folder, tmp_path / "test")
+    return lambda name: tmp_path / "test" / name
+
+
+def settings_of(folder, frames, calibration="", **sections):
+    (folder / "TEST.toml").write_text(toml(frames, calibration))
+    settings = read_test(folder / "TEST.toml")
+    if not sections:
+        return settings
+    return type(settings).from_mapping({**settings.to_mapping(), **sections}, folder)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_raw_bayer_frames_give_the_true_displacement(bayer, bayer_result):
+    assert (bayer_result.status == Status.CONVERGED).all()
+    assert (bayer_result.node_status == NodeStatus.MEASURED).all()
+    assert bayer_result.lights == ("red", "green", "blue")
+    assert bayer_result.names == ("frame_0.dng", "frame_1.dng", "frame_2.dng")
+    np.testing.assert_array_equal(bayer_result.nodes.min(axis=0), REGION[:2])
+    np.testing.assert_array_equal(bayer_result.nodes.max(axis=0), REGION[2:])
+    error = bayer.error(bayer_result.nodes, bayer_result.u, bayer_result.v)
+    assert rms(error[0]) < 1e-3
+    assert rms(error) < BAYER_RMS
+    assert (bayer_result.weight_share > 0).all()
+
+
+def test_the_result_tells_where_it_comes_from(bayer, bayer_result):
+    assert bayer_result.inputs == {str(path): file_hash(path) for path in bayer.frames}
+    told = bayer_result.provenance
+    assert told["inputs"] == bayer_result.inputs
+    assert told["calibration"]["sha256"] == file_hash(bayer.folder / "calibration.json")
+    assert told["settings"]["mesh"]["element_size"] == 25
+    assert told["finished"] >= told["created"]
+    assert bayer_result.frame(1).weights_thumbnail.shape[0] == 3
+    again = Result.open(bayer_result.path)
+    np.testing.assert_array_equal(again.u, bayer_result.u)
+
+
+def test_every_frame_is_told_as_it_finishes(bayer, tmp_path):
+    told = []
+    measure(bayer.settings(), tmp_path / "result", progress=lambda *state: told.append(state))
+    assert [state[:2] for state in told] == [(1, 3), (2, 3), (3, 3)]
+    assert all("converged" in line for _, _, line in told)
+
+
+def test_a_truncated_frame_is_recorded_and_the_rest_goes_on(bayer, bayer_result, copy, tmp_path):
+    damaged = copy("frames/frame_1.dng")
+    damaged.write_bytes(damaged.read_bytes()[:9000])
+    result = measure(read_test(copy("TEST.toml")), tmp_path / "result")
+    assert result.status.tolist() == [Status.CONVERGED, Status.FAILED, Status.CONVERGED]
+    assert "frame_1.dng" in result.reasons[1]
+    assert np.isnan(result.u[1]).all()
+    assert (result.node_status[1] != NodeStatus.MEASURED).all()
+    assert rms(bayer.error(result.nodes, result.u, result.v)[2]) < BAYER_RMS
+    np.testing.assert_allclose(result.u[2], bayer_result.u[2], atol=5e-3)
+
+
+def test_a_wholly_saturated_frame_is_recorded_and_the_rest_goes_on(bayer, copy, tmp_path):
+    from dataclasses import replace
+
+    from rgbmidic import read_frame
+    from rgbmidic.sequence.writers import write_dng
+
+    frame = read_frame(copy("frames/frame_1.dng"))
+    write_dng(copy("frames/frame_1.dng"), replace(frame, values=np.full(SHAPE, 4095, dtype=np.uint16)))
+    result = measure(read_test(copy("TEST.toml")), tmp_path / "result")
+    assert result.status.tolist() == [Status.CONVERGED, Status.FAILED, Status.CONVERGED]
+    assert "no light sees" in result.reasons[1]
+    assert np.isnan(result.v[1]).all()
+    np.testing.assert_array_equal(result.weight_share[1], 0)
+
+
+def test_a_saturated_spot_is_left_out_and_the_rest_measured(bayer, copy, tmp_path):
+    from rgbmidic import read_frame
+    from rgbmidic.sequence.writers import write_dng
+
+    frame = read_frame(copy("frames/frame_2.dng"))
+    frame.values[50:100, 50:100] = 4095
+    write_dng(copy("frames/frame_2.dng"), frame)
+    result = measure(read_test(copy("TEST.toml")), tmp_path / "result")
+    assert result.status[2] == Status.CONVERGED
+    measured = result.node_status[2] == NodeStatus.MEASURED
+    middle = (np.abs(result.nodes - 74) < 12).all(axis=1)
+    assert middle.any()
+    assert not measured[middle].any()
+    assert np.isnan(result.u[2][~measured]).all()
+    assert measured.mean() > 0.6
+    assert rms(bayer.error(result.nodes, result.u, result.v)[2][measured]) < 2 * BAYER_RMS
+
+
+@pytest.mark.parametrize(
+    ("sections", "error", "message"),
+    [
+        ({"frames": {"cfa": "BGGR"}}, FrameError, "cfa is stated as BGGR.*frame_0.dng says RGGB"),
+        ({"frames": {"black_level": 80.0}}, FrameError, "black_level is stated as 80"),
+        ({"frames": {"white_level": 4000.0}}, FrameError, "white_level is stated as 4000"),
+        ({"frames": {"kind": "rgb"}}, FrameError, "kind is stated as rgb"),
+        ({"frames": {"path": ["frames/*.png"]}}, FrameError, r"no file matches: frames/\*\.png"),
+        ({"frames": {"reference": [7]}}, FrameError, "names frame 7, but there are 3"),
+        ({"calibration": {"file": None}}, ConfigurationError, "calibration.file is missing"),
+        ({"calibration": {"file": "absent.json"}}, CalibrationError, "not found: .*absent.json"),
+        ({"region": {"rectangle": [500, 500, 600, 600]}}, RegionError, "does not overlap the image of 144 x 144 px"),
+        ({"region": {"rectangle": [20, 20, 22, 22]}}, RegionError, "too small"),
+        ({"region": {"rectangle": None, "mask": "absent.png"}}, FrameError, "not found: .*absent.png"),
+        ({"illumination": {"demosaic": "magic"}}, RgbmidicError, "magic"),
+        ({"mesh": {"element_size": 2.0}}, InputError, "at least 4 px"),
+    ],
+)
+def test_wrong_settings_stop_before_anything_is_written(bayer, tmp_path, sections, error, message):
+    with pytest.raises(error, match=message):
+        measure(bayer.settings(**sections), tmp_path / "result")
+    assert not (tmp_path / "result").exists()
+
+
+def test_a_calibration_without_crosstalk_is_refused(copy, tmp_path):
+    Calibration(cfa="RGGB").write(copy("calibration.json"))
+    with pytest.raises(ConfigurationError, match="has no crosstalk"):
+        measure(read_test(copy("TEST.toml")), tmp_path / "result")
+
+
+def test_a_damaged_reference_stops_the_job(copy, tmp_path):
+    frame = copy("frames/frame_0.dng")
+    frame.write_bytes(frame.read_bytes()[:9000])
+    with pytest.raises(FrameError, match=r"frame_0\.dng"):
+        measure(read_test(copy("TEST.toml")), tmp_path / "result")
+    assert not (tmp_path / "result").exists()
+
+
+def test_frames_of_different_sizes_are_refused(tmp_path):
+    for index, shape in enumerate([(144, 144), (144, 150)]):
+        write_tiff(tmp_path / f"{index}.tif", grey_frame(0, (0, 0), shape=shape))
+    with pytest.raises(FrameError, match=r"one size: .*1\.tif"):
+        measure(settings_of(tmp_path, 'path = "*.tif"\nkind = "monochrome"'), tmp_path / "result")
+
+
+def test_an_existing_result_is_not_overwritten_unless_asked(bayer, bayer_result, tmp_path):
+    folder = tmp_path / "result"
+    shutil.copytree(bayer_result.path, folder)
+    (folder / "notes.txt").write_text("mine")
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(ResultError, match="already holds a result"):
+        measure(bayer.settings(), folder)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    replaced = measure(bayer.settings(mesh={"element_size": 50.0}), folder, overwrite=True)
+    assert len(replaced.nodes) < len(bayer_result.nodes)
+    assert (folder / "notes.txt").read_text() == "mine"
+
+
+def test_tiff_frames_take_pattern_and_levels_from_the_calibration(bayer_result, tmp_path):
+    test = colour_test(tmp_path / "test", suffix=".tif")
+    result = measure(test.settings(), tmp_path / "result")
+    np.testing.assert_array_equal(result.u, bayer_result.u)
+    np.testing.assert_array_equal(result.v, bayer_result.v)
+
+
+def test_tiff_frames_without_any_pattern_are_refused(tmp_path):
+    test = colour_test(tmp_path / "test", suffix=".tif")
+    document = json.loads((test.folder / "calibration.json").read_text())
+    del document["camera"]
+    (test.folder / "calibration.json").write_text(json.dumps(document))
+    with pytest.raises(FrameError, match=r"frame_0\.tif does not tell its colour filter array"):
+        measure(test.settings(), tmp_path / "result")
+
+
+def test_three_channel_frames_need_no_demosaicing(tmp_path):
+    test = colour_test(tmp_path / "test", kind="rgb", suffix=".tif")
+    result = measure(test.settings(), tmp_path / "result")
+    assert (result.status == Status.CONVERGED).all()
+    assert result.lights == ("red", "green", "blue")
+    assert rms(test.error(result.nodes, result.u, result.v)) < COLOUR_RMS
+
+
+MOTIONS = [(0.0, 0.0), (0.4, -0.2), (1.6, 0.7)]
+STATED = 'kind = "monochrome"\nblack_level = 64\nwhite_level = 4095\n'
+
+
+def write_series(folder, texture, motions=MOTIONS, **noise):
+    folder.mkdir()
+    for index, shift in enumerate(motions):
+        write_tiff(folder / f"frame_{index}.tif", grey_frame(texture, shift, noise_seed=index, **noise))
+
+
+def test_one_monochrome_light_needs_no_calibration(tmp_path):
+    write_series(tmp_path / "grey", 0)
+    result = measure(settings_of(tmp_path, f'path = "grey"\n{STATED}'), tmp_path / "result")
+    assert (result.status == Status.CONVERGED).all()
+    assert len(result.lights) == 1
+    np.testing.assert_allclose(result.u.mean(axis=1), [u for u, _ in MOTIONS], atol=3e-3)
+    np.testing.assert_allclose(result.v.mean(axis=1), [v for _, v in MOTIONS], atol=3e-3)
+    assert rms(result.u - np.array(MOTIONS)[:, :1]) < GREY_RMS
+
+
+def test_lights_fired_in_succession_are_solved_together(tmp_path):
+    write_series(tmp_path / "left", 0)
+    write_series(tmp_path / "right", 1, [(0.0, 0.0), *((u + 0.5, v - 0.25) for u, v in MOTIONS[1:])])
+    paths = f'path = ["left", "right/*.tif"]\n{STATED}'
+    result = measure(settings_of(tmp_path, paths, solver={"rigid": "translation"}), tmp_path / "result")
+    assert (result.status == Status.CONVERGED).all()
+    assert len(result.lights) == 2
+    assert result.names[1] == "frame_1.tif + frame_1.tif"
+    assert rms(result.u - np.array(MOTIONS)[:, :1]) < GREY_RMS
+    np.testing.assert_allclose(result.frame(2).rigid[1], (0.5, -0.25), atol=3e-3)
+    assert len(result.inputs) == 6
+
+
+def test_lights_in_succession_must_have_equally_many_frames(tmp_path):
+    write_series(tmp_path / "left", 0)
+    write_series(tmp_path / "right", 1, MOTIONS[:2])
+    with pytest.raises(FrameError, match="equal numbers of frames; given are left: 3, right: 2"):
+        measure(settings_of(tmp_path, f'path = ["left", "right"]\n{STATED}'), tmp_path / "result")
+
+
+def test_averaged_reference_frames_lower_the_noise(tmp_path):
+    write_series(tmp_path / "grey", 0, [(0.0, 0.0), (0.0, 0.0), (0.4, -0.2)], sigma=60.0)
+    residual = [
+        measure(
+            settings_of(tmp_path, f'path = "grey"\n{STATED}reference = {reference}\n', weights={"method": "none"}),
+            tmp_path / f"result_{len(reference)}",
+        ).residual[2, 0]
+        for reference in ([0], [0, 1])
+    ]
+    # sigma^2 (1 + 1/n) instead of 2 sigma^2
+    assert residual[1] / residual[0] == pytest.approx(np.sqrt(0.75), rel=0.03)
+
+
+def test_the_last_frame_is_the_start_of_the_next(tmp_path):
+    motions = [(5.0 * i, -4.0 * i) for i in range(6)]
+    write_series(tmp_path / "grey", 0, motions)
+    text = f'path = "grey"\n{STATED}'
+    settings = settings_of(tmp_path, text, solver={"search_radius": 8}, region={"rectangle": [20, 45, 100, 125]})
+    result = measure(settings, tmp_path / "result")
+    assert (result.status == Status.CONVERGED).all()
+    np.testing.assert_allclose(result.u[5], 25, atol=0.05)
+    np.testing.assert_allclose(result.v[5], -20, atol=0.05)
+
+
+def test_a_region_may_be_a_polygon_or_a_mask_image(tmp_path):
+    write_series(tmp_path / "grey", 0)
+    mask = np.zeros(SHAPE, dtype=np.uint8)
+    mask[20:120, 30:90] = 255
+    mask[50:80, 50:70] = 0
+    tifffile.imwrite(tmp_path / "mask.tif", mask)
+    text = f'path = "grey"\n{STATED}'
+    for number, region in enumerate([{"polygon": [[20, 20], [120, 30], [70, 120]]}, {"mask": "mask.tif"}]):
+        settings = settings_of(tmp_path, text, region=region, mesh={"element_size": 12})
+        result = measure(settings, tmp_path / f"result_{number}")
+        assert (result.status == Status.CONVERGED).all()
+        assert rms(result.u[2] - MOTIONS[2][0]) < 3 * GREY_RMS
+    inside = (result.nodes > (52, 52)).all(axis=1) & (result.nodes < (67, 77)).all(axis=1)
+    assert not inside.any()
+
+
+def test_a_mask_of_another_size_is_refused_by_name(tmp_path):
+    write_series(tmp_path / "grey", 0, MOTIONS[:1])
+    tifffile.imwrite(tmp_path / "mask.tif", np.ones((20, 30), dtype=np.uint8))
+    with pytest.raises(RegionError, match=r"mask\.tif.*30, 20.*144, 144"):
+        measure(settings_of(tmp_path, f'path = "grey"\n{STATED}', region={"mask": "mask.tif"}), tmp_path / "result")
