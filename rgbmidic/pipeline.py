@@ -18,6 +18,7 @@ from rgbmidic.config import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.correlation import Deformed, Reference, Solution, SolveOptions, Status, solve
 from rgbmidic.correlation.start import coarse_start, refine_start
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError, RgbmidicError
+from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.mosaic import ChannelFrame, LinearChannels, LinearMosaic, Mosaic, linearise
@@ -261,8 +262,11 @@ class Separator:
         crosstalk = self._crosstalk()
         (only,) = linear
         if isinstance(only, LinearMosaic):
-            return separate(only, crosstalk, self.settings.illumination.demosaic)
-        return unmix(only, crosstalk)
+            images = separate(only, crosstalk, self.settings.illumination.demosaic)
+        else:
+            images = unmix(only, crosstalk)
+        registration = self.calibration.registration if self.calibration else None
+        return images if registration is None else align(images, registration)
 
     def _crosstalk(self) -> Crosstalk:
         if self.calibration is None or self.calibration.crosstalk is None:
