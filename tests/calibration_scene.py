@@ -9,10 +9,10 @@ from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic, cfa_channels
 
 GAIN, READ, BLACK, WHITE = 4.0, 3.0, 64.0, 4095.0
 
-MATRICES = {
+MATRICES = {  # by rounded condition number
     1.5: np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]]),
-    3.0: np.array([[1, 0.27, 0.09], [0.04, 1, 0.39], [0.01, 0.39, 1]]),
-    6.0: np.array([[1, 0.55, 0.12], [0.30, 1, 0.62], [0.06, 0.50, 1]]),
+    3.0: np.array([[1, 0.33, 0.10], [0.06, 1, 0.48], [0.01, 0.46, 1]]),
+    6.0: np.array([[1, 0.58, 0.12], [0.34, 1, 0.64], [0.06, 0.53, 1]]),
 }
 
 
@@ -61,7 +61,7 @@ def captures(
     return lights, dark
 
 
-def wave_texture(x, y, rng, size=4.2, count=250):
+def wave_texture(x, y, rng, size=4.2, count=160):
     """A speckle that is known between the pixels too: a sum of waves at points x, y (px), albedo 0.1 to 0.8."""
     wave_x, wave_y = rng.normal(0, 1 / (0.9 * size), (2, count))
     phase = rng.uniform(0, 2 * np.pi, count)

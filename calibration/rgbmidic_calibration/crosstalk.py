@@ -17,7 +17,7 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
 from rgbmidic_calibration.blocks import BlockMeans, block_centres
 from rgbmidic_calibration.plausibility import CHECKS, check_captures, check_matrix
-from rgbmidic_calibration.ratio import ColumnFit, Wald, capture_scatter, fit_column, offsets_left, wald
+from rgbmidic_calibration.ratio import ColumnFit, Variation, capture_scatter, fit_column, offsets_left, variation
 
 __all__ = ["CHANNELS", "CrosstalkEstimate", "LightFit", "estimate_crosstalk"]
 
@@ -57,7 +57,7 @@ class LightFit:
         Largest scatter (standard deviation) of an entry between captures beyond their noise.
     offset, offset_std : ndarray, shape (C,)
         Grey level that is left where the light is absent, and its uncertainty (`ratio.offsets_left`).
-    variation : Wald
+    variation : Variation
         The test whether the column varies over the field.
     captures : int
     """
@@ -73,7 +73,7 @@ class LightFit:
     colour_drift: float
     offset: Floats
     offset_std: Floats
-    variation: Wald
+    variation: Variation
     captures: int
 
 
@@ -195,22 +195,20 @@ def _prepare(name: str, captures: Sequence[BlockMeans], dark: _Dark) -> _Light:
     return _Light(name, captures, signal, valid, reference)
 
 
-def _variation(light: _Light, like: BlockMeans) -> tuple[int, Wald]:
+def _variation(light: _Light, like: BlockMeans) -> tuple[int, Variation]:
     """Degree that the light's captures ask for, and the test of all terms that are not constant."""
-    centres = block_centres(like.shape, like.block)
-    norms = (legendre_products(centres, like.shape, AUTOMATIC_ORDER) ** 2).mean(axis=(0, 1))
-    test = Wald(p_value=1.0, rms=0.0)
-    for order in range(AUTOMATIC_ORDER, 0, -1):
-        fit = fit_column(light.signal, light.valid, light.reference, legendre_products(centres, like.shape, order))
-        highest = wald(fit, light.reference, slice(order * (order + 1) // 2, None), norms)
-        if order == AUTOMATIC_ORDER:
-            test = wald(fit, light.reference, slice(1, None), norms)
-        if highest.p_value < FIELD_SIGNIFICANCE and highest.rms > FIELD_TOLERANCE:
-            return order, test
-    return 0, test
+    design = legendre_products(block_centres(like.shape, like.block), like.shape, AUTOMATIC_ORDER)
+    needed, overall = 0, Variation(p_value=1.0, rms=0.0)
+    for order in range(AUTOMATIC_ORDER):
+        found = variation(light.signal, light.valid, light.reference, design, (order + 1) * (order + 2) // 2)
+        overall = found if order == 0 else overall
+        if found.p_value >= FIELD_SIGNIFICANCE or found.rms <= FIELD_TOLERANCE:
+            break
+        needed = order + 1
+    return needed, overall
 
 
-def _summary(light: _Light, fit: ColumnFit, variation: Wald, design: Floats) -> LightFit:
+def _summary(light: _Light, fit: ColumnFit, found: Variation, design: Floats) -> LightFit:
     count = fit.weights.sum(axis=(1, 2))
     strength = fit.mass / np.maximum(count, 1)
     offset, offset_std = offsets_left(light.signal, fit.weights, light.reference, design)
@@ -226,7 +224,7 @@ def _summary(light: _Light, fit: ColumnFit, variation: Wald, design: Floats) -> 
         colour_drift=float(np.sqrt(capture_scatter(fit).max())),
         offset=offset,
         offset_std=offset_std,
-        variation=variation,
+        variation=found,
         captures=len(light.captures),
     )
 

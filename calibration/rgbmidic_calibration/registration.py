@@ -124,6 +124,8 @@ def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Im
         place = (slice(row, 2 * signal.shape[0], 2), slice(column, 2 * signal.shape[1], 2))
         picture[place] = _relative(signal, stack.clipped[plane], LOCAL / 2)
         used[place] = 1
+    if not used.any():
+        raise CalibrationError("no colour plane stands out of its noise: do all captures show the same scene at rest?")
     return _filled(picture, used)
 
 
@@ -342,5 +344,5 @@ def jitter(stack: TemporalStack, picture: Image) -> Floats:
         return np.full(2, np.nan)
     weight = 1 / np.maximum(mean[use], 0.02 * float(mean[use].mean()))
     moments = (columns[use] * weight[:, None]).T
-    solution = np.linalg.solve(moments @ columns[use], moments @ stack.variance[plane][use])
+    solution = np.linalg.pinv(moments @ columns[use]) @ (moments @ stack.variance[plane][use])
     return np.asarray(np.sqrt(np.maximum(solution[2:], 0)))

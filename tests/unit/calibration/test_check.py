@@ -132,12 +132,12 @@ def test_registration_left():
         name: stack_frames([expose(3000 * picture, MATRIX[:, i], rng) for _ in range(2)])
         for i, (name, picture) in enumerate(zip(LIGHTS, registered_pictures(truth, shape, 3), strict=True))
     }
-    assert all(left < 0.03 for _, left, _ in registration_left(truth, stacks))
+    assert all(left < 0.02 + 3 * std for _, left, std in registration_left(truth, stacks))
     none = Registration.identity(LIGHTS, shape)
     assert [left > 0.1 for _, left, _ in registration_left(none, stacks)] == [True, True]
     two = registration_left(truth, {"green": stacks["green"], "blue": stacks["blue"]})
     assert [name for name, *_ in two] == ["blue"]
-    assert two[0][1] < 0.03
+    assert two[0][1] < 0.05
 
 
 def test_limits_from_options():

@@ -115,10 +115,14 @@ def test_mistakes_are_errors(pictures):
     lights, dark = stacks(pictures, rng, count=2)
     with pytest.raises(CalibrationError, match="at least two lights"):
         estimate_registration({"red": lights["red"]}, dark)
-    plain = stack_frames([expose(3000 * white_target(SHAPE, rng), MATRIX[:, 1], rng) for _ in range(2)])
+    other = registered_pictures(true_registration(), SHAPE, seed=99)[1]
+    moving = stack_frames([expose(3000 * picture, MATRIX[:, 1], rng) for picture in (pictures[1], other)])
+    with pytest.raises(CalibrationError, match="light green: no colour plane stands out"):
+        estimate_registration({"red": lights["red"], "green": moving}, dark)
+    white = white_target(SHAPE, rng)
+    plain = stack_frames([expose(3000 * white, MATRIX[:, 1], rng) for _ in range(2)])
     with pytest.raises(CalibrationError, match="lights red and green"):
         estimate_registration({"red": lights["red"], "green": plain}, dark)
-    other = registered_pictures(true_registration(), SHAPE, seed=99)[1]
     stranger = stack_frames([expose(3000 * other, MATRIX[:, 1], rng) for _ in range(2)])
     with pytest.raises(CalibrationError, match="light"):
         estimate_registration({"red": lights["red"], "green": stranger}, dark)
