@@ -9,6 +9,7 @@ from rgbmidic._kernels.interpolation import PAD
 
 __all__ = [
     "bspline_coefficients",
+    "curvature_deviation",
     "element_hessian",
     "element_moments",
     "element_right_side",
@@ -155,3 +156,15 @@ def element_vector(first, second, pixels):
 def interpolate_nodal(values, pixels, mesh):
     """A nodal field (N, 2) at the owned pixels, (2, P)."""
     return np.array([shape_functions(pixels, e, i) @ values[mesh.elements[e]] for e, i in owned(pixels)]).T
+
+
+def curvature_deviation(curvature, pixels, mesh):
+    """A quadratic field with the second derivatives (E, 2, 3) of each element minus its linear interpolant, (2, P)."""
+    out = []
+    for e, i in owned(pixels):
+        xx, xy, yy = curvature[e].T
+        corners = mesh.nodes[mesh.elements[e]]
+        points = np.vstack([corners, [pixels.columns[i], pixels.rows[i]]]) - corners[0]
+        quadratic = [(xx * x * x + 2 * xy * x * y + yy * y * y) / 2 for x, y in points]
+        out.append(quadratic[3] - shape_functions(pixels, e, i) @ quadratic[:3])
+    return np.array(out).T

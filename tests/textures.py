@@ -54,6 +54,13 @@ class Texture:
         vectors = random.normal(size=(waves, 2)) / (spot * np.sqrt(2))
         return cls(waves=vectors, phases=random.uniform(0, 2 * np.pi, waves), contrast=contrast)
 
+    def at(self, x: Array, y: Array) -> Array:
+        """Grey levels at any points, for motions that are not affine."""
+        total = np.zeros(np.shape(x))
+        for (a, b), phase in zip(self.waves, self.phases, strict=True):
+            total += np.cos(a * x + b * y + phase)
+        return np.asarray(self.mean + self.contrast * np.sqrt(2 / len(self.waves)) * total)
+
     def image(self, shape: tuple[int, int], motion: Affine | None = None) -> Array:
         """Grey levels (H, W) at the pixel centres once every material point has moved."""
         motion = motion or Affine()

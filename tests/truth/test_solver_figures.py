@@ -82,28 +82,44 @@ SIGMA = 4.0
 
 
 @cache
-def noise(lights: int, prefilter: str) -> tuple[float, float]:
+def noise(lights: int, prefilter: str = "binomial", *, statistics: bool = True) -> tuple[float, float]:
     """Observed and predicted standard deviation of u and v in px under `lights` lights with independent noise."""
     motion = Affine(shift=(0.3, 0.2))
     pair = [texture().image(NOISE_SHAPE), texture().image(NOISE_SHAPE, motion)]
     stacks = [np.stack([image] * lights) for image in pair]
     random = np.random.default_rng(lights)
     found = [
-        correlate(*noisy_pair(stacks, SIGMA, random), region=NOISE_REGION, prefilter=prefilter, initial=motion.shift)
+        correlate(
+            *noisy_pair(stacks, SIGMA, random),
+            region=NOISE_REGION,
+            prefilter=prefilter,
+            initial=motion.shift,
+            statistics=statistics,
+        )
         for _ in range(DRAWS)
     ]
     observed = np.stack([one.displacement for one in found]).std(axis=0, ddof=1)
     return rms(observed), rms(np.stack([one.displacement_std for one in found]))
 
 
-def test_the_noise_falls_as_the_root_of_the_number_of_lights():
-    alone = noise(1, "binomial")[0]
-    assert noise(3, "binomial")[0] * np.sqrt(3) == pytest.approx(alone, rel=ROOT_OF_LIGHTS)
+@pytest.mark.parametrize("statistics", [False, True])
+def test_the_noise_falls_as_the_root_of_the_number_of_lights(statistics):
+    alone = noise(1, statistics=statistics)[0]
+    assert noise(3, statistics=statistics)[0] * np.sqrt(3) == pytest.approx(alone, rel=ROOT_OF_LIGHTS)
 
 
-@pytest.mark.parametrize(("lights", "prefilter"), [(1, "none"), (1, "binomial"), (3, "binomial")])
-def test_the_predicted_noise_is_the_observed_one(lights, prefilter):
-    observed, predicted = noise(lights, prefilter)
+@pytest.mark.parametrize(
+    ("lights", "options"),
+    [
+        (1, {"prefilter": "none", "statistics": False}),
+        (1, {"statistics": False}),
+        (3, {"statistics": False}),
+        (1, {"statistics": True}),
+        (3, {"statistics": True}),
+    ],
+)
+def test_the_predicted_noise_is_the_observed_one(lights, options):
+    observed, predicted = noise(lights, **options)
     assert predicted == pytest.approx(observed, rel=PREDICTED_NOISE)
 
 
@@ -114,6 +130,23 @@ def test_twice_the_noise_doubles_the_prediction():
         for sigma in (3.0, 6.0)
     )
     assert loud / quiet == pytest.approx(2, rel=0.05)
+
+
+def test_the_nodes_of_a_curved_field_are_corrected_or_their_uncertainty_says_so():
+    bend = 2e-4  # second derivative of u in 1/px: 0.01 px at the nodes of 25 px elements
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    material = x.copy()
+    for _ in range(30):
+        material = x - bend / 2 * (material - 100) ** 2
+    pair = reference_image(), texture().at(material, y)
+    plain, corrected = (correlate(*pair, region=REGION, curvature=on) for on in (False, True))
+    inner = (np.abs(plain.nodes - 100) < 40).all(axis=1)
+    off, left = (
+        np.abs(one.displacement[inner, 0] - bend / 2 * (one.nodes[inner, 0] - 100) ** 2) for one in (plain, corrected)
+    )
+    assert off.mean() > 0.006
+    assert rms(left) < 0.35 * rms(off)
+    assert (plain.displacement_std[inner, 0] > 0.7 * off).all()
 
 
 @pytest.mark.parametrize("shift", [(40.0, 0.0), (-28.3, 28.3), (0.4, -40.2)])

@@ -175,6 +175,23 @@ def test_neighbours_and_sums_at_the_nodes():
     np.testing.assert_allclose(mesh.to_nodes(np.array([1.0, 10.0])), [11, 1, 11, 10])
 
 
+def test_the_gradient_at_the_nodes_of_a_linear_field_is_exact_and_of_a_quadratic_one_inside():
+    mesh = Tri3Mesh.from_region(REGIONS["rectangle"], 13)
+    x, y = mesh.nodes.T
+    linear = mesh.nodal_gradient(np.stack([2 * x - 3 * y, 0.5 * y + 7], axis=1))
+    np.testing.assert_allclose(linear, np.broadcast_to([[2, -3], [0, 0.5]], linear.shape), atol=1e-9)
+    inner = ~mesh.on_boundary
+    quadratic = mesh.nodal_gradient(np.stack([x * x, x * y], axis=1))[inner]
+    np.testing.assert_allclose(quadratic[:, 0], np.stack([2 * x, 0 * x], axis=1)[inner], atol=1e-8)
+    np.testing.assert_allclose(quadratic[:, 1], np.stack([y, x], axis=1)[inner], atol=1e-8)
+
+
+def test_boundary_nodes_are_those_on_the_outline():
+    mesh = Tri3Mesh.from_region(REGIONS["rectangle"], 13)
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    np.testing.assert_array_equal(mesh.on_boundary, ((mesh.nodes == low) | (mesh.nodes == high)).any(axis=1))
+
+
 def test_clockwise_elements_are_turned_and_impossible_meshes_refused():
     mesh = Tri3Mesh(nodes=[(0, 0), (10, 0), (10, 10)], elements=[(0, 2, 1)])
     np.testing.assert_array_equal(mesh.elements, [(0, 1, 2)])
