@@ -92,7 +92,8 @@ def fit_column(signal: Floats, valid: Bools, reference: int, design: Floats) -> 
 
 
 def _moment(weights: Floats, design: Floats) -> Floats:
-    return np.asarray(np.einsum("nrs,rst,rsu->tu", weights, design, design, optimize=True))
+    flat = design.reshape(-1, design.shape[-1])
+    return np.asarray((flat * weights.sum(axis=0).reshape(-1, 1)).T @ flat)
 
 
 def _total(weights: Floats, design: Floats) -> Floats:
@@ -120,7 +121,7 @@ def _without_outliers(signal: Floats, valid: Bools, reference: int, design: Floa
         spread = np.median(np.abs(scaled.transpose(0, 2, 3, 1)[valid]), axis=0) / 0.6745
         limit = np.where(spread > 0, OUTLIER * spread, np.inf)[:, None, None]
         weights = (valid & (np.abs(scaled) <= limit).all(axis=1)).astype(np.float64)
-        right = np.einsum("nrs,ncrs,rst->tc", weights, signal, design, optimize=True)
+        right = np.einsum("crs,rst->tc", (weights[:, None] * signal).sum(axis=0), design)
         update = np.linalg.solve(_moment(weights * base, design), right)
         done = np.abs(update - coefficients).max() < 1e-10
         coefficients = update
@@ -178,7 +179,8 @@ def variation(signal: Floats, valid: Bools, reference: int, design: Floats, know
     sums = _cluster_sums(score.reshape(-1, *score.shape[2:]))
     inverse = np.linalg.pinv(sums.T @ sums)
     signs = np.random.default_rng(0).choice((-1.0, 1.0), (4999, len(sums)))
-    flipped = np.einsum("fq,qp,fp->f", signs @ sums, inverse, signs @ sums, optimize=True)
+    flips = signs @ sums
+    flipped = ((flips @ inverse) * flips).sum(axis=1)
     observed = sums.sum(axis=0) @ inverse @ sums.sum(axis=0)
     coefficients = fit_column(signal, valid, reference, design).coefficients[known:, others]
     norms = (design[..., known:] ** 2).mean(axis=(0, 1))
