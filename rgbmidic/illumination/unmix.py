@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.unmix import unmix as unmix_kernel
+from rgbmidic._kernels.unmix_field import unmix_field as unmix_field_kernel
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
@@ -17,6 +18,9 @@ NEGLIGIBLE = 1e-3
 """A channel whose coefficient is below this fraction of the light's largest does not make the light invalid: clipped at
 full scale it would change the light by less than a thousandth of full scale."""
 
+GRID = 32
+"""Largest distance (px) of the points between which a matrix that varies over the field is interpolated."""
+
 
 def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float = NEGLIGIBLE) -> IlluminationImages:
     """One image per light from camera channels: ``lights = A^-1 channels`` (pseudo-inverse for k < C).
@@ -26,7 +30,7 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
     channels
         Values (C, H, W) above black, with their validity.
     crosstalk
-        A, shape (C, k).
+        A, shape (C, k), everywhere the same or varying over the field.
     negligible
         Coefficients of A^-1 below this fraction of the largest of their row do not make a light invalid.
 
@@ -54,7 +58,21 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
     valid = np.empty(values.shape, dtype=bool)
     flat = np.ascontiguousarray(channels.values, dtype=np.float32).reshape(colours, -1)
     flat_valid = np.ascontiguousarray(channels.valid, dtype=bool).reshape(colours, -1)
-    unmix_kernel(flat, flat_valid, matrix.astype(np.float32), needed, values, valid)
+    if crosstalk.field is None:
+        unmix_kernel(flat, flat_valid, matrix.astype(np.float32), needed, values, valid)
+    else:
+        step = max(min(GRID, min(shape) // 16), 2)
+        grid = _unmixing_grid(crosstalk, shape, step)
+        image = (-1, *shape)
+        unmix_field_kernel(
+            flat.reshape(image),
+            flat_valid.reshape(image),
+            grid,
+            step,
+            needed,
+            values.reshape(image),
+            valid.reshape(image),
+        )
     return IlluminationImages(
         values=values.reshape(lights, *shape),
         valid=valid.reshape(lights, *shape),
@@ -62,6 +80,18 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
         full_scale=channels.full_scale,
         covariance=_covariance(channels, matrix),
     )
+
+
+def _unmixing_grid(crosstalk: Crosstalk, shape: tuple[int, ...], step: int) -> npt.NDArray[np.float32]:
+    """A^-1 at every `step`-th pixel and beyond the last ones, (GY, GX, k, C)."""
+    if crosstalk.field is not None and crosstalk.field.shape != tuple(shape):
+        calibrated = crosstalk.field.shape
+        raise InputError(
+            f"the crosstalk varies over a field of {calibrated[1]} x {calibrated[0]} px; the frame has {shape[1]} x "
+            f"{shape[0]} px: calibrate with frames of the size of the test"
+        )
+    y, x = (step * np.arange((side - 1) // step + 2) for side in shape)
+    return crosstalk.unmixing_at(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
 
 
 def _covariance(channels: LinearChannels, matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:

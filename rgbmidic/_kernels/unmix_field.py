@@ -1,0 +1,39 @@
+"""Compiled loop that turns camera channels into lights with a matrix that varies slowly over the field."""
+
+import numpy as np
+from numba import njit, prange
+
+__all__ = ["unmix_field"]
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def unmix_field(channels, valid, grid, step, needed, out, out_valid):
+    """``out = matrix(x, y) @ channels`` with the matrix interpolated linearly between grid points `step` px apart.
+
+    channels, valid: (C, H, W); grid: (GY, GX, k, C) at x, y = 0, step, 2 step ... beyond the last pixel; needed:
+    (k, C); out, out_valid: (k, H, W). Invalid where a `needed` channel is; one not needed contributes nothing.
+    """
+    colours, height, width = channels.shape
+    lights = out.shape[0]
+    for y in prange(height):
+        gy = y // step
+        down = np.float32(y - gy * step) / np.float32(step)
+        for light in range(lights):
+            values, ok = out[light, y], out_valid[light, y]
+            values[:] = 0.0
+            ok[:] = True
+            for colour in range(colours):
+                counts = needed[light, colour]
+                for gx in range((width + step - 1) // step):
+                    start, stop = gx * step, min((gx + 1) * step, width)
+                    above, below = grid[gy, gx, light, colour], grid[gy + 1, gx, light, colour]
+                    left = above + (below - above) * down
+                    above, below = grid[gy, gx + 1, light, colour], grid[gy + 1, gx + 1, light, colour]
+                    slope = (above + (below - above) * down - left) / np.float32(step)
+                    for x in range(start, stop):
+                        good = valid[colour, y, x]
+                        factor = left + slope * np.float32(x - start)
+                        values[x] += factor * channels[colour, y, x] if good else np.float32(0.0)
+                        ok[x] &= good or not counts
+            for x in range(width):
+                values[x] = values[x] if ok[x] else np.float32(np.nan)
