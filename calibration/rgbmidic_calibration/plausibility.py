@@ -45,7 +45,8 @@ WEAK_LIMIT, WEAK_WARNING = 0.01, 0.10
 COLOUR_LIMIT = 0.02
 """A capture whose entry departs by more than this from the median of its light is another picture."""
 DETAIL_LIMIT = 0.6
-INTENSITY_WARNING = 0.05
+INTENSITY_WARNING, DELIBERATE = 0.05, 0.30
+"""Captures whose strengths differ by more than the second are meant to: an exposure series."""
 COLOUR_DRIFT_WARNING = 5e-4
 OFFSET_WARNING, OFFSET_SIGNIFICANCE = 0.002, 5.0
 CONDITION_WARNING = 6.0
@@ -298,7 +299,7 @@ def _check_agreement(
 
 def _fit_warnings(fit: LightFit) -> list[str]:
     warnings = []
-    if fit.intensity_drift > INTENSITY_WARNING:
+    if INTENSITY_WARNING < fit.intensity_drift < DELIBERATE:
         warnings.append(
             f"light {fit.name}: its strength differs by {100 * fit.intensity_drift:.1f} % between captures: let the "
             "lamp warm up (the matrix does not suffer)"

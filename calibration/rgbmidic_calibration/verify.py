@@ -32,6 +32,9 @@ Floats = npt.NDArray[np.float64]
 
 BLOCK = 16
 
+SAME_EXPOSURE = 0.05
+"""Range of the captures' strengths, relative to their mean, up to which their scatter is noise."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
@@ -347,10 +350,12 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
     Raises
     ------
     CalibrationError
-        Fewer than two captures.
+        Fewer than two captures, or captures of different exposures.
     """
     if stack.count < 2:
         raise CalibrationError("noise needs at least two captures of the same scene")
+    if float((np.ptp(stack.strength, axis=0) / np.maximum(stack.strength.mean(axis=0), 1)).max()) > SAME_EXPOSURE:
+        raise CalibrationError("the captures of a light have different exposures")
     observed = predicted = 0.0
     samples = 0
     for mean, variance, clipped in zip(stack.mean, stack.variance, stack.clipped, strict=True):

@@ -1,0 +1,82 @@
+"""The virtual sphere measured with a calibration from captures alone, against the run that is given the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rgbmidic.config import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.registration import Registration, frame_geometry
+from rgbmidic.pipeline import measure
+from rgbmidic.sequence.writers import write_dng
+from rgbmidic.virtual import record, render, sphere_scene, truth, turned
+from rgbmidic.virtual.capture import dark_frames, target_scene
+from rgbmidic_calibration.blocks import block_means
+from rgbmidic_calibration.crosstalk import estimate_crosstalk
+from rgbmidic_calibration.noise import photon_transfer
+from rgbmidic_calibration.registration import estimate_registration
+from rgbmidic_calibration.stacks import stack_frames
+
+SIZE = 224
+ABERRATION = (-2e-4, 0.0, 3e-4)
+LOSS = 0.05
+BORDER = 30
+
+
+def from_captures(scene):
+    target, camera, lights = render(target_scene(scene, "speckled")), scene.camera, scene.lights
+    singles = {
+        light.name: [record(target, camera, lights, seed=100 * i + k, on=(light.name,)) for k in range(4)]
+        for i, light in enumerate(lights)
+    }
+    dark = dark_frames(camera, count=4, seed=9)
+    crosstalk = estimate_crosstalk(
+        {name: [block_means(frame) for frame in frames] for name, frames in singles.items()},
+        [block_means(frame) for frame in dark],
+    ).crosstalk
+    dark_stack = stack_frames(dark, drifts=False)
+    stacks = {name: stack_frames(frames) for name, frames in singles.items()}
+    dimmed = [target * np.float32(share) for share in (0.3, 0.6)]
+    flats = [
+        [record(image, camera, lights, seed=500 + 10 * i + k, on=("green",)) for k in range(2)]
+        for i, image in enumerate(dimmed)
+    ]
+    noise = photon_transfer(dark_stack, [*(stack_frames(frames) for frames in flats), stacks["green"]]).camera_noise
+    return Calibration(
+        crosstalk=crosstalk, camera_noise=noise, registration=estimate_registration(stacks, dark_stack).registration
+    )
+
+
+def true_calibration(scene):
+    centre, radius = frame_geometry(scene.camera.shape)
+    parameters = np.zeros((3, 5))
+    parameters[:, 3] = [(1 + m) / (1 + ABERRATION[0]) - 1 for m in ABERRATION]
+    names = tuple(light.name for light in scene.lights)
+    return Calibration(
+        crosstalk=scene.camera.true_crosstalk(scene.lights),
+        noise=scene.camera.noise,
+        registration=Registration(lights=names, parameters=parameters, centre=centre, radius=radius),
+    )
+
+
+def test_calibration_from_captures_loses_less_than_five_per_cent(tmp_path):
+    scene, state = sphere_scene(size=SIZE, seed=5, aberration=ABERRATION), turned(2.0)
+    (tmp_path / "frames").mkdir()
+    for index, image in enumerate((render(scene), render(scene, state))):
+        write_dng(tmp_path / "frames" / f"{index}.dng", record(image, scene.camera, scene.lights, seed=index))
+    exact = truth(scene, state)
+    errors = {}
+    for name, calibration in (("truth", true_calibration(scene)), ("captures", from_captures(scene))):
+        calibration.write(tmp_path / f"{name}.json")
+        settings = TestSettings(
+            frames=FrameSettings(path=("frames/*.dng",)),
+            region=RegionSettings(rectangle=(BORDER, BORDER, SIZE - 1 - BORDER, SIZE - 1 - BORDER)),
+            calibration_file=tmp_path / f"{name}.json",
+            base=tmp_path,
+        )
+        result = measure(settings, tmp_path / name)
+        column, row = np.rint(result.nodes).astype(int).T
+        found = np.stack([result.u[1], result.v[1]])
+        errors[name] = float(np.sqrt(np.nanmean((found - exact[:, row, column]) ** 2)))
+    assert errors["truth"] < 0.03
+    assert errors["captures"] < (1 + LOSS) * errors["truth"]
