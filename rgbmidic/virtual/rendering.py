@@ -13,7 +13,7 @@ from rgbmidic.virtual.fields import AffineField, InPlaneField, material_from_spa
 from rgbmidic.virtual.light import NOMINAL_DISTANCE, Light
 from rgbmidic.virtual.scene import Plate, Scene, State
 
-__all__ = ["material_points", "render", "samples_needed", "truth"]
+__all__ = ["material_points", "placed", "render", "samples_needed", "truth"]
 
 Array = npt.NDArray[np.float64]
 BAND = 64
@@ -62,10 +62,17 @@ def render(scene: Scene, state: State | None = None) -> npt.NDArray[np.float32]:
     return out * np.float32(1 / len(poses))
 
 
-def material_points(scene: Scene, state: State | None = None) -> Array:
-    """Material point (mm, body axes) that an ideal lens sees at every pixel centre, shape (3, H, W); NaN off it."""
+def material_points(scene: Scene, state: State | None = None, pixels: tuple[Array, Array] | None = None) -> Array:
+    """Material point (mm, body axes) that an ideal lens sees at every pixel centre, shape (3, H, W); NaN off it.
+
+    `pixels`: image points (x, y) in px, two arrays of one shape, instead of the pixel centres.
+    """
     state = state or State()
-    x, y = np.meshgrid(np.arange(scene.camera.shape[1], dtype=float), np.arange(scene.camera.shape[0], dtype=float))
+    if pixels is None:
+        height, width = scene.camera.shape
+        x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    else:
+        x, y = pixels
     spatial = _intersect(scene, state, x, y)
     if isinstance(scene.body, Plate):
         spatial[:2] = material_from_spatial(state.displacement, spatial[0], spatial[1])
@@ -73,6 +80,27 @@ def material_points(scene: Scene, state: State | None = None) -> Array:
         outside = (abs(spatial[0]) > scene.body.width / 2) | (abs(spatial[1]) > scene.body.height / 2)
         spatial[:, outside] = np.nan
     return spatial
+
+
+def placed(scene: Scene, material: Array, state: State | None = None) -> tuple[Array, Array]:
+    """Where material points (3, ...) are in a state, and which way the surface faces there.
+
+    Returns
+    -------
+    points : ndarray, shape (3, ...)
+        mm, camera axes.
+    normals : ndarray, shape (3, ...)
+        Outward unit normals, camera axes.
+    """
+    state = state or State()
+    position = material.copy()
+    if isinstance(scene.body, Plate) and state.displacement is not None:
+        ux, uy = state.displacement(material[0], material[1])
+        position[0] += ux
+        position[1] += uy
+    turn, origin = state.pose(scene.body)
+    points = np.einsum("ij,j...->i...", turn, position) + origin.reshape(3, *[1] * (material.ndim - 1))
+    return points, np.einsum("ij,j...->i...", turn, _normals(scene, material))
 
 
 def truth(scene: Scene, state: State, reference: State | None = None) -> Array:
@@ -93,15 +121,7 @@ def truth(scene: Scene, state: State, reference: State | None = None) -> Array:
         (u, v) in px; NaN where the pixel is not on the body or the point is hidden in `state`. Points that leave the
         frame keep their displacement.
     """
-    material = material_points(scene, reference)
-    position = material.copy()
-    if isinstance(scene.body, Plate) and state.displacement is not None:
-        ux, uy = state.displacement(material[0], material[1])
-        position[0] += ux
-        position[1] += uy
-    turn, origin = state.pose(scene.body)
-    point = np.einsum("ij,jyx->iyx", turn, position) + origin[:, None, None]
-    normal = np.einsum("ij,jyx->iyx", turn, _normals(scene, material))
+    point, normal = placed(scene, material_points(scene, reference), state)
     hidden = ~((normal * point).sum(axis=0) < 0)
     camera = scene.camera
     x = camera.focal_px * point[0] / point[2] + camera.centre[0] - np.arange(camera.shape[1])
@@ -219,7 +239,7 @@ def _intersect(scene: Scene, state: State, x: Array, y: Array) -> Array:
 
 
 def _normals(scene: Scene, material: Array) -> Array:
-    """Outward unit normals (3, H, W) in body axes."""
+    """Outward unit normals (3, ...) in body axes."""
     normal = np.zeros_like(material)
     if isinstance(scene.body, Plate):
         normal[2] = -1.0
