@@ -1,0 +1,29 @@
+"""Every example runs, and the number it ends in keeps its limit."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+LIMITS = {
+    "bayer_pair.py": ("rms error", 0.015),
+    "plain_dic.py": ("rms error", 0.002),
+    "two_lights.py": ("ratio", 0.4),
+}
+"""What the last line says, and the largest number it may end in."""
+
+
+def test_every_example_has_its_limit():
+    assert {path.name for path in EXAMPLES.glob("*.py")} == set(LIMITS)
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_the_last_number_keeps_its_limit(name, capsys):
+    runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+    what, limit = LIMITS[name]
+    label, _, rest = capsys.readouterr().out.strip().splitlines()[-1].partition(": ")
+    assert label == what
+    assert 0 < float(rest.split()[0]) <= limit
