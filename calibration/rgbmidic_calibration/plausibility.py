@@ -40,6 +40,8 @@ DARK_SHARE_LIMIT = 0.10
 DARK_SCALE_LIMIT = 0.05
 """Dark frames brighter than this share of the full scale are not dark."""
 DARK_WARNING = 0.005
+DARK_LEVEL_WARNING = 2.0
+"""Departure (DN) of the dark frames from the stated black level that the user should know of."""
 GREENS_LIMIT, GREENS_WARNING = 0.08, 0.03
 WEAK_LIMIT, WEAK_WARNING = 0.01, 0.10
 COLOUR_LIMIT = 0.02
@@ -205,10 +207,10 @@ def _check_dark(
             f"the dark frames are not dark: {level:.1f} DN above the black level, where the weakest light with its "
             f"surroundings gives {min(brightest):.1f} DN: was a lamp on, or does daylight reach the target?",
         )
-    elif np.abs(median).max() > DARK_WARNING * scale:
+    elif np.abs(median).max() > min(DARK_WARNING * scale, DARK_LEVEL_WARNING):
         return [
             f"the dark frames are {median[np.abs(median).argmax()]:+.1f} DN from the stated black level: right only if "
-            "the same ambient light (or black level) holds in all captures and in the test"
+            "the same ambient light holds in all captures and in the test; without ambient light state this black level"
         ]
     return []
 
