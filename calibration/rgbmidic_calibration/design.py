@@ -221,14 +221,15 @@ def _is_number(text: str) -> bool:
 
 def draw_design(result: Design, camera: Sensitivities, lamps: Mapping[str, Lamp], path: Path) -> None:
     """Picture of the spectra over the camera's sensitivities, and of the predicted matrix."""
-    from rgbmidic_calibration.pictures import draw_matrix, save
+    from rgbmidic_calibration.pictures import COLOURS, draw_matrix, save
 
     def spectra(axes: Axes) -> None:
-        for name, values, colour in zip("RGB", camera.values, ("#c0392b", "#27823b", "#2457a6"), strict=True):
+        for name, values, colour in zip("RGB", camera.values, COLOURS, strict=False):
             axes.plot(camera.wavelengths, values / camera.values.max(), color=colour, label=f"camera {name}")
-        for name in result.crosstalk.lights:
+        for name, column in zip(result.crosstalk.lights, result.crosstalk.matrix.T, strict=True):
             power = lamps[name].power(camera.wavelengths)
-            axes.fill_between(camera.wavelengths, power / power.max(), alpha=0.25, label=name)
+            colour = COLOURS[column.argmax()]
+            axes.fill_between(camera.wavelengths, power / power.max(), alpha=0.25, label=name, color=colour)
         axes.set(xlabel="wavelength, nm", ylabel="relative")
         axes.legend(fontsize="small")
 

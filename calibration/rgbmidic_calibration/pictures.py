@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_calibration", "draw_matrix", "save"]
+__all__ = ["COLOURS", "draw_calibration", "draw_matrix", "save"]
 
 COLOURS = ("#c0392b", "#27823b", "#2457a6", "#7d3c98")
 
