@@ -25,6 +25,8 @@ def random_record(seed: int) -> FrameRecord:
     return FrameRecord(
         displacement=displacement,
         displacement_std=np.where(blank[:, None], np.nan, random.uniform(0.01, 0.02, (NODES, 2))),
+        strain=np.where(blank[:, None], np.nan, random.normal(0, 1e-3, (NODES, 3))),
+        strain_std=np.where(blank[:, None], np.nan, random.uniform(1e-4, 2e-4, (NODES, 3))),
         status=seed % 2,
         node_status=blank.astype(np.uint8),
         residual=random.uniform(10, 20, 3),

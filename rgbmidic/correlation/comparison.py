@@ -25,6 +25,8 @@ _FREEDOM = 4.0
 """Degrees of freedom of the Student distribution taken for the residual."""
 _RANGE = 8.0
 """Standard deviation (px) of the window in which the variance of the residual is estimated."""
+_COARSE = 4
+"""Reduction of the grid on which that window is applied."""
 _BLOCK = 9
 """Side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
 _SCORE_RANGE = 20.0
@@ -94,7 +96,8 @@ class Comparison:
         return np.stack([correct(light) for light in range(len(self.values))])
 
     def _global(self, light: int) -> FloatImage:
-        f, g = self.reference.values[light], self.warped[light]
+        f: FloatImage = self.reference.values[light]
+        g: FloatImage = self.warped[light]
         weight = np.where(np.isfinite(g), self.weights[light], np.float32(0)).astype(np.float64)
         total = weight.sum()
         if not total:
@@ -109,7 +112,8 @@ class Comparison:
 
     def _local(self, light: int) -> FloatImage:
         reference, pixels = self.reference, self.reference.pixels
-        f, g = reference.values[light], np.nan_to_num(self.warped[light])
+        f: FloatImage = reference.values[light]
+        g: FloatImage = np.nan_to_num(self.warped[light])
         weight = np.where(np.isfinite(self.warped[light]), self.weights[light], np.float32(0))
         if not weight.any():
             return f
@@ -151,10 +155,16 @@ class Comparison:
         return np.asarray(typical / variance * robust, dtype=np.float32), np.asarray(bend, dtype=np.float32)
 
     def _local_mean(self, values: FloatImage, weight: FloatImage) -> FloatImage:
+        """Weighted Gaussian mean (P,) around each pixel, found on a coarser grid: it varies slowly."""
         pixels = self.reference.pixels
-        total = _blur(pixels.scatter(values * weight), _RANGE)
-        share = _blur(pixels.scatter(weight), _RANGE)
-        return pixels.gather(np.asarray(total / np.maximum(share, np.float32(1e-6)), dtype=np.float32))
+        coarse = [
+            cv2.resize(pixels.window(v), None, fx=1 / _COARSE, fy=1 / _COARSE, interpolation=cv2.INTER_AREA)
+            for v in (values * weight, weight)
+        ]
+        total, share = (_blur(np.asarray(image, dtype=np.float32), _RANGE / _COARSE) for image in coarse)
+        top, left, height, width = pixels.bounds
+        fine = cv2.resize(total / np.maximum(share, np.float32(1e-6)), (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(np.asarray(fine)[pixels.rows - top, pixels.columns - left], dtype=np.float32)
 
     def score_covariance(self, step_weights: FloatImage, measured: int) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side, from the residual itself.
@@ -166,30 +176,40 @@ class Comparison:
         reference, pixels = self.reference, self.reference.pixels
         score = np.zeros((2, pixels.rows.size), dtype=np.float32)
         for light, (weight, residual) in enumerate(zip(step_weights, self.residual, strict=True)):
-            score[0] += weight * residual * reference.gradient_x[light]
-            score[1] += weight * residual * reference.gradient_y[light]
-        used = pixels.scatter(np.asarray(step_weights.any(axis=0), dtype=np.float32))
-        area = float(_BLOCK**2)
-        sums = [_block_sum(pixels.scatter(q)) for q in score]
-        count = _blur(_block_sum(used), _SCORE_RANGE)
-        fitted = min(area * measured / max(float(used.sum()), 1.0), 0.75)
-        floor = np.float32(1e-3 * area)
-        products = (sums[0] * sums[0], sums[0] * sums[1], sums[1] * sums[1])
-        xx, xy, yy = (
-            pixels.gather(np.asarray(_blur(p, _SCORE_RANGE) / np.maximum(count, floor), dtype=np.float32))
-            / np.float32(1 - fitted)
-            for p in products
-        )
-        # the kernel takes squares of vectors: the covariance is the sum of two
-        first = np.sqrt(np.maximum(xx, 0))
-        along = np.divide(xy, first, out=np.zeros_like(xy), where=first > 0)
-        rest = np.sqrt(np.maximum(yy - along * along, 0))
-        one = pixels.gather(used)
-        return reference.blocks(one, first, along) + reference.blocks(one, np.zeros_like(rest), rest)
+            pull = weight * residual
+            score[0] += pull * reference.gradient_x[light]
+            score[1] += pull * reference.gradient_y[light]
+        used = np.asarray(step_weights.any(axis=0), dtype=np.float32)
+        x, y, count = (self._block_sums(values) for values in (score[0], score[1], used))
+        around = np.maximum(_blur(count, _SCORE_RANGE / _BLOCK), np.float32(1e-3 * _BLOCK**2))
+        fitted = min(_BLOCK**2 * measured / max(float(used.sum()), 1.0), 0.75)
+        density = np.stack([_blur(product, _SCORE_RANGE / _BLOCK) / around for product in (x * x, x * y, y * y)])
+        return self._spread(density.astype(np.float64) / (1 - fitted), used)
 
+    def _block_sums(self, values: FloatImage) -> FloatImage:
+        """Sums of a pixel field (P,) over blocks of `_BLOCK` x `_BLOCK` px."""
+        image = self.reference.pixels.window(values)
+        rows, columns = (-(-size // _BLOCK) for size in image.shape)
+        padded = np.zeros((rows * _BLOCK, columns * _BLOCK), dtype=np.float32)
+        padded[: image.shape[0], : image.shape[1]] = image
+        return np.asarray(padded.reshape(rows, _BLOCK, columns, _BLOCK).sum(axis=(1, 3)), dtype=np.float32)
 
-def _block_sum(image: FloatImage) -> FloatImage:
-    return np.asarray(cv2.boxFilter(image, -1, (_BLOCK, _BLOCK), normalize=False), dtype=np.float32)
+    def _spread(self, density: FloatArray, used: FloatImage) -> FloatArray:
+        """Element blocks of a score variance per pixel (xx, xy, yy) that is constant in each element.
+
+        ``integral phi_a phi_b`` over a triangle is its area times (1 + delta_ab) / 12; the area is that of the pixels
+        in use.
+        """
+        mesh, offsets = self.reference.mesh, self.reference.pixels.offsets
+        top, left, _, _ = self.reference.pixels.bounds
+        place = mesh.nodes[mesh.elements].mean(axis=1) - (left, top)
+        centre = np.round(place / _BLOCK - 0.5).astype(int)
+        column = np.clip(centre[:, 0], 0, density.shape[2] - 1)
+        row = np.clip(centre[:, 1], 0, density.shape[1] - 1)
+        owner = np.repeat(np.arange(len(mesh.elements)), np.diff(offsets))
+        area = np.bincount(owner, weights=used, minlength=len(mesh.elements))
+        mass = area[:, None, None] * (np.ones((3, 3)) + np.eye(3)) / 12
+        return np.asarray(mass[..., None] * density[:, row, column].T[:, None, None, :])
 
 
 def _blur(image: FloatImage, sigma: float) -> FloatImage:

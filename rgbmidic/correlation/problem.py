@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
 from rgbmidic._kernels.interpolation import sample_with_gradient
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
 from rgbmidic.correlation.system import NormalEquations
-from rgbmidic.correlation.uncertainty import Probing
+from rgbmidic.correlation.uncertainty import Probing, displacement_functionals, strain_functionals
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
@@ -56,6 +57,8 @@ class Reference:
     ----------
     mesh, pixels, equations, probing
         TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
+    functionals : tuple of csr_matrix, shape (N, 2 N)
+        u, v, exx, eyy, exy at the nodes as linear functions of the unknowns.
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded.
     values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
@@ -67,6 +70,7 @@ class Reference:
     pixels: PixelMap
     equations: NormalEquations
     probing: Probing
+    functionals: tuple[sp.csr_matrix, ...]
     images: FloatImage
     weights: FloatImage
     values: FloatImage
@@ -104,6 +108,7 @@ class Reference:
             pixels=pixels,
             equations=NormalEquations.from_mesh(mesh),
             probing=Probing.from_mesh(mesh),
+            functionals=(*displacement_functionals(len(mesh.nodes)), *strain_functionals(mesh)),
             images=ready,
             weights=usable,
             values=samples[0],

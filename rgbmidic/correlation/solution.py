@@ -45,6 +45,9 @@ class Solution:
     displacement_std : ndarray, shape (N, 2), float64
         Standard uncertainty of the nodal values in px, from the residual (noise, demosaicing, erratic reflections) and
         from the curvature that linear elements cannot follow; NaN where not measured.
+    strain, strain_std : ndarray, shape (N, 3), float64
+        Small strain (exx, eyy, exy), tensor shear, and its standard uncertainty: the area-weighted mean of the elements
+        around each node; NaN where the node or a neighbour is not measured.
     node_status : ndarray, shape (N,), uint8
         See `NodeStatus`.
     status : Status
@@ -67,6 +70,8 @@ class Solution:
     elements: npt.NDArray[np.int32]
     displacement: FloatArray
     displacement_std: FloatArray
+    strain: FloatArray
+    strain_std: FloatArray
     node_status: npt.NDArray[np.uint8]
     status: Status
     reason: str

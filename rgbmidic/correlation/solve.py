@@ -19,7 +19,7 @@ from rgbmidic.correlation.curvature import curvature_correction
 from rgbmidic.correlation.problem import Deformed, Reference
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.step import Step, rigid_functions
-from rgbmidic.correlation.uncertainty import nodal_std
+from rgbmidic.correlation.uncertainty import functional_std
 from rgbmidic.errors import InputError
 
 __all__ = ["BRIGHTNESS", "SolveOptions", "solve"]
@@ -32,12 +32,12 @@ BRIGHTNESS = ("none", "global", "local")
 
 _LONGEST_STEP = 4.0
 """Longest motion of a node in one iteration, px."""
-_FIRST_PASS = 0.05
+_FIRST_PASS = 0.01
 """Increment (px) at which the first pass hands over to the pass with the weights brought back anew."""
 _PASSES = 8
 """Most passes: each brings the weights back with the latest displacement."""
-_REFINED = 2
-"""Passes after the first whose residual still changes the weights and grey levels."""
+_REFINED = {"none": 1, "global": 1, "local": 4}
+"""Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _PASS_ITERATIONS = 12
 _LOST = 0.5
 """Uncertainty (px) from which a node is lost: a position uncertain by half a pixel is not within reach of a match."""
@@ -145,6 +145,7 @@ class _Run:
     factor: FloatImage | None = None
     bend: FloatImage | None = None
     matched: npt.NDArray[np.bool_] = field(init=False)
+    seen: Comparison = field(init=False)
     history: list[float] = field(default_factory=list)
     sums: FloatArray = field(init=False)
     motion: FloatArray = field(init=False)
@@ -161,10 +162,10 @@ class _Run:
         """Passes until the weights have settled, then the result."""
         step: Step | None = None
         tolerance = self.options.tolerance
-        first = self._compare()
-        self.matched = first.matched(_STARTED)
+        self.seen = self._compare()
+        self.matched = self.seen.matched(_STARTED)
         if self.options.brightness != "none":
-            self.values = first.brightness("global")
+            self.values = self.seen.brightness("global")
         for number in range(_PASSES):
             weights = self._weights()
             if not weights.any():
@@ -182,10 +183,12 @@ class _Run:
         assert step is not None
         if self.history[-1] > tolerance:
             self._iterate(step, tolerance)
+            self.seen = self._compare()
         return self._conclude(step)
 
     def _refining(self, number: int) -> bool:
-        return (self.options.statistics or self.options.brightness != "none") and number <= _REFINED
+        refined = self.options.statistics or self.options.brightness != "none"
+        return refined and number <= _REFINED[self.options.brightness]
 
     def _light_displacement(self, light: int) -> FloatArray:
         return np.asarray(self.displacement + (self.functions @ self.rigid[light]).reshape(-1, 2))
@@ -195,9 +198,8 @@ class _Run:
         return np.stack([self.reference.pull_back(self.deformed, j, self._light_displacement(j)) for j in lights])
 
     def _weights(self) -> FloatImage:
-        """Pixel weights (k, P) of the next pass."""
-        weights = self._pull_back()
-        weights *= np.repeat(self.matched, np.diff(self.reference.pixels.offsets))
+        """Pixel weights (k, P) of the next pass: those last brought back, where the images match."""
+        weights = self.seen.weights * np.repeat(self.matched, np.diff(self.reference.pixels.offsets))
         if self.factor is not None:
             weights *= self.factor
         return weights
@@ -213,17 +215,17 @@ class _Run:
 
     def _learn(self, number: int, step: Step) -> None:
         """What the displacement found says about matching, brightness and precision."""
-        comparison = self._compare()
+        comparison = self.seen = self._compare()
         before = self.matched
         self.matched = comparison.matched()
         if not self.matched.all() or self.history[-1] > _FIRST_PASS:
             # a node whose own pixels match nothing wanders, though its elements match as a whole
-            lost = self._std(comparison, step).max(axis=1) > _LOST
+            lost = self._std(comparison, step, 2).max(axis=1) > _LOST
             if len(self.history) < self.options.max_iterations:
                 lost |= self.motion > _WANDERING
             self.matched &= ~lost[self.reference.mesh.elements].any(axis=1)
         # where elements have come back, what was learnt from their wrong match must be learnt anew
-        if number >= _REFINED and (before | ~self.matched).all():
+        if number >= _REFINED[self.options.brightness] and (before | ~self.matched).all():
             return
         if self.options.brightness != "none":
             self.values = comparison.brightness(self.options.brightness)
@@ -265,7 +267,7 @@ class _Run:
 
     def _conclude(self, step: Step) -> Solution:
         elements = self.reference.mesh.elements
-        std = self._std(self._compare(), step)
+        std, strain_std = np.split(self._std(self.seen, step, 5), [2], axis=1)
         lost = step.measured & (std.max(axis=1) > _LOST)
         measured = step.measured & ~lost
         if not measured.any():
@@ -281,6 +283,8 @@ class _Run:
             displacement = displacement - offset
         else:
             std = np.hypot(std, offset)
+        strain = np.stack([f @ displacement.ravel() for f in self.reference.functionals[2:]], axis=1)
+        inner = measured & ~self._beside(~measured)
         with np.errstate(invalid="ignore", divide="ignore"):
             residual = np.sqrt(self.sums[:, 0] / self.sums[:, 1])
         last = float(self.motion[measured].max())
@@ -290,6 +294,8 @@ class _Run:
             elements=elements,
             displacement=np.where(measured[:, None], displacement, np.nan),
             displacement_std=np.where(measured[:, None], std, np.nan),
+            strain=np.where(inner[:, None], strain, np.nan),
+            strain_std=np.where(inner[:, None], strain_std, np.nan),
             node_status=node_status,
             status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
             reason="" if converged else f"the last iteration still moved a node by {last:.3g} px",
@@ -299,10 +305,11 @@ class _Run:
             history=np.array(self.history),
         )
 
-    def _std(self, comparison: Comparison, step: Step) -> FloatArray:
-        """Standard uncertainty (N, 2) in px from the scores."""
-        scores = comparison.score_covariance(step.weights, int(step.measured.sum()))
-        std = nodal_std(step.solve, self.reference.equations.matrix(scores), self.reference.probing)
+    def _std(self, comparison: Comparison, step: Step, count: int) -> FloatArray:
+        """Standard uncertainty (N, count) of the first of u, v (px), exx, eyy, exy from the scores."""
+        reference = self.reference
+        scores = reference.equations.matrix(comparison.score_covariance(step.weights, int(step.measured.sum())))
+        std = functional_std(step.solve, scores, reference.probing, reference.functionals[:count])
         return std * self._robust_loss(step)
 
     def _robust_loss(self, step: Step) -> float:
@@ -312,10 +319,17 @@ class _Run:
         total = float(step.weights.sum(dtype=np.float64))
         return total / max(float((step.weights * self.bend).sum(dtype=np.float64)), 0.1 * total)
 
+    def _beside(self, nodes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Nodes that share an element with one of `nodes`, shape (N,)."""
+        elements = self.reference.mesh.elements
+        beside = np.zeros(len(nodes), dtype=bool)
+        beside[elements[nodes[elements].any(axis=1)]] = True
+        return beside
+
     def _nothing_left(self) -> str:
         if not self.matched.all():
             return "the images do not match anywhere in the region"
-        if not self._pull_back().any():
+        if not self.seen.weights.any():
             return "no light sees the region: every weight is zero"
         return "the images have no texture in the region"
 
@@ -327,6 +341,8 @@ class _Run:
             elements=self.reference.mesh.elements,
             displacement=nothing,
             displacement_std=nothing.copy(),
+            strain=np.full((len(nothing), 3), np.nan),
+            strain_std=np.full((len(nothing), 3), np.nan),
             node_status=np.full(len(nothing), NodeStatus.NOT_SEEN, dtype=np.uint8),
             status=Status.FAILED,
             reason=reason,

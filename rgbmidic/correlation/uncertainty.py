@@ -7,7 +7,7 @@ and each node of the result belongs to the nearest of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ import scipy.sparse as sp
 
 from rgbmidic.mesh import Tri3Mesh
 
-__all__ = ["Probing", "nodal_std"]
+__all__ = ["Probing", "displacement_functionals", "functional_std", "strain_functionals"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -68,10 +68,13 @@ def _greedy_colours(indptr: npt.NDArray[np.int32], indices: npt.NDArray[np.int32
     return colour
 
 
-def nodal_std(
-    solve: Callable[[FloatArray], FloatArray], right_side_covariance: sp.csc_matrix, probing: Probing
+def functional_std(
+    solve: Callable[[FloatArray], FloatArray],
+    right_side_covariance: sp.csc_matrix,
+    probing: Probing,
+    functionals: Sequence[sp.csr_matrix],
 ) -> FloatArray:
-    """Standard uncertainty (N, 2) of u and v: the root of the diagonal of ``M^-1 S M^-1``.
+    """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
 
     Parameters
     ----------
@@ -81,14 +84,38 @@ def nodal_std(
         S, shape (2 N, 2 N).
     probing
         Colouring of the mesh.
+    functionals
+        F matrices (N, 2 N); row n of each gives the quantity at node n, and is zero but for n and its neighbours.
     """
     count, colours = len(probing.colour), len(probing.nearest)
-    nodes = np.arange(count)
-    variance = np.empty((count, 2))
-    for axis in range(2):
-        unit = np.zeros((2 * count, colours))
-        unit[2 * nodes + axis, probing.colour] = 1.0
-        columns = solve(unit)
+    members = sp.csr_matrix((np.ones(count), (np.arange(count), probing.colour)), shape=(count, colours))
+    variance = np.empty((count, len(functionals)))
+    for i, functional in enumerate(functionals):
+        columns = solve((functional.T @ members).toarray())
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
-        variance[:, axis] = np.bincount(probing.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
+        variance[:, i] = np.bincount(probing.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
     return np.sqrt(np.maximum(variance, 0))
+
+
+def displacement_functionals(nodes: int) -> list[sp.csr_matrix]:
+    """The displacements u and v themselves, as `functional_std` takes them."""
+    row = np.arange(nodes)
+    return [sp.csr_matrix((np.ones(nodes), (row, 2 * row + axis)), shape=(nodes, 2 * nodes)) for axis in (0, 1)]
+
+
+def strain_functionals(mesh: Tri3Mesh) -> list[sp.csr_matrix]:
+    """Strains exx, eyy, exy at the nodes, means of the elements around by area, as `functional_std` takes them."""
+    slopes = mesh.shape_gradients() * mesh.areas[:, None, None]
+    share = 1 / mesh.to_nodes(mesh.areas)
+    row = np.repeat(mesh.elements, 3, axis=1).ravel()
+    column = np.tile(mesh.elements, 3).ravel()
+    count = len(mesh.nodes)
+
+    def matrix(*parts: tuple[int, int, float]) -> sp.csr_matrix:
+        total = sp.csr_matrix((count, 2 * count))
+        for component, axis, factor in parts:
+            values = factor * np.tile(slopes[..., axis], 3).ravel() * share[row]
+            total = total + sp.csr_matrix((values, (row, 2 * column + component)), shape=(count, 2 * count))
+        return sp.csr_matrix(total)
+
+    return [matrix((0, 0, 1.0)), matrix((1, 1, 1.0)), matrix((0, 1, 0.5), (1, 0, 0.5))]

@@ -88,6 +88,19 @@ class PixelMap:
         """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
         return np.ascontiguousarray(image[..., self.rows, self.columns])
 
+    @property
+    def bounds(self) -> tuple[int, int, int, int]:
+        """First row, first column, height and width of the smallest rectangle around the owned pixels."""
+        top, left = int(self.rows.min()), int(self.columns.min())
+        return top, left, int(self.rows.max()) - top + 1, int(self.columns.max()) - left + 1
+
+    def window(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """`values` (P,) as an image of the rectangle `bounds`, 0 where no pixel is owned."""
+        top, left, height, width = self.bounds
+        image = np.zeros((height, width), dtype=np.float32)
+        image[self.rows - top, self.columns - left] = values
+        return image
+
     def scatter(self, values: npt.NDArray[np.float32], fill: float = 0.0) -> npt.NDArray[np.float32]:
         """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""
         image = np.full(self.shape, fill, dtype=np.float32)

@@ -79,12 +79,15 @@ class Tri3Mesh:
 
     def element_gradient(self, values: FloatArray) -> FloatArray:
         """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2)."""
+        return np.asarray(np.einsum("eac,ead->ecd", values[self.elements], self.shape_gradients()))
+
+    def shape_gradients(self) -> FloatArray:
+        """Gradient of the three shape functions of every element, shape (E, 3, 2), per px."""
         p = self.nodes[self.elements]
         x, y = p[..., 0], p[..., 1]
         slopes_x = np.stack([y[:, 1] - y[:, 2], y[:, 2] - y[:, 0], y[:, 0] - y[:, 1]], axis=1)
         slopes_y = np.stack([x[:, 2] - x[:, 1], x[:, 0] - x[:, 2], x[:, 1] - x[:, 0]], axis=1)
-        slopes = np.stack([slopes_x, slopes_y], axis=-1) / (2 * self.areas)[:, None, None]
-        return np.asarray(np.einsum("eac,ead->ecd", values[self.elements], slopes))
+        return np.asarray(np.stack([slopes_x, slopes_y], axis=-1) / (2 * self.areas)[:, None, None])
 
     def nodal_gradient(self, values: FloatArray) -> FloatArray:
         """Gradient of nodal values (N, C) at the nodes: the area-weighted mean of the elements around; (N, C, 2)."""

@@ -16,14 +16,19 @@ from rgbmidic.sequence.store import Result
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
 
-_CSV_COLUMNS = ("frame", "name", "status", "node", "node_status", "x", "y", "u", "v", "u_std", "v_std")
+_STRAIN = ("exx", "eyy", "exy")
+_CSV_COLUMNS = (
+    *("frame", "name", "status", "node", "node_status", "x", "y", "u", "v", "u_std", "v_std"),
+    *_STRAIN,
+    *(f"{name}_std" for name in _STRAIN),
+)
 
 
 def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool = False) -> None:
     """Write all frames of a result into one file.
 
-    ``"npz"``: nodes (N, 2) and elements (E, 3); u, v, u_std, v_std and node_status (T, N); status and iterations (T,);
-    residual and weight_share (T, k); names and lights. ``"csv"``: a header line, then one row per node and frame.
+    ``"npz"``: nodes (N, 2) and elements (E, 3); u, v, exx, eyy, exy, each also with _std, and node_status (T, N); status
+    and iterations (T,); residual and weight_share (T, k); names and lights. ``"csv"``: a header line, then one row per node and frame.
     Positions and displacements are in px, x right, y down; NaN (an empty field in csv) where not measured.
 
     Parameters
@@ -59,6 +64,8 @@ def _write_npz(result: Result, file: BinaryIO) -> None:
         name: getattr(result, name)
         for name in ("nodes", "elements", "u", "v", "u_std", "v_std", "status", "node_status", "iterations")
     }
+    for axis, name in enumerate(_STRAIN):
+        arrays[name], arrays[f"{name}_std"] = result.strain[..., axis], result.strain_std[..., axis]
     arrays |= {name: np.asarray(getattr(result, name)) for name in ("residual", "weight_share", "names", "lights")}
     np.savez_compressed(file, **arrays)
 
@@ -75,7 +82,7 @@ def _write_csv(result: Result, file: BinaryIO) -> None:
 def _csv_rows(result: Result, index: int) -> Iterator[list[Any]]:
     record = result.frame(index)
     head = [index, result.names[index], record.status]
-    numbers = np.hstack([result.nodes, record.displacement, record.displacement_std])
+    numbers = np.hstack([result.nodes, record.displacement, record.displacement_std, record.strain, record.strain_std])
     for node, (status, row) in enumerate(zip(record.node_status, numbers.tolist(), strict=True)):
         yield [*head, node, int(status), *("" if number != number else f"{number:.9g}" for number in row)]
 

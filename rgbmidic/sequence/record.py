@@ -30,6 +30,8 @@ class FrameRecord:
 
     Attributes
     ----------
+    strain, strain_std : ndarray, shape (N, 3), float64
+        (exx, eyy, exy) and standard uncertainty; NaN where not measured.
     displacement, displacement_std : ndarray, shape (N, 2), float64
         (u, v) and standard uncertainty in px; NaN where not measured.
     status : int
@@ -52,6 +54,8 @@ class FrameRecord:
 
     displacement: FloatArray
     displacement_std: FloatArray
+    strain: FloatArray
+    strain_std: FloatArray
     status: int
     node_status: npt.NDArray[np.uint8]
     residual: FloatArray
@@ -97,6 +101,8 @@ class FrameRecord:
         return cls(
             displacement=np.full((nodes, 2), np.nan),
             displacement_std=np.full((nodes, 2), np.nan),
+            strain=np.full((nodes, 3), np.nan),
+            strain_std=np.full((nodes, 3), np.nan),
             status=Status.FAILED,
             node_status=np.full(nodes, NodeStatus.NOT_SEEN, dtype=np.uint8),
             residual=np.full(lights, np.nan),
@@ -118,6 +124,8 @@ def _arrays(nodes: int, lights: int) -> list[tuple[str, tuple[tuple[int, ...], A
     return [
         ("displacement", ((nodes, 2), np.float64)),
         ("displacement_std", ((nodes, 2), np.float64)),
+        ("strain", ((nodes, 3), np.float64)),
+        ("strain_std", ((nodes, 3), np.float64)),
         ("node_status", ((nodes,), np.uint8)),
         ("residual", ((lights,), np.float64)),
         ("weight_share", ((lights,), np.float64)),

@@ -253,6 +253,16 @@ class Result:
         return self._stack("displacement_std")[..., 1]
 
     @cached_property
+    def strain(self) -> FloatArray:
+        """Small strain (exx, eyy, exy), tensor shear, shape (T, N, 3); NaN where not measured."""
+        return self._stack("strain")
+
+    @cached_property
+    def strain_std(self) -> FloatArray:
+        """Standard uncertainty of `strain`, shape (T, N, 3)."""
+        return self._stack("strain_std")
+
+    @cached_property
     def status(self) -> npt.NDArray[np.int64]:
         """`Status` of each frame, shape (T,)."""
         return np.array([record.status for record in self._records], dtype=np.int64)

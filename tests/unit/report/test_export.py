@@ -25,7 +25,9 @@ def test_npz_holds_every_array(result: Result, tmp_path: Path) -> None:
         assert archive["u"].shape == archive["v_std"].shape == (3, NODES)
         assert archive["names"].tolist() == ["frame 0", "frame 1", "frame 2"]
         assert archive["lights"].tolist() == list(LIGHTS)
-        for name in set(archive.files) - {"names", "lights"}:
+        strains = {f"{name}{suffix}" for name in ("exx", "eyy", "exy") for suffix in ("", "_std")}
+        np.testing.assert_array_equal(archive["exy_std"], result.strain_std[..., 2])
+        for name in set(archive.files) - {"names", "lights"} - strains:
             np.testing.assert_array_equal(archive[name], getattr(result, name), err_msg=name)
         assert {"nodes", "elements", "u", "v", "u_std", "v_std", "status", "node_status"} <= set(archive.files)
 
