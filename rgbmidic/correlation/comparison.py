@@ -181,9 +181,16 @@ class Comparison:
             score[1] += pull * reference.gradient_y[light]
         used = np.asarray(step_weights.any(axis=0), dtype=np.float32)
         x, y, count = (self._block_sums(values) for values in (score[0], score[1], used))
-        around = np.maximum(_blur(count, _SCORE_RANGE / _BLOCK), np.float32(1e-3 * _BLOCK**2))
+        around = _blur(count, _SCORE_RANGE / _BLOCK)
+        # half a block's worth of the mean over the region: beside a hole few blocks speak
+        prior, total = 0.5 * _BLOCK**2, max(float(count.sum()), 1.0)
         fitted = min(_BLOCK**2 * measured / max(float(used.sum()), 1.0), 0.75)
-        density = np.stack([_blur(product, _SCORE_RANGE / _BLOCK) / around for product in (x * x, x * y, y * y)])
+        density = np.stack(
+            [
+                (_blur(product, _SCORE_RANGE / _BLOCK) + prior * float(product.sum()) / total) / (around + prior)
+                for product in (x * x, x * y, y * y)
+            ]
+        )
         return self._spread(density.astype(np.float64) / (1 - fitted), used)
 
     def _block_sums(self, values: FloatImage) -> FloatImage:

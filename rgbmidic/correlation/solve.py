@@ -309,7 +309,7 @@ class _Run:
         """Standard uncertainty (N, count) of the first of u, v (px), exx, eyy, exy from the scores."""
         reference = self.reference
         scores = reference.equations.matrix(comparison.score_covariance(step.weights, int(step.measured.sum())))
-        std = functional_std(step.solve, scores, reference.probing, reference.functionals[:count])
+        std = functional_std(step.solve, scores, reference.probing, reference.functionals[:count], step.measured)
         return std * self._robust_loss(step)
 
     def _robust_loss(self, step: Step) -> float:

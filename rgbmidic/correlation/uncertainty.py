@@ -73,6 +73,7 @@ def functional_std(
     right_side_covariance: sp.csc_matrix,
     probing: Probing,
     functionals: Sequence[sp.csr_matrix],
+    measured: npt.NDArray[np.bool_],
 ) -> FloatArray:
     """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
 
@@ -86,9 +87,11 @@ def functional_std(
         Colouring of the mesh.
     functionals
         F matrices (N, 2 N); row n of each gives the quantity at node n, and is zero but for n and its neighbours.
+    measured : ndarray, shape (N,), bool
+        Nodes whose uncertainty is asked for; the columns of the others reach far and would spoil those of their colour.
     """
     count, colours = len(probing.colour), len(probing.nearest)
-    members = sp.csr_matrix((np.ones(count), (np.arange(count), probing.colour)), shape=(count, colours))
+    members = sp.csr_matrix((measured * 1.0, (np.arange(count), probing.colour)), shape=(count, colours))
     variance = np.empty((count, len(functionals)))
     for i, functional in enumerate(functionals):
         columns = solve((functional.T @ members).toarray())
