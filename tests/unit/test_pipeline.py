@@ -92,9 +92,19 @@ def test_every_frame_is_told_as_it_finishes(bayer, tmp_path):
     assert all("converged" in line for _, _, line in told)
 
 
-def test_a_truncated_frame_is_recorded_and_the_rest_goes_on(bayer, bayer_result, copy, tmp_path):
+DAMAGE = {
+    "header only": lambda content: content[:300],
+    "truncated": lambda content: content[: len(content) * 2 // 3],
+    "last row lost": lambda content: content[:-250],
+    "empty": lambda content: b"",
+    "text": lambda content: b"not a frame " * 500,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_frame_is_recorded_and_the_rest_goes_on(bayer, bayer_result, copy, tmp_path, damage):
     damaged = copy("frames/frame_1.dng")
-    damaged.write_bytes(damaged.read_bytes()[:9000])
+    damaged.write_bytes(DAMAGE[damage](damaged.read_bytes()))
     result = measure(read_test(copy("TEST.toml")), tmp_path / "result")
     assert result.status.tolist() == [Status.CONVERGED, Status.FAILED, Status.CONVERGED]
     assert "frame_1.dng" in result.reasons[1]
