@@ -179,6 +179,9 @@ class SolverSettings:
         the mesh.
     curvature
         Correct the nodal values for the curvature that linear elements cannot follow.
+    fill
+        Longest distance in px over which nodes that are not measured get a value carried over from measured ones, flagged
+        and with an uncertainty that grows with the distance; 0 leaves them NaN.
     search_radius
         Largest motion in px that the coarse start looks for.
     tolerance
@@ -191,6 +194,7 @@ class SolverSettings:
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
     brightness: Literal["none", "global", "local"] = "none"
     curvature: bool = False
+    fill: float = _bounded(0.0, at_least=0)
     search_radius: float = _bounded(64.0, at_least=0)
     tolerance: float = _bounded(1e-3, above=0)
     max_iterations: int = _bounded(50, at_least=1)

@@ -18,6 +18,7 @@ from rgbmidic.config import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.correlation import Deformed, Reference, Solution, SolveOptions, Status, solve
 from rgbmidic.correlation.start import coarse_start, refine_start
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError, RgbmidicError
+from rgbmidic.fields import fill
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
@@ -135,11 +136,12 @@ def _measure_frame(
         deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
         start = Start(displacement=np.zeros((nodes, 2))) if settings.frames.reference == (index,) else last
         solution = track(reference, deformed, start, _options(settings), search_radius=settings.solver.search_radius)
+        kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
         inputs = frames.hashes(index)
     except RgbmidicError as error:
         logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)
         return FrameRecord.failed(str(error), nodes=nodes, lights=lights), last
-    record = FrameRecord.from_solution(solution, weights_thumbnail=_thumbnail(weights), inputs=inputs)
+    record = FrameRecord.from_solution(kept, weights_thumbnail=_thumbnail(weights), inputs=inputs)
     return record, last.after(solution)
 
 

@@ -26,6 +26,8 @@ def random_record(seed: int) -> FrameRecord:
         displacement=displacement,
         displacement_std=np.where(blank[:, None], np.nan, random.uniform(0.01, 0.02, (NODES, 2))),
         strain=np.where(blank[:, None], np.nan, random.normal(0, 1e-3, (NODES, 3))),
+        light_share=np.full((NODES, len(LIGHTS)), 1 / len(LIGHTS)),
+        misfit=np.ones(NODES),
         strain_std=np.where(blank[:, None], np.nan, random.uniform(1e-4, 2e-4, (NODES, 3))),
         status=seed % 2,
         node_status=blank.astype(np.uint8),

@@ -85,6 +85,21 @@ class Comparison:
             least = float(np.clip(1 - _WORSE * (1 - typical), *_MATCHED))
         return np.asarray(coefficient >= least)
 
+    def misfit(self, weights: FloatImage, measured: npt.NDArray[np.bool_]) -> FloatArray:
+        """Weighted rms residual around each node (N,), over its median: 1 is ordinary, 3 is suspicious.
+
+        `weights` (k, P) are those of the solve, in units of the inverse variance of the residual.
+        """
+        mesh, offsets = self.reference.mesh, self.reference.pixels.offsets
+        owner = np.repeat(np.arange(len(mesh.elements)), np.diff(offsets))
+        sums = [
+            np.asarray(np.bincount(owner, weights=part.sum(axis=0), minlength=len(mesh.elements)), dtype=np.float64)
+            for part in (weights * self.residual**2, weights > 0)
+        ]
+        around = mesh.to_nodes(sums[0]) / np.maximum(mesh.to_nodes(sums[1]), 1.0)
+        typical = float(np.median(around[measured])) if measured.any() else 0.0
+        return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)
+
     def brightness(self, kind: str) -> FloatImage:
         """Reference grey levels (k, P) brought to the brightness and contrast of the deformed images.
 

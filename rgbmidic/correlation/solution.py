@@ -29,6 +29,8 @@ class NodeStatus(IntEnum):
     """No light sees enough texture around the node, in the reference or in the deformed image."""
     DECORRELATED = 2
     """The images around the node do not match at the displacement found."""
+    FILLED = 3
+    """Not measured; the value is carried over from measured nodes within the distance asked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +52,10 @@ class Solution:
         around each node; NaN where the node or a neighbour is not measured.
     node_status : ndarray, shape (N,), uint8
         See `NodeStatus`.
+    light_share : ndarray, shape (N, k), float64
+        Share of each light in what determines the node.
+    misfit : ndarray, shape (N,), float64
+        Weighted rms residual around the node over its median: 1 is ordinary; well above it the result is suspicious.
     status : Status
     reason : str
         Why the frame is not converged; empty otherwise.
@@ -73,6 +79,8 @@ class Solution:
     strain: FloatArray
     strain_std: FloatArray
     node_status: npt.NDArray[np.uint8]
+    light_share: FloatArray
+    misfit: FloatArray
     status: Status
     reason: str
     rigid: FloatArray

@@ -60,6 +60,8 @@ class Step:
         Schur complement of the rigid unknowns.
     measured : ndarray, shape (N,), bool
         Nodes that see enough texture.
+    light_share : ndarray, shape (N, k), float64
+        Share of each light in what determines a node; 0 where nothing does.
     """
 
     weights: FloatImage
@@ -70,6 +72,7 @@ class Step:
     border_solved: FloatArray
     schur: FloatArray
     measured: npt.NDArray[np.bool_]
+    light_share: FloatArray
 
     @classmethod
     def build(cls, reference: Reference, weights: FloatImage, functions: FloatArray) -> Step:
@@ -93,6 +96,7 @@ class Step:
             border_solved=solved,
             schur=corner - border.T @ solved,
             measured=measured,
+            light_share=_light_share(reference, per_light),
         )
 
     def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -113,6 +117,15 @@ def _border(hessians: list[sp.csc_matrix], functions: FloatArray) -> tuple[Float
         part = slice(i * count, (i + 1) * count)
         corner[part, part] = functions.T @ column
     return np.concatenate(columns, axis=1) if columns else np.empty((len(functions), 0)), corner
+
+
+def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArray:
+    corners = reference.mesh.elements.ravel()
+    count = len(reference.mesh.nodes)
+    own = [np.einsum("eaad->ead", blocks)[..., [0, 2]].sum(axis=-1).ravel() for blocks in per_light]
+    light = np.stack([np.bincount(corners, weights=part, minlength=count) for part in own], axis=1)
+    total = light.sum(axis=1, keepdims=True)
+    return np.asarray(light / np.where(total > 0, total, 1.0))
 
 
 def _observability(hessian: sp.csc_matrix, area: FloatArray) -> tuple[npt.NDArray[np.bool_], float]:

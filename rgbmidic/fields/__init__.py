@@ -1,5 +1,6 @@
 """From a solution to what an engineer reads: the field at pixels and nodes."""
 
 from rgbmidic.fields.evaluate import at_nodes, at_pixels, field_rms
+from rgbmidic.fields.fill import fill
 
-__all__ = ["at_nodes", "at_pixels", "field_rms"]
+__all__ = ["at_nodes", "at_pixels", "field_rms", "fill"]

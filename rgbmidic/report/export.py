@@ -16,6 +16,7 @@ from rgbmidic.sequence.store import Result
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
 
+_ARRAYS = ("nodes", "elements", "u", "v", "u_std", "v_std", "node_status", "light_share", "misfit")
 _STRAIN = ("exx", "eyy", "exy")
 _CSV_COLUMNS = (
     *("frame", "name", "status", "node", "node_status", "x", "y", "u", "v", "u_std", "v_std"),
@@ -27,8 +28,9 @@ _CSV_COLUMNS = (
 def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool = False) -> None:
     """Write all frames of a result into one file.
 
-    ``"npz"``: nodes (N, 2) and elements (E, 3); u, v, exx, eyy, exy, each also with _std, and node_status (T, N); status
-    and iterations (T,); residual and weight_share (T, k); names and lights. ``"csv"``: a header line, then one row per node and frame.
+    ``"npz"``: nodes (N, 2) and elements (E, 3); u, v, exx, eyy, exy, each also with _std, node_status and misfit (T, N);
+    light_share (T, N, k); status and iterations (T,); residual and weight_share (T, k); names and lights. ``"csv"``: a
+    header line, then one row per node and frame.
     Positions and displacements are in px, x right, y down; NaN (an empty field in csv) where not measured.
 
     Parameters
@@ -60,10 +62,7 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
 
 
 def _write_npz(result: Result, file: BinaryIO) -> None:
-    arrays: dict[str, Any] = {
-        name: getattr(result, name)
-        for name in ("nodes", "elements", "u", "v", "u_std", "v_std", "status", "node_status", "iterations")
-    }
+    arrays: dict[str, Any] = {name: getattr(result, name) for name in (*_ARRAYS, "status", "iterations")}
     for axis, name in enumerate(_STRAIN):
         arrays[name], arrays[f"{name}_std"] = result.strain[..., axis], result.strain_std[..., axis]
     arrays |= {name: np.asarray(getattr(result, name)) for name in ("residual", "weight_share", "names", "lights")}

@@ -38,6 +38,10 @@ class FrameRecord:
         A `Status`.
     node_status : ndarray, shape (N,), uint8
         A `NodeStatus` per node.
+    light_share : ndarray, shape (N, k), float64
+        Share of each light in what determines a node.
+    misfit : ndarray, shape (N,), float64
+        Residual around a node over its median.
     residual, weight_share : ndarray, shape (k,), float64
         Weighted rms residual in grey levels and mean weight over the region, per light.
     rigid : ndarray, shape (k, m), float64
@@ -58,6 +62,8 @@ class FrameRecord:
     strain_std: FloatArray
     status: int
     node_status: npt.NDArray[np.uint8]
+    light_share: FloatArray
+    misfit: FloatArray
     residual: FloatArray
     weight_share: FloatArray
     rigid: FloatArray
@@ -105,6 +111,8 @@ class FrameRecord:
             strain_std=np.full((nodes, 3), np.nan),
             status=Status.FAILED,
             node_status=np.full(nodes, NodeStatus.NOT_SEEN, dtype=np.uint8),
+            light_share=np.zeros((nodes, lights)),
+            misfit=np.full(nodes, np.nan),
             residual=np.full(lights, np.nan),
             weight_share=np.full(lights, np.nan),
             rigid=np.zeros((lights, 0)),
@@ -127,6 +135,8 @@ def _arrays(nodes: int, lights: int) -> list[tuple[str, tuple[tuple[int, ...], A
         ("strain", ((nodes, 3), np.float64)),
         ("strain_std", ((nodes, 3), np.float64)),
         ("node_status", ((nodes,), np.uint8)),
+        ("light_share", ((nodes, lights), np.float64)),
+        ("misfit", ((nodes,), np.float64)),
         ("residual", ((lights,), np.float64)),
         ("weight_share", ((lights,), np.float64)),
         ("rigid", ((lights, -1), np.float64)),

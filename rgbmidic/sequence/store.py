@@ -263,6 +263,16 @@ class Result:
         return self._stack("strain_std")
 
     @cached_property
+    def light_share(self) -> FloatArray:
+        """Share of each light in what determines a node, shape (T, N, k)."""
+        return self._stack("light_share")
+
+    @cached_property
+    def misfit(self) -> FloatArray:
+        """Residual around each node over its median, shape (T, N); well above 1 is suspicious."""
+        return self._stack("misfit")
+
+    @cached_property
     def status(self) -> npt.NDArray[np.int64]:
         """`Status` of each frame, shape (T,)."""
         return np.array([record.status for record in self._records], dtype=np.int64)

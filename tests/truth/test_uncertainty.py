@@ -1,0 +1,183 @@
+"""Whether the stated uncertainty is right: camera noise alone, a turning sphere that reflects, and spoiled frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from textures import Affine, Texture
+
+from rgbmidic import correlate
+from rgbmidic.correlation import NodeStatus, Solution
+from rgbmidic.fields import at_nodes, field_rms, fill
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.mosaic import linearise
+from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.unmix import unmix
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.virtual import record, render, sphere_scene, truth, turned
+
+DRAWS = 100
+RATIO = (0.9, 1.1)  # stated over observed, median of the field
+COVERAGE = (0.90, 0.99)  # of 95 % intervals
+IN_MOTION = (0.8, 1.25)  # rms(error / u_std) of a frame
+SPOILED = 1.5  # the same, beside what is spoiled
+SIZE, REGION, ANGLES = 400, (30, 30, 369, 369), (0.33, 1.0, 4.0)
+
+
+@pytest.fixture(scope="module")
+def draws() -> tuple[list[Solution], np.ndarray]:
+    """Solutions of three noisy lights, one of them noisy by three times on the left, and the true displacement."""
+    motion, shape = Affine.strain_and_rotation(0.01, 0.5, (0.3, 0.2)), (130, 130)
+    texture = Texture.random(4)
+    pair = [texture.image(shape), texture.image(shape, motion)]
+    sigma = np.full((3, *shape), 4.0)
+    sigma[0, :, :65] *= 3
+    random = np.random.default_rng(0)
+    found = [
+        correlate(*(image + sigma * random.normal(size=sigma.shape) for image in pair), region=(10, 10, 119, 119))
+        for _ in range(DRAWS)
+    ]
+    return found, motion.displacement(found[0].nodes, shape)
+
+
+def test_stated_noise_is_observed_noise(draws: tuple[list[Solution], np.ndarray]) -> None:
+    found, _ = draws
+    for name in ("displacement", "strain"):
+        observed = np.std([getattr(one, name) for one in found], axis=0)
+        stated = np.sqrt(np.mean([getattr(one, f"{name}_std") ** 2 for one in found], axis=0))
+        assert RATIO[0] < np.median(stated / observed) < RATIO[1], name
+
+
+def test_intervals_cover_the_truth(draws: tuple[list[Solution], np.ndarray]) -> None:
+    found, displacement = draws
+    errors = np.array([one.displacement - displacement for one in found])
+    covered = np.abs(errors) < 1.96 * np.array([one.displacement_std for one in found])
+    left = found[0].nodes[:, 0] < 60
+    for place in (left, ~left):
+        assert COVERAGE[0] < covered[:, place].mean() < COVERAGE[1]
+
+
+class Sphere:
+    """The turning sphere: noise-free lights and truth of every angle, recorded by a 3-CCD or a Bayer camera."""
+
+    def __init__(self) -> None:
+        self.scene = sphere_scene(size=SIZE, seed=23)
+        self.lights = {angle: render(self.scene, turned(angle)) for angle in (0.0, *ANGLES)}
+        self.truth = {angle: truth(self.scene, turned(angle)) for angle in ANGLES}
+        self.crosstalk = self.scene.camera.true_crosstalk(self.scene.lights)
+
+    def images(self, lights: np.ndarray, kind: str, seed: int) -> IlluminationImages:
+        frame = record(lights, replace(self.scene.camera, kind=kind), self.scene.lights, seed=seed)
+        linear = linearise(frame)
+        return unmix(linear, self.crosstalk) if kind == "rgb" else separate(linear, self.crosstalk)
+
+    def measure(self, reference: np.ndarray, deformed: np.ndarray, kind: str) -> Solution:
+        pair = [self.images(lights, kind, seed).values for seed, lights in enumerate((reference, deformed))]
+        return correlate(*pair, region=REGION, normalise=10)
+
+    def ratio(self, solution: Solution, angle: float, where: np.ndarray | bool = True) -> float:
+        """rms(error / u_std) over the nodes."""
+        error = solution.displacement - at_nodes(self.truth[angle], solution.nodes)
+        ratio = (error / solution.displacement_std)[np.broadcast_to(where, len(error))]
+        return float(np.sqrt(np.nanmean(ratio**2)))
+
+
+@pytest.fixture(scope="module")
+def sphere() -> Sphere:
+    return Sphere()
+
+
+@pytest.mark.parametrize("kind", ["rgb", "bayer"])
+@pytest.mark.parametrize("angle", ANGLES)
+def test_error_in_motion_is_as_stated(sphere: Sphere, kind: str, angle: float) -> None:
+    solution = sphere.measure(sphere.lights[0.0], sphere.lights[angle], kind)
+    assert IN_MOTION[0] < sphere.ratio(solution, angle) < IN_MOTION[1]
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_three_lights_beat_each_alone(sphere: Sphere, angle: float) -> None:
+    reference, deformed = (sphere.images(sphere.lights[a], "bayer", seed).values for seed, a in enumerate((0.0, angle)))
+
+    def error(*pair: np.ndarray) -> float:
+        found = correlate(*pair, region=REGION, normalise=10)
+        mesh = Tri3Mesh(nodes=found.nodes, elements=found.elements)
+        return field_rms(mesh, found.displacement, sphere.truth[angle], border=25)
+
+    alone = [error(reference[light], deformed[light]) for light in range(3)]
+    assert error(reference, deformed) < min(alone)
+
+
+def _off(lights: np.ndarray) -> None:
+    lights[0] = 0
+
+
+def _flicker(lights: np.ndarray) -> None:
+    lights *= np.array([1.2, 0.8, 1.1], dtype=np.float32)[:, None, None]
+
+
+def _fragment(lights: np.ndarray) -> None:
+    lights[:, 150:220, 200:280] = np.random.default_rng(0).uniform(200, 2500, (70, 80))
+
+
+def _glare(lights: np.ndarray) -> None:
+    y, x = np.mgrid[:SIZE, :SIZE]
+    lights += (9000 * np.exp(-((x - 240) ** 2 + (y - 185) ** 2) / (2 * 25**2))).astype(np.float32)
+
+
+def _saturated(lights: np.ndarray) -> None:
+    lights[1, :, : SIZE // 3] *= 6
+
+
+@pytest.mark.parametrize("spoil", [_off, _flicker, _fragment, _glare, _saturated])
+@pytest.mark.parametrize("kind", ["rgb", "bayer"])
+def test_what_is_spoiled_is_flagged_and_spoils_nothing_else(sphere: Sphere, kind: str, spoil: object) -> None:
+    reference, deformed = sphere.lights[0.0], sphere.lights[1.0].copy()
+    spoil(deformed)  # type: ignore[operator]
+    if spoil is _glare:
+        reference = reference.copy()
+        _glare(reference)
+    solution = sphere.measure(reference, deformed, kind)
+    x, y = solution.nodes.T
+    near = np.zeros(len(x), dtype=bool)
+    if spoil in (_fragment, _glare):
+        near = (np.abs(x - 240) < 75) & (np.abs(y - 185) < 70)
+    if spoil is _saturated:
+        near = x < SIZE / 3 + 15
+    assert solution.measured[~near].all()
+    assert sphere.ratio(solution, 1.0, ~near) < SPOILED
+    if spoil in (_fragment, _glare, _saturated):
+        assert (~solution.measured[near]).any()
+        error = solution.displacement - at_nodes(sphere.truth[1.0], solution.nodes)
+        assert np.nanmax(np.abs(error)) < 0.3  # nothing wild passes for measured
+
+
+def test_dead_pixels_are_outvoted(sphere: Sphere) -> None:
+    dead = np.random.default_rng(5).random((SIZE, SIZE)) < 0.01
+    pair = []
+    for seed, angle in enumerate((0.0, 1.0)):
+        frame = record(sphere.lights[angle], replace(sphere.scene.camera, kind="rgb"), sphere.scene.lights, seed=seed)
+        values = frame.values.copy()
+        values[:, dead] = 0
+        pair.append(unmix(linearise(replace(frame, values=values)), sphere.crosstalk).values)
+    solution = correlate(*pair, region=REGION, normalise=10)
+    assert solution.measured.all()
+    assert sphere.ratio(solution, 1.0) < SPOILED
+
+
+def test_gaps_are_filled_only_when_asked_for_with_a_growing_uncertainty() -> None:
+    motion, shape = Affine.strain_and_rotation(0.01, 0.5, (2.3, -0.2)), (260, 260)
+    texture, random = Texture.random(1), np.random.default_rng(0)
+    weights = np.ones(shape)
+    weights[80:180, 90:190] = 0
+    pair = [texture.image(shape, *extra) + random.normal(0, 3, shape) for extra in ((), (motion,))]
+    solution = correlate(*pair, weights=weights, region=(10, 10, 249, 249))
+    assert (~solution.measured).any()
+    mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
+    filled = fill(mesh, solution, 80.0)
+    new = filled.node_status == NodeStatus.FILLED
+    error = np.abs(filled.displacement - motion.displacement(solution.nodes, shape))
+    assert np.array_equal(new, ~solution.measured)
+    assert (error[new] < 3 * filled.displacement_std[new]).all()
+    assert filled.displacement_std[new].min() > np.nanmedian(solution.displacement_std)
