@@ -193,7 +193,7 @@ def track(
         trial = solve(reference, deformed, initial, options)
         if best is None or (trial.status, trial.unmeasured_share) < (best.status, best.unmeasured_share):
             best = trial
-        if best.status is Status.CONVERGED and best.unmeasured_share <= start.unmeasured + _LOSS:
+        if best.status is Status.CONVERGED and best.unmeasured_share <= start.unmeasured:
             break
     assert best is not None
     return best
@@ -218,10 +218,6 @@ def _options(settings: TestSettings) -> SolveOptions:
         tolerance=settings.solver.tolerance,
         max_iterations=settings.solver.max_iterations,
     )
-
-
-_LOSS = 0.003
-"""Share of the nodes that may be lost from one frame to the next before another start is tried."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
