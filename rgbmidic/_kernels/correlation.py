@@ -78,6 +78,20 @@ def _spline(coefficients, row, column, tx, ty):
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _place(px, py, base_x, base_y, height, width):
+    """Pixel (column, row) and fraction of a local position, and whether it lies outside the image."""
+    cx = np.floor(px)
+    cy = np.floor(py)
+    column = base_x + np.int64(cx)
+    row = base_y + np.int64(cy)
+    tx = px - cx
+    ty = py - cy
+    beyond_x = column < 0 or column > width - 1 or (column == width - 1 and tx > _ZERO)
+    beyond_y = row < 0 or row > height - 1 or (row == height - 1 and ty > _ZERO)
+    return column, row, tx, ty, beyond_x or beyond_y
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _element_motion(displacement, elements, barycentric, origin, e):
     """Affine displacement of element e about its origin pixel: whole-pixel part, constant rest and slopes."""
     ux = uy = uxx = uxy = uyx = uyy = 0.0
@@ -245,14 +259,8 @@ def warp(coefficients, local_x, local_y, offsets, origin, elements, barycentric,
         for i in range(offsets[e], offsets[e + 1]):
             px = ux + fxx * local_x[i] + fxy * local_y[i]
             py = uy + fyx * local_x[i] + fyy * local_y[i]
-            cx = np.floor(px)
-            cy = np.floor(py)
-            column = base_x + np.int64(cx)
-            row = base_y + np.int64(cy)
-            tx = px - cx
-            ty = py - cy
-            outside = column < 0 or row < 0 or column > width - 1 or row > height - 1
-            if outside or (column == width - 1 and tx > _ZERO) or (row == height - 1 and ty > _ZERO):
+            column, row, tx, ty, outside = _place(px, py, base_x, base_y, height, width)
+            if outside:
                 out[i] = np.nan
             else:
                 out[i] = _spline(coefficients, row, column, tx, ty)
@@ -292,16 +300,8 @@ def pull_back(deformed_weight, reference_weight, local_x, local_y, offsets, orig
         for i in range(offsets[e], offsets[e + 1]):
             px = ux + fxx * local_x[i] + fxy * local_y[i]
             py = uy + fyx * local_x[i] + fyy * local_y[i]
-            cx = np.floor(px)
-            cy = np.floor(py)
-            column = base_x + np.int64(cx)
-            row = base_y + np.int64(cy)
-            tx = px - cx
-            ty = py - cy
-            if column < 0 or row < 0 or column > width - 1 or row > height - 1:
-                out[i] = _ZERO
-                continue
-            if (column == width - 1 and tx > _ZERO) or (row == height - 1 and ty > _ZERO):
+            column, row, tx, ty, outside = _place(px, py, base_x, base_y, height, width)
+            if outside:
                 out[i] = _ZERO
                 continue
             right = min(column + 1, width - 1)
