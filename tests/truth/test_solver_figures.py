@@ -17,6 +17,8 @@ RIGID_BIAS = 0.002
 """|mean error| in px for rigid shifts of 0 to 1 px, no noise, 4 px speckle."""
 AFFINE_RMS = 0.003
 """rms error in px for 1 % strain and 2 degrees of rotation, no noise."""
+STRAIN = 1e-4
+"""rms error of the strain at the nodes, no noise."""
 ROOT_OF_LIGHTS = 0.05
 """Relative deviation of the noise under k lights from 1/sqrt(k)."""
 PREDICTED_NOISE = 0.10
@@ -73,6 +75,15 @@ def test_strain_and_rotation_are_recovered(strain, degrees, prefilter):
     assert found.status is Status.CONVERGED
     assert found.measured.all()
     assert rms(error(found, motion)) <= AFFINE_RMS
+
+
+def test_the_strain_of_a_stretch_is_that_stretch_and_of_a_rigid_motion_none():
+    for stretch in (0.0, 0.01):
+        motion = Affine(shift=(0.4, 0.3), gradient=((1 + stretch, 0.002), (0.0, 1 - stretch / 3)))
+        found = correlate(reference_image(), texture().image(SHAPE, motion), region=REGION)
+        truth = np.broadcast_to((stretch, -stretch / 3, 0.001), found.strain.shape)
+        assert np.abs((found.strain - truth).mean(axis=0)).max() <= STRAIN / 10
+        assert rms(found.strain - truth) <= STRAIN
 
 
 DRAWS = 40

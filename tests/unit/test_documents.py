@@ -7,11 +7,13 @@ import tomllib
 from dataclasses import MISSING, fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 from small_tests import colour_test
 
-from rgbmidic import NodeStatus, Status, TestSettings
+from rgbmidic import NodeStatus, Status, TestSettings, measure
 from rgbmidic.config import _place, _sections
+from rgbmidic.report.export import export_result
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -65,8 +67,8 @@ def as_written(default: object) -> str:
 
 
 def test_every_key_of_the_test_file_is_documented_with_its_default():
-    expected = {section: {key: as_written(d) for key, d in keys.items()} for section, keys in defaults().items()}
-    assert documented() == expected
+    expected = {f"{name}.{key}": as_written(d) for name, keys in defaults().items() for key, d in keys.items()}
+    assert {f"{name}.{key}": text for name, keys in documented().items() for key, text in keys.items()} == expected
 
 
 def test_every_choice_of_a_key_is_named():
@@ -93,6 +95,24 @@ def test_status_codes_are_documented(codes):
     text = (DOCS / "conventions.md").read_text(encoding="utf-8")
     for code in codes:
         assert f"| {int(code)} | `{code.name}` |" in text
+
+
+def test_every_exported_array_is_documented_with_its_shape(tmp_path):
+    test = colour_test(tmp_path / "test", [(0.0, 0.0), (0.3, 0.1)])
+    result = measure(test.settings(), tmp_path / "result")
+    export_result(result, "npz", tmp_path / "result.npz")
+    rows = re.findall(
+        r"^\| (`\w+`[^|]*) \| ([^|]*\([^|]*\)) \|", (DOCS / "conventions.md").read_text("utf-8"), re.MULTILINE
+    )
+    shapes = {}
+    for names, text in rows:
+        names, parts = re.findall(r"`(\w+)`", names), re.findall(r"\(([^)]*)\)", text)
+        shapes |= dict(zip(names, parts if len(parts) > 1 else parts * len(names), strict=True))
+    sizes = {"T": 2, "N": len(result.nodes), "E": len(result.elements), "k": 3, "2": 2, "3": 3}
+    with np.load(tmp_path / "result.npz") as archive:
+        for name in archive.files:
+            stated = tuple(sizes[size.strip()] for size in shapes[name].split(",") if size.strip())
+            assert archive[name].shape == stated, name
 
 
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import tifffile
 from small_tests import REGION, SHAPE, colour_test, grey_frame, toml
 
-from rgbmidic import Calibration, NodeStatus, Result, Status, measure, read_test
+from rgbmidic import Calibration, NodeStatus, Result, Status, measure, read_frame, read_test
 from rgbmidic.errors import (
     CalibrationError,
     ConfigurationError,
@@ -21,7 +22,7 @@ from rgbmidic.errors import (
     RgbmidicError,
 )
 from rgbmidic.sequence.frames import file_hash
-from rgbmidic.sequence.writers import write_tiff
+from rgbmidic.sequence.writers import write_dng, write_tiff
 
 BAYER_RMS = 0.015
 """px: Malvar demosaicing and the noise of a 12-bit camera on a plate without reflections."""
@@ -115,11 +116,6 @@ def test_a_damaged_frame_is_recorded_and_the_rest_goes_on(bayer, bayer_result, c
 
 
 def test_a_wholly_saturated_frame_is_recorded_and_the_rest_goes_on(bayer, copy, tmp_path):
-    from dataclasses import replace
-
-    from rgbmidic import read_frame
-    from rgbmidic.sequence.writers import write_dng
-
     frame = read_frame(copy("frames/frame_1.dng"))
     write_dng(copy("frames/frame_1.dng"), replace(frame, values=np.full(SHAPE, 4095, dtype=np.uint16)))
     result = measure(read_test(copy("TEST.toml")), tmp_path / "result")
@@ -130,9 +126,6 @@ def test_a_wholly_saturated_frame_is_recorded_and_the_rest_goes_on(bayer, copy, 
 
 
 def test_a_saturated_spot_is_left_out_and_the_rest_measured(bayer, copy, tmp_path):
-    from rgbmidic import read_frame
-    from rgbmidic.sequence.writers import write_dng
-
     frame = read_frame(copy("frames/frame_2.dng"))
     frame.values[50:100, 50:100] = 4095
     write_dng(copy("frames/frame_2.dng"), frame)
@@ -145,6 +138,13 @@ def test_a_saturated_spot_is_left_out_and_the_rest_measured(bayer, copy, tmp_pat
     assert np.isnan(result.u[2][~measured]).all()
     assert measured.mean() > 0.6
     assert rms(bayer.error(result.nodes, result.u, result.v)[2][measured]) < 2 * BAYER_RMS
+    here = replace(bayer, folder=copy("TEST.toml").parent)
+    filled = measure(here.settings(solver={"fill": 100}), tmp_path / "filled")
+    assert (filled.node_status[2][~measured] == NodeStatus.FILLED).all()
+    error = bayer.error(filled.nodes, filled.u, filled.v)[2]
+    assert np.abs(error[~measured]).max() < 0.1
+    assert filled.u_std[2][~measured].min() > np.median(filled.u_std[2][measured])
+    np.testing.assert_array_equal(filled.u[2][measured], result.u[2][measured])
 
 
 @pytest.mark.parametrize(
