@@ -23,6 +23,8 @@ RIGID = ("none", "translation", "translation+rotation")
 
 _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
+_ROUNDING = 1e-4
+"""Share of a node's texture under which what it sees in its worse direction may be rounding."""
 _SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area."""
 
@@ -83,7 +85,7 @@ class Step:
         measured, scale = _observability(hessian, equations.nodal_area)
         smoothness = sp.csc_matrix((_SMOOTHNESS * scale) * equations.smoothness)
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
-        anchor = 1e-9 * max(scale, 1e-30) * sp.eye(equations.size, format="csc")
+        anchor = 1e-9 * scale * sp.eye(equations.size, format="csc")
         solve = factorise(sp.csc_matrix(hessian + smoothness + anchor))
         border, corner = _border([equations.matrix(blocks) for blocks in per_light[1:]], functions)
         solved = solve(border) if border.shape[1] else border
@@ -138,7 +140,8 @@ def _observability(hessian: sp.csc_matrix, area: FloatArray) -> tuple[npt.NDArra
     mixed = np.asarray(hessian[2 * nodes, 2 * nodes + 1]).ravel()
     half = diagonal.sum(axis=1) / 2
     smallest = half - np.hypot((diagonal[:, 0] - diagonal[:, 1]) / 2, mixed)
+    smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only
     density = smallest / area
     typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
     seen = density > _SEEN * typical if typical > 0 else np.zeros(len(density), dtype=bool)
-    return seen, float(np.median(half[seen])) if seen.any() else 0.0
+    return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
