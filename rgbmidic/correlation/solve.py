@@ -173,7 +173,10 @@ class _Run:
             change = np.abs(weights - step.weights).sum() if step is not None else np.inf
             if step is not None and change <= _SETTLED * weights.sum() and not self._refining(number):
                 break
-            step = Step.build(self.reference, weights, self.functions)
+            try:
+                step = Step.build(self.reference, weights, self.functions)
+            except RuntimeError as error:  # what SuperLU raises on a matrix that is singular in double precision
+                return self._failed(f"the equations cannot be solved: {error}")
             if not step.measured.any():
                 return self._failed(self._nothing_left())
             self._iterate(step, max(tolerance, _FIRST_PASS) if number == 0 else tolerance)
