@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from rgbmidic import __version__
-from rgbmidic.errors import RgbmidicError
+from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.report.export import EXPORT_FORMATS, export_result
 from rgbmidic.sequence.store import Result
 
@@ -28,6 +28,8 @@ BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 _CONVERGED, _FAILED = 0, 2
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+study = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(study, name="study", help="The paper's own analyses.")
 _messages = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
@@ -150,6 +152,41 @@ def virtual(
 
     with _progress("rendering") as progress:
         write_dataset(scene, out, progress)
+
+
+@study.command()
+def paper(
+    out: Annotated[Path, typer.Option("--out", help="Folder for what is written; must be empty or new.")],
+    angles: Annotated[str, typer.Option("--angles", help="Degrees, such as 0.333,8; the paper's by default.")] = "",
+    size: Annotated[int, typer.Option("--size", help="Rows and columns of the frames in px.")] = 1024,
+    causes: Annotated[
+        bool | None, typer.Option(help="Also change one thing at a time; by default in frames of 1024 px and more.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """The paper's experiment on the virtual bench, its statements beside what is measured (docs/study.md)."""
+    from rgbmidic.report.study import check_folder, write_study
+    from rgbmidic.study import ANGLES, run_paper_study
+
+    started = time.perf_counter()
+    check_folder(out, overwrite=overwrite)
+    wanted = _numbers(angles, "--angles") if angles else ANGLES
+    with _progress("study") as progress:
+        results = run_paper_study(
+            wanted, size=size, causes=size >= 1024 if causes is None else causes, progress=progress
+        )
+    claims = write_study(results, out, overwrite=overwrite)
+    console = Console(soft_wrap=True)
+    for claim in claims:
+        console.print(f"{claim.verdict:15} {claim.scene or 'plate':11} {claim.figure}: {claim.statement}", markup=False)
+    console.print(f"report: {out / 'report.md'}   {time.perf_counter() - started:.0f} s")
+
+
+def _numbers(text: str, option: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option} are numbers with commas between them, such as 0.333,8; not {text!r}") from None
 
 
 @contextmanager

@@ -1,0 +1,67 @@
+"""A page of text, tables and pictures, written as Markdown and as HTML at once."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["Page"]
+
+_STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
+table{border-collapse:collapse;font-size:13px;margin:1rem 0}td,th{border:1px solid #ccc;padding:.25rem .5rem;
+text-align:left;vertical-align:top}th{background:#f3f3f3}img{max-width:100%}figcaption{color:#555;font-size:13px}
+figure{margin:1rem 0}"""
+
+
+class Page:
+    """Collects blocks in order; `write` puts them into a folder as ``report.md`` and ``report.html``."""
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self._markdown = [f"# {title}"]
+        self._html = [f"<h1>{html.escape(title)}</h1>"]
+
+    def heading(self, text: str) -> None:
+        """A section's heading."""
+        self._markdown.append(f"## {text}")
+        self._html.append(f"<h2>{html.escape(text)}</h2>")
+
+    def text(self, text: str) -> None:
+        """A paragraph; words between backquotes are code."""
+        self._markdown.append(text)
+        self._html.append(f"<p>{_inline(text)}</p>")
+
+    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """A table of texts."""
+        lines = [header, ["---"] * len(header), *rows]
+        self._markdown.append(
+            "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines)
+        )
+        head = "".join(f"<th>{_inline(cell)}</th>" for cell in header)
+        body = "".join("<tr>" + "".join(f"<td>{_inline(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        self._html.append(f"<table><tr>{head}</tr>{body}</table>")
+
+    def picture(self, file: str, caption: str) -> None:
+        """A picture that lies in the page's folder."""
+        self._markdown.append(f"![{caption}]({file})\n\n*{caption}*")
+        cell = html.escape(caption)
+        self._html.append(
+            f'<figure><img src="{html.escape(file)}" alt="{cell}"><figcaption>{cell}</figcaption></figure>'
+        )
+
+    def write(self, folder: Path) -> tuple[Path, Path]:
+        """Write both pages; gives their paths."""
+        markdown, page = folder / "report.md", folder / "report.html"
+        markdown.write_text("\n\n".join(self._markdown) + "\n", encoding="utf-8")
+        title, body = html.escape(self.title), "\n".join(self._html)
+        page.write_text(
+            f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>{body}</html>\n',
+            encoding="utf-8",
+        )
+        return markdown, page
+
+
+def _inline(text: str) -> str:
+    return re.sub("`([^`]*)`", r"<code>\1</code>", html.escape(text))

@@ -1,0 +1,62 @@
+"""The paper's own studies, on virtual and on real data: perturbation P, goniometry, topography, the methods compared."""
+
+from rgbmidic.study.bench import BENCHES, Bench, lamp_for_reflection
+from rgbmidic.study.competitors import METHODS, Competitor, Method
+from rgbmidic.study.goniometry import Goniometry, Lobe, fit_lobe, goniometry, pixel_levels
+from rgbmidic.study.paper import ANGLES, Measurement, PaperStudy, SceneStudy, run_paper_study
+from rgbmidic.study.perturbation import (
+    Area,
+    area_means,
+    area_stds,
+    areas_along_x,
+    high_pass,
+    perturbation,
+    residual_percent,
+)
+from rgbmidic.study.threshold import DisturbedZone, SetUpThreshold, disturbed_zone, set_up_threshold
+from rgbmidic.study.topography import (
+    Roughness,
+    detrend,
+    local_slope,
+    paint_classes,
+    roughness,
+    slope_uncertainty,
+    wrinkle_spacing,
+)
+
+__all__ = [
+    "ANGLES",
+    "BENCHES",
+    "METHODS",
+    "Area",
+    "Bench",
+    "Competitor",
+    "DisturbedZone",
+    "Goniometry",
+    "Lobe",
+    "Measurement",
+    "Method",
+    "PaperStudy",
+    "Roughness",
+    "SceneStudy",
+    "SetUpThreshold",
+    "area_means",
+    "area_stds",
+    "areas_along_x",
+    "detrend",
+    "disturbed_zone",
+    "fit_lobe",
+    "goniometry",
+    "high_pass",
+    "lamp_for_reflection",
+    "local_slope",
+    "paint_classes",
+    "perturbation",
+    "pixel_levels",
+    "residual_percent",
+    "roughness",
+    "run_paper_study",
+    "set_up_threshold",
+    "slope_uncertainty",
+    "wrinkle_spacing",
+]
