@@ -211,9 +211,12 @@ def installed(name: str) -> str | None:
 
 def in_own_process(what: str, folder: Path, threads: int, repeats: int) -> dict[str, Any]:
     """Run one contender in a fresh process; a failure is a result too."""
-    environment = {**os.environ, "NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)}
-    command = [sys.executable, __file__, "--child", what, str(folder), str(threads), str(repeats)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    path = os.pathsep.join(str(Path(entry).resolve()) for entry in sys.path)
+    threading = {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)}
+    environment = {**os.environ, **threading, "PYTHONPATH": path}
+    command = [sys.executable, str(Path(__file__).resolve()), "--child", what, str(folder), str(threads), str(repeats)]
+    # in the temporary folder: some contenders leave files where they run
+    done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode:
         return {"failed": (done.stderr.strip().splitlines() or ["no message"])[-1]}
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))

@@ -121,4 +121,6 @@ def grey_frame(
     """A 12-bit monochrome frame of a cosine texture (mean 2000, contrast 500 DN) with white noise, black level 64."""
     image = 10 * Texture.random(seed).image(shape, Affine(shift=shift)) + 64
     noisy = image + np.random.default_rng([noise_seed, seed]).normal(scale=sigma, size=shape)
-    return ChannelFrame(values=np.rint(noisy).clip(0, 4095).astype(np.uint16)[None], black_level=64, white_level=4095)
+    return ChannelFrame(
+        values=np.rint(noisy).clip(0, 4095).astype(np.uint16)[None], black_level=np.array([64.0]), white_level=4095
+    )
