@@ -212,11 +212,13 @@ def square(x, y):
     return np.maximum(np.abs(x - 100), np.abs(y - 100)) < 40
 
 
-def test_a_hole_in_the_region_leaves_the_rest_as_good_as_without():
+@pytest.mark.parametrize("inside", ["nothing", "something else"])
+def test_a_hole_in_the_region_leaves_the_rest_as_good_as_without(inside):
     masks = part(disc)
+    content = (np.nan, np.nan) if inside == "nothing" else (texture(8).image(SHAPE), texture(9).image(SHAPE))
     box = np.zeros(SHAPE, dtype=bool)
     box[20:181, 20:181] = True
-    found = correlate(*pair_with(masks, np.nan, np.nan), region=Region.from_mask(box & ~masks[0]))
+    found = correlate(*pair_with(masks, *content), region=Region.from_mask(box & ~masks[0]))
     assert found.status is Status.CONVERGED
     assert found.measured.all()
     assert rms(error(found)) <= GAP_RMS
