@@ -206,10 +206,10 @@ def _print_summary(result: Result, seconds: float) -> None:
     table.add_row("frames", f"{len(result)}, {int((result.status == _CONVERGED).sum())} converged")
     table.add_row("nodes", f"{len(result.nodes)}, {measured:.1%} measured")
     for light, share in zip(result.lights, result.weight_share[result.status != _FAILED].T, strict=True):
-        table.add_row(light, f"mean weight {share.mean():.2f}" if share.size else "-")
+        table.add_row(light, f"{share.mean():.0%} of the weight" if share.size else "-")
     table.add_row("time", f"{seconds:.1f} s")
-    table.add_row("result", str(result.path))
-    Console(soft_wrap=True).print(table)
+    Console().print(table)
+    print(f"result        {result.path}")  # rich would cut a long path
 
 
 if __name__ == "__main__":
