@@ -57,7 +57,8 @@ class Page:
         markdown.write_text("\n\n".join(self._markdown) + "\n", encoding="utf-8")
         title, body = html.escape(self.title), "\n".join(self._html)
         page.write_text(
-            f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>{body}</html>\n',
+            f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
+            f"<style>{_STYLE}</style>{body}</html>\n",
             encoding="utf-8",
         )
         return markdown, page

@@ -212,17 +212,15 @@ def _causes_section(page: Page, causes: Sequence[Cause]) -> None:
         return
     page.heading("Causes: one thing changed at a time")
     page.text(
-        f"P in 1e-3 px within {RADIUS:g} px of the middle of the reflection / far from it, at 0.33, 1 and 8°. Plain DIC "
-        "suffers from the reflection's brightness as such: paint without any roughness that reflects as much on average "
-        "gives the same P, and P follows the gloss. Grey-level correction removes that part, and what it leaves is the "
-        "erratic part: on flat, smooth paint it leaves nothing but noise. Away from the reflection P of plain DIC rises "
-        "with the angle because the diffuse light changes with its incidence, with wrinkles and without them."
+        f"P in 1e-3 px within {RADIUS:g} px of the middle of the reflection / far from it. Plain DIC suffers from the "
+        "reflection's brightness as such: paint without any roughness that reflects as much on average gives the same "
+        "P, and P follows the gloss. Grey-level correction removes that part; what it leaves is the erratic part: on "
+        "flat, smooth paint it leaves hardly more than noise. Away from the reflection P of plain DIC rises with the "
+        "angle because the diffuse light changes with its incidence, with wrinkles and without them."
     )
-    rows = [
-        (cause.title, *(_pair(cause.inside[m, i], cause.outside[m, i]) for m in range(2) for i in range(3)))
-        for cause in causes
-    ]
-    header = ("change", *(f"{method} {angle}°" for method in ("DIC", "GLC-DIC") for angle in ("0.33", "1", "8")))
+    angles = causes[0].angles
+    rows = [(cause.title, *map(_pair, cause.inside.ravel(), cause.outside.ravel())) for cause in causes]
+    header = ("change", *(f"{method} {angle:g}°" for method in ("DIC", "GLC-DIC") for angle in angles))
     page.table(header, rows)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 import cv2
 import numpy as np
@@ -31,11 +33,26 @@ __all__ = [
     "topography_figure",
 ]
 
-_AREA_COLOURS = ("#1b6ca8", "#1a9850", "#b8860b", "#d95f02", "#c51b7d")
+_AREA_COLOURS = ("#1f8fe0", "#2ca25f", "#d9a400", "#e8590c", "#d6279a")
 _WIDTH = 7.5
 Image = npt.NDArray[Any]
+Parameters = ParamSpec("Parameters")
 
 
+def _styled(draw: Callable[Parameters, Figure]) -> Callable[Parameters, Figure]:
+    """The function under the style that all figures share."""
+
+    @wraps(draw)
+    def styled(*arguments: Parameters.args, **settings: Parameters.kwargs) -> Figure:
+        import matplotlib as mpl
+
+        with mpl.rc_context(_STYLE):
+            return draw(*arguments, **settings)
+
+    return styled
+
+
+@_styled
 def images_figure(scene: SceneStudy) -> Figure:
     """Fig. 4: the light that crosses the areas at 0 degrees and at the largest angle, and its grey level along them."""
     last = scene.angles[-1]
@@ -56,6 +73,7 @@ def images_figure(scene: SceneStudy) -> Figure:
     return figure
 
 
+@_styled
 def displacement_maps(scene: SceneStudy, method: str) -> Figure:
     """Figs 5 and 15: U_y of a method at the smallest and at the largest angle."""
     figure, axes = _axes(1, len(scene.snapshots), 3.2)
@@ -68,6 +86,7 @@ def displacement_maps(scene: SceneStudy, method: str) -> Figure:
     return figure
 
 
+@_styled
 def ripple_figure(scene: SceneStudy) -> Figure:
     """U_y without its long waves: every method at the smallest and at the largest angle."""
     count = len(scene.snapshots)
@@ -83,6 +102,7 @@ def ripple_figure(scene: SceneStudy) -> Figure:
     return figure
 
 
+@_styled
 def mean_figure(scene: SceneStudy) -> Figure:
     """Fig. 6: mean displacement of the areas against the angle, plain DIC."""
     figure, axes = _axes(1, 2, 2.6)
@@ -96,6 +116,7 @@ def mean_figure(scene: SceneStudy) -> Figure:
     return figure
 
 
+@_styled
 def perturbation_figure(scene: SceneStudy) -> Figure:
     """Figs 7, 8, 13 and 17: P of the areas against the angle, one panel per method, one scale."""
     figure, axes = _axes(2, 2, 5.4, sharex=True, sharey=True)
@@ -110,6 +131,7 @@ def perturbation_figure(scene: SceneStudy) -> Figure:
     return figure
 
 
+@_styled
 def goniometry_figure(turning: Goniometry) -> Figure:
     """Fig. 9: grey level of the pixels against the angle of the light."""
     figure, axes = _axes(1, 1, 3.6, width=5.5)
@@ -134,10 +156,12 @@ def goniometry_figure(turning: Goniometry) -> Figure:
     return figure
 
 
+@_styled
 def topography_figure(relief: Topography) -> Figure:
     """Figs 10 and 11: intensity, height and local slope of one square millimetre."""
     figure, axes = _axes(1, 3, 2.6)
     points = min(int(1000 / relief.pitch), *relief.height.shape)
+    rows, columns = ((n - points) // 2 for n in relief.height.shape)
     side = points * relief.pitch / 1000
     parts = {
         "intensity": (relief.intensity, "gray", ""),
@@ -145,7 +169,7 @@ def topography_figure(relief: Topography) -> Figure:
         "local slope (°)": (relief.slope, "magma", "°"),
     }
     for axis, (title, (values, colours, unit)) in zip(axes[0], parts.items(), strict=True):
-        cut = values[:points, :points]
+        cut = values[rows : rows + points, columns : columns + points]
         low, high = np.nanpercentile(cut, [0.5, 99.5])
         picture = axis.imshow(cut, cmap=colours, vmin=low, vmax=high, extent=(0, side, side, 0))
         axis.set_title(title)
@@ -158,6 +182,7 @@ def topography_figure(relief: Topography) -> Figure:
     return figure
 
 
+@_styled
 def threshold_figure(scene: SceneStudy) -> Figure:
     """Fig. 14: from P around the reflection to the threshold and the mask."""
     found = scene.threshold
@@ -175,17 +200,19 @@ def threshold_figure(scene: SceneStudy) -> Figure:
     ):
         axis.imshow(picture, cmap="gray", vmin=0, vmax=1)
         axis.set_title(title, fontsize=8)
-        axis.set_axis_off()
+        axis.set_xticks([])
+        axis.set_yticks([])
     axes[0][1].add_patch(_circle(zone.centre, zone.radius))
     axis = axes[0][3]
     axis.plot(zone.radii, 1000 * zone.profile, marker="o", markersize=2.5, linewidth=1, color="#1b6ca8")
     axis.axhline(1500 * zone.unaffected, color="0.5", linewidth=0.8, linestyle="--")
     axis.axvline(zone.radius, color="#c8102e", linewidth=1)
-    axis.set_title(f"P (1e-3 px) at {scene.chosen:g}°: radius {zone.radius:.0f} px", fontsize=8)
+    axis.set_title(f"P (1e-3 px), {scene.chosen:g}°: {zone.radius:.0f} px", fontsize=8)
     _finish_plot(axis, "distance (px)", "")
     return figure
 
 
+@_styled
 def masks_figure(scene: SceneStudy) -> Figure:
     """Fig. 16: what every light leaves out at the smallest and at the largest angle, with the areas."""
     count = len(scene.snapshots)
@@ -207,13 +234,11 @@ def masks_figure(scene: SceneStudy) -> Figure:
 
 
 def _axes(rows: int, columns: int, height: float, *, width: float = _WIDTH, **settings: Any) -> tuple[Figure, Any]:
-    import matplotlib as mpl
     from matplotlib.figure import Figure
 
     ratios = settings.pop("height_ratios", None)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        return figure, figure.subplots(rows, columns, squeeze=False, height_ratios=ratios, **settings)
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, height_ratios=ratios, **settings)
 
 
 def _map(
@@ -240,12 +265,14 @@ def _map(
 
 def _mark_areas(axis: Axes, scene: SceneStudy, *, label: bool = False) -> None:
     from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import withStroke
 
     for area, colour in zip(scene.bench.areas, _AREA_COLOURS, strict=True):
         x0, y0, x1, y1 = area.rectangle
         axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=0.9))
         if label:
-            axis.text((x0 + x1) / 2, y0 - 12, area.name, color=colour, ha="center", fontsize=6.5)
+            text = axis.text((x0 + x1) / 2, y0 - 12, area.name, color=colour, ha="center", fontsize=7, weight="bold")
+            text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
 def _circle(centre: tuple[float, float], radius: float) -> Any:

@@ -1,4 +1,4 @@
-"""The paper's own studies, on virtual and on real data: perturbation P, goniometry, topography, the methods compared."""
+"""The paper's own studies, on virtual and real data: perturbation P, goniometry, topography, methods compared."""
 
 from rgbmidic.study.bench import BENCHES, Bench, lamp_for_reflection
 from rgbmidic.study.competitors import METHODS, Competitor, Method

@@ -41,7 +41,7 @@ _MARGIN = 60.0
 _ROW = 180.0
 """Distance (px) of the areas above the middle of the frame; half as much and more in small frames."""
 _APART = 390.0
-"""Distance (px) along y between the reflection in the areas and the others: twice the paper's radius of 165, and more."""
+"""Distance (px) along y between the reflection in the areas and the others: over twice the paper's radius of 165."""
 _REGION = 0.55
 """Half the side of the measured square, in radii of the sphere: beyond, the surface turns away."""
 _BRIGHTEST = 0.97

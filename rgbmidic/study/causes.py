@@ -103,11 +103,14 @@ class Cause:
     ----------
     title
         The variation.
+    angles
+        Degrees.
     inside, outside : ndarray, shape (2 methods, n angles)
         P (px) of plain DIC and of GLC-DIC in the reflection and far from it.
     """
 
     title: str
+    angles: tuple[float, ...]
     inside: Array
     outside: Array
 
@@ -232,7 +235,7 @@ def _measure_variation(
             mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
             ripple = high_pass(at_pixels(mesh, solution.displacement, shot.shape)[1])
             inside[row, column], outside[row, column] = _inside_and_outside(ripple, bench, angle)
-    return Cause(title=variation.title, inside=inside, outside=outside)
+    return Cause(title=variation.title, angles=angles, inside=inside, outside=outside)
 
 
 def _shoot(bench: Bench, images: npt.NDArray[np.float32], shot: int, *, noisy: bool) -> IlluminationImages:

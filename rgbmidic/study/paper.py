@@ -384,7 +384,12 @@ def measure_state(
         ripple = high_pass(field[1])
         perturbation = area_stds(ripple, bench.areas)
         error = area_stds(high_pass(field[1] - truth[1]), bench.areas)
-        residual = np.mean([residual_percent(reference.values[i], images.values[i], field) for i in competitor.lights])
+        residual = np.mean(
+            [
+                residual_percent(reference.values[i], images.values[i], np.asarray(field, dtype=np.float64))
+                for i in competitor.lights
+            ]
+        )
         frontier = _frontier(ripple, competitor, images)
     else:
         residual, frontier = np.float64(np.nan), float("nan")
@@ -423,7 +428,7 @@ def _frontier(ripple: Array, competitor: Competitor, images: IlluminationImages)
     masks = ((competitor.reference.weights > 0) & (after > 0)).astype(np.uint8)
     edge = np.zeros(images.shape, dtype=np.uint8)
     for mask in masks:
-        edge |= cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+        edge |= np.asarray(cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)), dtype=np.uint8)
     distance = cv2.distanceTransform(1 - edge, cv2.DIST_L2, 5) if edge.any() else np.full(images.shape, np.inf)
     known = np.isfinite(ripple)
     beside = known & (distance > _ELEMENT) & (distance <= 3 * _ELEMENT)

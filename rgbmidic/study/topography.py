@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ __all__ = ["Roughness", "detrend", "local_slope", "paint_classes", "roughness", 
 
 Array = npt.NDArray[np.float64]
 
+_OCTAVE = 0.1
+"""Standard deviation, in the logarithm of the frequency, of the window that smooths the spectrum."""
 _BLOCKS = 3
 """The map is cut into this many blocks along each side to find the uncertainty of the spacing."""
 
@@ -80,7 +83,7 @@ def local_slope(height: npt.ArrayLike, pitch: float) -> Array:
     if not (pitch > 0 and math.isfinite(pitch)):
         raise InputError(f"the pitch of a height map is positive, not {pitch!r}")
     along_y, along_x = np.gradient(values, pitch)
-    return np.degrees(np.arctan(np.hypot(along_x, along_y)))
+    return np.asarray(np.degrees(np.arctan(np.hypot(along_x, along_y))))
 
 
 def slope_uncertainty(height_std: float, pitch: float) -> float:
@@ -100,7 +103,7 @@ def paint_classes(intensity: npt.ArrayLike) -> npt.NDArray[np.bool_]:
     low, high = np.percentile(values[known], [0.5, 99.5])
     grey = np.clip(255 * (np.where(known, values, low) - low) / max(high - low, 1e-300), 0, 255).astype(np.uint8)
     level = cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0]
-    return known & (grey > level)
+    return np.asarray(known & (grey > level))
 
 
 def roughness(
@@ -176,8 +179,8 @@ def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.0
     rows, columns = (np.linspace(0, n, _BLOCKS + 1).astype(int) for n in values.shape)
     parts = [
         _peak(*_ring_spectrum(values[a:b, c:d], pitch, longest))
-        for a, b in zip(rows, rows[1:], strict=False)
-        for c, d in zip(columns, columns[1:], strict=False)
+        for a, b in pairwise(rows)
+        for c, d in pairwise(columns)
     ]
     return 1 / peak, float(np.std(1 / np.array(parts), ddof=1) / _BLOCKS)
 
@@ -213,15 +216,14 @@ def _ring_spectrum(values: Array, pitch: float, longest: float) -> tuple[Array, 
 
 
 def _peak(frequency: Array, power: Array) -> float:
-    """Peak of a noisy spectrum: vertex of the parabola through its smoothed logarithm around the largest value."""
-    step = frequency[1] - frequency[0]
-    reach = max(1.0, 0.15 * frequency.mean() / step)
-    kernel = np.exp(-0.5 * (np.arange(-int(3 * reach), int(3 * reach) + 1) / reach) ** 2)
-    smooth = np.convolve(power, kernel, "same") / np.convolve(np.ones_like(power), kernel, "same")
+    """Peak of a noisy spectrum: vertex of the parabola through its logarithm, smoothed over `_OCTAVE` of frequency."""
+    position = np.log(frequency)
+    kernel = np.exp(-0.5 * ((position[:, None] - position) / _OCTAVE) ** 2)
+    smooth = kernel @ power / kernel.sum(axis=1)
     top = int(smooth.argmax())
-    near = slice(max(top - int(reach), 0), top + int(reach) + 1)
-    if near.stop - near.start < 3:
+    near = np.abs(position - position[top]) <= _OCTAVE
+    if near.sum() < 3:
         return float(frequency[top])
-    bend, slope, _ = np.polyfit(frequency[near] - frequency[top], np.log(smooth[near] + 1e-300), 2)
+    bend, slope, _ = np.polyfit(position[near] - position[top], np.log(smooth[near] + 1e-300), 2)
     shift = -slope / (2 * bend) if bend < 0 else 0.0
-    return float(frequency[top] + np.clip(shift, -reach * step, reach * step))
+    return float(frequency[top] * np.exp(np.clip(shift, -_OCTAVE, _OCTAVE)))

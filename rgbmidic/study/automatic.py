@@ -1,0 +1,86 @@
+"""The weighting threshold of a test, found from its own first deformed frame (paper, section 3.2).
+
+Every light is first correlated alone and without weights. Where its reflection disturbs the displacement, the grey
+level on the contour of the disturbed zone becomes the threshold of all lights and frames. The paper looks at one light;
+here the one whose reflection disturbs most is taken, as the others' may lie outside the region.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.correlation import Status
+from rgbmidic.errors import InputError
+from rgbmidic.fields import at_pixels
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.mesh import Region
+from rgbmidic.study.competitors import Competitor
+from rgbmidic.study.perturbation import high_pass
+from rgbmidic.study.threshold import SetUpThreshold, set_up_threshold
+
+__all__ = ["FALLBACK", "automatic_threshold"]
+
+logger = logging.getLogger(__name__)
+
+FALLBACK = 2 / 3
+"""Threshold where no reflection disturbs the first deformed frame: the paper's."""
+
+
+def automatic_threshold(
+    reference: IlluminationImages,
+    deformed: IlluminationImages,
+    region: Region,
+    *,
+    blur: float = 10.0,
+    element_size: float = 25.0,
+    prefilter: str = "binomial",
+) -> SetUpThreshold | None:
+    """Threshold from the reference and one deformed state, or None where no light's reflection disturbs.
+
+    Parameters
+    ----------
+    reference, deformed
+        Illumination images of the two states.
+    region
+        What is measured.
+    blur
+        Standard deviation (px) of the blur that the weights will use.
+    element_size
+        px.
+    prefilter
+        Of the correlation; a Bayer mosaic needs ``"binomial"``.
+    """
+    found = []
+    for light, name in enumerate(reference.names):
+        for component, ripple in _ripples(reference, deformed, region, light, element_size, prefilter):
+            try:
+                threshold = set_up_threshold(ripple, reference, light=light, blur=blur)
+            except InputError as error:
+                logger.info("%s alone, without weights, %s: %s", name, component, error)
+                continue
+            if 0 < threshold.value <= 1:
+                found.append(threshold)
+    return max(found, key=lambda threshold: threshold.zone.contrast, default=None)
+
+
+def _ripples(
+    reference: IlluminationImages,
+    deformed: IlluminationImages,
+    region: Region,
+    light: int,
+    element_size: float,
+    prefilter: str,
+) -> list[tuple[str, npt.NDArray[np.float64]]]:
+    """High-passed u and v (H, W) of one light alone; of the two the smaller displacement shows a disturbance best."""
+    competitor = Competitor.prepare(
+        "dic", reference, region, light=light, element_size=element_size, prefilter=prefilter
+    )
+    solution = competitor.measure(deformed)
+    if solution.status is Status.FAILED:
+        logger.info("%s alone, without weights: %s", reference.names[light], solution.reason)
+        return []
+    fields = at_pixels(competitor.reference.mesh, solution.displacement, reference.shape)
+    return [(name, high_pass(part)) for name, part in zip("uv", fields, strict=True)]
