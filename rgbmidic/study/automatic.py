@@ -55,9 +55,9 @@ def automatic_threshold(
     """
     found = []
     for light, name in enumerate(reference.names):
-        for component, ripple in _ripples(reference, deformed, region, light, element_size, prefilter):
+        for component, field in _displacement(reference, deformed, region, light, element_size, prefilter):
             try:
-                threshold = set_up_threshold(ripple, reference, light=light, blur=blur)
+                threshold = set_up_threshold(high_pass(field), reference, light=light, blur=blur)
             except InputError as error:
                 logger.info("%s alone, without weights, %s: %s", name, component, error)
                 continue
@@ -66,15 +66,15 @@ def automatic_threshold(
     return max(found, key=lambda threshold: threshold.zone.contrast, default=None)
 
 
-def _ripples(
+def _displacement(
     reference: IlluminationImages,
     deformed: IlluminationImages,
     region: Region,
     light: int,
     element_size: float,
     prefilter: str,
-) -> list[tuple[str, npt.NDArray[np.float64]]]:
-    """High-passed u and v (H, W) of one light alone; of the two the smaller displacement shows a disturbance best."""
+) -> list[tuple[str, npt.NDArray[np.float32]]]:
+    """u and v (H, W) of one light alone, without weights; the smaller of the two shows a disturbance best."""
     competitor = Competitor.prepare(
         "dic", reference, region, light=light, element_size=element_size, prefilter=prefilter
     )
@@ -83,4 +83,4 @@ def _ripples(
         logger.info("%s alone, without weights: %s", reference.names[light], solution.reason)
         return []
     fields = at_pixels(competitor.reference.mesh, solution.displacement, reference.shape)
-    return [(name, high_pass(part)) for name, part in zip("uv", fields, strict=True)]
+    return list(zip("uv", fields, strict=True))

@@ -97,6 +97,7 @@ def _displacement_of_reflection(data: _Data) -> Claim:
         "the reflection moves from A4 at 0° to A2 at 14°, about 200 px",
         f"the brightest point of the blurred image moves by {way:.0f} px at {angle:g}° ({expected:.0f} px by geometry)",
         _verdict(abs(way - expected) < 20),
+        "The brightest point is that of reflection and diffuse light together, and of the speckle that is left.",
     )
 
 
@@ -131,6 +132,7 @@ def _linear_mean(data: _Data) -> Claim:
         "the mean U_y of every area is linear in the angle",
         f"largest deviation from a straight line {worst:.1%} of the largest displacement of the area",
         _verdict(worst < 0.1),
+        "Near the axis of rotation U_y is small, and the reflection's error weighs more.",
     )
 
 
@@ -194,6 +196,7 @@ def _only_then(data: _Data) -> Claim:
         f"A1, A2 at {data.angles[first]:g}°: {ratio[0]:.1f}, {ratio[1]:.1f} times A0; at {LARGE:g}° and more up to "
         f"{later[0]:.1f}, {later[1]:.1f} times",
         "not measured" if not data.large.any() else _verdict(bool((ratio < 1.6).all() and np.nanmax(later) > 2)),
+        "In small frames the areas stand closer together than in the paper, and A2 lies in the disturbed zone.",
     )
 
 

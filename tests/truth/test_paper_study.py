@@ -1,0 +1,111 @@
+"""A short run of the paper's experiment: the reflection disturbs plain DIC, and MIDIC with weights puts it right."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from rgbmidic.cli import app
+from rgbmidic.errors import InputError
+from rgbmidic.study import METHODS, run_paper_study
+from rgbmidic.study.claims import judge
+from rgbmidic.study.paper import PaperStudy
+
+ANGLES = (1.0, 8.0)
+
+
+@pytest.fixture(scope="module")
+def study() -> PaperStudy:
+    return run_paper_study(ANGLES, size=512, scenes=("sequential",), causes=False)
+
+
+def test_reflection_disturbs_one_light_and_midic_follows_the_quiet_area(study):
+    scene = study.scene("sequential")
+    p = {method: scene.perturbation(method) for method in METHODS}
+    quiet = p["dic"][:, 0]
+    assert (quiet > 0.0005).all()
+    assert (quiet < 0.015).all()
+    # paper: 4 to 5 times; the worst of A2 to A4 tells
+    assert (p["dic"][:, 2:].max(axis=1) > 3 * quiet).all()
+    assert p["glc-dic"][1, 2:].max() < 0.8 * p["dic"][1, 2:].max()
+    assert np.median(p["midic-unweighted"] / p["dic"]) > 0.6
+    assert (p["midic"][:, 3:] < 1.3 * quiet[:, None]).all()
+    assert p["midic"][1, 2:].max() < 0.4 * p["dic"][1, 2:].max()
+
+
+def test_p_is_error_and_not_the_motion_of_the_sphere(study):
+    """The long waves that the filter takes off are all of the true field: what is left is error."""
+    for one in study.scene("sequential").measurements.values():
+        assert one.perturbation == pytest.approx(one.error, rel=0.05, nan_ok=True)
+
+
+def test_threshold_is_found_where_the_disturbance_ends(study):
+    found = study.scene("sequential").threshold
+    assert 100 < found.zone.radius < 300
+    assert 0.15 < found.value < 0.5
+
+
+def test_two_lamps_halve_the_variance(study):
+    noise = study.noise
+    assert noise.together < noise.single.min()
+    assert np.sqrt(np.mean((noise.single / noise.together) ** 2)) == pytest.approx(np.sqrt(2), rel=0.12)
+
+
+def test_every_statement_has_a_verdict_and_a_reason_where_it_fails(study):
+    claims = judge(study)
+    assert {claim.figure.split(",")[0] for claim in claims} >= {"Fig. 4", "Fig. 7", "Fig. 8", "Fig. 9", "Fig. 17"}
+    for claim in claims:
+        assert claim.measured
+        if claim.verdict == "not reproduced":
+            assert claim.reason or claim.figure == "Fig. 6", claim
+
+
+def test_verdicts_follow_the_figures(study):
+    """A study in which MIDIC is as disturbed as plain DIC must not pass."""
+    scene = study.scene("sequential")
+    spoilt = {
+        (method, angle): scene.measurements["dic" if method == "midic" else method, angle]
+        for method, angle in scene.measurements
+    }
+    worse = replace(study, scenes=(replace(scene, measurements=spoilt),))
+    for figures, passes in ((judge(study), True), (judge(worse), False)):
+        trend = next(claim for claim in figures if claim.figure == "Fig. 17" and "trend" in claim.statement)
+        assert (trend.verdict != "not reproduced") == passes
+
+
+def test_command_writes_tables_pictures_and_report(study, tmp_path, monkeypatch):
+    asked = {}
+
+    def canned(angles, **settings):
+        asked.update(angles=angles, **settings)
+        return study
+
+    monkeypatch.setattr("rgbmidic.study.run_paper_study", canned)
+    out = tmp_path / "study"
+    result = CliRunner().invoke(app, ["study", "paper", "--out", str(out), "--angles", "1,8", "--size", "512"])
+    assert result.exit_code == 0, result.output
+    assert asked["angles"] == [1.0, 8.0]
+    assert (asked["size"], asked["causes"]) == (512, False)
+    with (out / "perturbation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["scene", "method", "angle_deg", "area", "P_px"]
+    assert len(rows) == len(METHODS) * len(ANGLES) * 5
+    row = next(r for r in rows if (r["method"], r["angle_deg"], r["area"]) == ("midic", "8", "A4"))
+    assert float(row["P_px"]) == pytest.approx(study.scene("sequential").perturbation("midic")[1, 4], rel=1e-5)
+    report = (out / "report.md").read_text(encoding="utf-8")
+    pictures = {path.name for path in out.glob("*.png")}
+    assert len(pictures) == 10
+    assert all(f"]({name})" in report for name in pictures)
+    assert "reproduced" in report
+    assert all(name in (out / "report.html").read_text(encoding="utf-8") for name in pictures)
+    again = CliRunner().invoke(app, ["study", "paper", "--out", str(out)])
+    assert "not empty" in str(again.exception)
+
+
+@pytest.mark.parametrize("angles", ["0", "-1,3", "50", "3,x"])
+def test_angles_that_make_no_sense_are_refused_before_any_work(angles, tmp_path):
+    result = CliRunner().invoke(app, ["study", "paper", "--out", str(tmp_path / "out"), f"--angles={angles}"])
+    assert isinstance(result.exception, InputError)
+    assert "angles" in str(result.exception)
