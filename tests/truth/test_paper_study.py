@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from rgbmidic.cli import app
 from rgbmidic.errors import InputError
 from rgbmidic.study import METHODS, run_paper_study
+from rgbmidic.study.causes import VARIATIONS, find_causes
 from rgbmidic.study.claims import judge
 from rgbmidic.study.paper import PaperStudy
 
@@ -109,3 +110,13 @@ def test_angles_that_make_no_sense_are_refused_before_any_work(angles, tmp_path)
     result = CliRunner().invoke(app, ["study", "paper", "--out", str(tmp_path / "out"), f"--angles={angles}"])
     assert isinstance(result.exception, InputError)
     assert "angles" in str(result.exception)
+
+
+def test_brightness_disturbs_plain_dic_and_roughness_defeats_the_grey_level_correction():
+    """Paint without relief and wrinkles that reflects as much on average: the same P by DIC, hardly any by GLC-DIC."""
+    rough, smooth = find_causes((8.0,), size=448, variations=[VARIATIONS[0], VARIATIONS[5]])
+    assert "no wrinkles" in smooth.title
+    plain, corrected = rough.inside[:, 0], smooth.inside[:, 0]
+    assert corrected[0] == pytest.approx(plain[0], rel=0.35)
+    assert corrected[1] < 0.35 * plain[1]
+    assert (rough.ratio[:, 0] > 3).all()
