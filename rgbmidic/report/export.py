@@ -28,9 +28,9 @@ _CSV_COLUMNS = (
 def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool = False) -> None:
     """Write all frames of a result into one file.
 
-    ``"npz"``: nodes (N, 2) and elements (E, 3); u, v, exx, eyy, exy, each also with _std, node_status and misfit (T, N);
-    light_share (T, N, k); status and iterations (T,); residual and weight_share (T, k); names and lights. ``"csv"``: a
-    header line, then one row per node and frame.
+    ``"npz"``: nodes (N, 2) and elements (E, 3); u, v, exx, eyy, exy, each also with _std, node_status and misfit (T,
+    N); light_share (T, N, k); status and iterations (T,); residual and weight_share (T, k); names and lights.
+    ``"csv"``: a header line, then one row per node and frame.
     Positions and displacements are in px, x right, y down; NaN (an empty field in csv) where not measured.
 
     Parameters
