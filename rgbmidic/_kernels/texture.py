@@ -1,0 +1,179 @@
+"""Compiled loops over a Bayer mosaic that gather what the colours' textures have in common.
+
+Grids hold one value per square block of pixels and stand for the block's centre; between the centres they are
+interpolated linearly, beyond the outermost they are constant. ``red_row, red_column`` are the position of red in the
+2x2 cell. A sample that must not be used is NaN.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+__all__ = ["block_sums", "cell_moments", "expand_row", "lag_products", "scaled_contrast", "subtract_mean"]
+
+REACH = 3
+"""Rows and columns beyond a cell that its binomial sums reach."""
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def block_sums(values, red_row, red_column, block, sums, counts):
+    """Sum and number of finite samples of each channel in each block: `sums`, `counts` (3, h, w) float64."""
+    rows, columns = values.shape
+    for bi in prange(sums.shape[1]):
+        for bj in range(sums.shape[2]):
+            for channel in range(3):
+                sums[channel, bi, bj] = 0.0
+                counts[channel, bi, bj] = 0.0
+            for i in range(bi * block, min((bi + 1) * block, rows)):
+                own = 0 if i % 2 == red_row else 2
+                for j in range(bj * block, min((bj + 1) * block, columns)):
+                    channel = own if (j % 2 == red_column) == (own == 0) else 1
+                    if np.isfinite(values[i, j]):
+                        sums[channel, bi, bj] += values[i, j]
+                        counts[channel, bi, bj] += 1.0
+
+
+@njit(cache=True, nogil=True)
+def expand_row(grid, row, block, line, out):
+    """Row of pixels `out` (W,) interpolated from a grid (h, w); `line` (w,) is scratch."""
+    position = min(max((row + 0.5) / block - 0.5, 0.0), grid.shape[0] - 1.0)
+    low = int(position)
+    high = min(low + 1, grid.shape[0] - 1)
+    part = np.float32(position - low)
+    for g in range(line.size):
+        line[g] = grid[low, g] + part * (grid[high, g] - grid[low, g])
+    half, last = block // 2, line.size - 1
+    first = min(half, out.size)
+    for j in range(first):
+        out[j] = line[0]
+    per_pixel = np.float32(1.0 / block)
+    for g in range(last):
+        start = half + g * block
+        level, slope = line[g], (line[g + 1] - line[g]) * per_pixel
+        for j in range(min(block, out.size - start)):
+            out[start + j] = level + slope * np.float32(j + 0.5)
+    for j in range(half + last * block, out.size):
+        out[j] = line[last]
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def subtract_mean(values, mean, red_row, red_column, block, out):
+    """``out = values - local mean of the pixel's channel``; `mean` (3, h, w) float32."""
+    rows, columns = values.shape
+    for i in prange(rows):
+        line = np.empty(mean.shape[2], dtype=np.float32)
+        other, green = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
+        own = 0 if i % 2 == red_row else 2
+        expand_row(mean[own], i, block, line, other)
+        expand_row(mean[1], i, block, line, green)
+        start = red_column if own == 0 else 1 - red_column
+        for j in range(start, columns, 2):
+            green[j] = other[j]
+        for j in range(columns):
+            out[i, j] = values[i, j] - green[j]
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def scaled_contrast(contrast, scale, red_row, red_column, block, pad, out):
+    """``out = contrast * scale of the pixel's channel``, mirrored by `pad` pixels on every side.
+
+    `scale` (3, h, w) float32; `out` has `pad` more rows above and below and columns on the left, and at least as many
+    on the right, where what lies beyond is 0. H, W > pad.
+    """
+    rows, columns = contrast.shape
+    for p in prange(rows + 2 * pad):
+        i = abs(p - pad)
+        i = min(i, 2 * (rows - 1) - i)
+        line = np.empty(scale.shape[2], dtype=np.float32)
+        other, green = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
+        own = 0 if i % 2 == red_row else 2
+        expand_row(scale[own], i, block, line, other)
+        expand_row(scale[1], i, block, line, green)
+        start = red_column if own == 0 else 1 - red_column
+        for j in range(start, columns, 2):
+            green[j] = other[j]
+        target = out[p]
+        for j in range(columns):
+            target[j + pad] = contrast[i, j] * green[j]
+        for side in range(1, pad + 1):
+            target[pad - side] = target[pad + side]
+            target[pad + columns - 1 + side] = target[pad + columns - 1 - side]
+        for j in range(columns + 2 * pad, target.size):
+            target[j] = 0.0
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def cell_moments(contrast, red_row, red_column, block, sums, counts):
+    """Second moments of the four planes' low-passed contrast, summed over the cells of each block.
+
+    At the middle of each 2x2 cell the binomial [1 5 10 10 5 1] along both axes takes from each of the planes red, green
+    in red rows, green in blue rows and blue its own share, with the same weight and the same centroid. `sums`
+    (6, h, w) float64 receives red², green², blue², red green, red blue, green blue, the greens averaged after
+    multiplying; `counts` (h, w) the cells; a cell with a sample that is not finite in reach is left out.
+    """
+    rows, columns = contrast.shape
+    half = block // 2
+    for bi in prange(sums.shape[1]):
+        sums[:, bi] = 0.0
+        counts[bi] = 0.0
+        even = np.empty(columns, dtype=np.float32)
+        odd = np.empty(columns, dtype=np.float32)
+        for ci in range(bi * half, (bi + 1) * half):
+            i = 2 * ci
+            if i < 2 or i + REACH >= rows:
+                continue
+            for j in range(columns):
+                even[j] = contrast[i - 2, j] + 10 * contrast[i, j] + 5 * contrast[i + 2, j]
+                odd[j] = 5 * contrast[i - 1, j] + 10 * contrast[i + 1, j] + contrast[i + 3, j]
+            red = even if red_row == 0 else odd
+            blue = odd if red_row == 0 else even
+            for bj in range(sums.shape[2]):
+                for cj in range(bj * half, (bj + 1) * half):
+                    j = 2 * cj
+                    if j < 2 or j + REACH >= columns:
+                        continue
+                    first = red[j - 2] + 10 * red[j] + 5 * red[j + 2]
+                    second = 5 * red[j - 1] + 10 * red[j + 1] + red[j + 3]
+                    third = blue[j - 2] + 10 * blue[j] + 5 * blue[j + 2]
+                    fourth = 5 * blue[j - 1] + 10 * blue[j + 1] + blue[j + 3]
+                    if red_column == 0:
+                        r, g1, g2, b = first, second, third, fourth
+                    else:
+                        g1, r, b, g2 = first, second, third, fourth
+                    total = r + g1 + g2 + b
+                    if not np.isfinite(total):
+                        continue
+                    g = 0.5 * (g1 + g2)
+                    sums[0, bi, bj] += r * r
+                    sums[1, bi, bj] += 0.5 * (g1 * g1 + g2 * g2)
+                    sums[2, bi, bj] += b * b
+                    sums[3, bi, bj] += r * g
+                    sums[4, bi, bj] += r * b
+                    sums[5, bi, bj] += g * b
+                    counts[bi, bj] += 1.0
+
+
+@njit(cache=True, nogil=True)
+def lag_products(contrast, red_row, red_column, lags, step, sums, counts):
+    """Products of samples at each lag (row, column), apart for red-green, red-blue, green-blue and each colour alone.
+
+    Base pixels are the 2x2 cells of every `step`-th row of cells. `sums`, `counts` (lags, 6) float64; kinds 0 to 5 are
+    red², green², blue², red green, red blue, green blue.
+    """
+    rows, columns = contrast.shape
+    for n in range(lags.shape[0]):
+        di, dj = lags[n, 0], lags[n, 1]
+        for ci in range(0, rows // 2, step):
+            for i in range(2 * ci, 2 * ci + 2):
+                other = i + di
+                if other >= rows:
+                    continue
+                own = 0 if i % 2 == red_row else 2
+                own_other = 0 if other % 2 == red_row else 2
+                for j in range(max(0, -dj), min(columns, columns - dj)):
+                    a = own if (j % 2 == red_column) == (own == 0) else 1
+                    b = own_other if ((j + dj) % 2 == red_column) == (own_other == 0) else 1
+                    product = contrast[i, j] * contrast[other, j + dj]
+                    if np.isfinite(product):
+                        kind = a if a == b else 2 + a + b
+                        sums[n, kind] += product
+                        counts[n, kind] += 1.0

@@ -1,0 +1,207 @@
+"""How each colour sees the common texture, block by block, from a single mosaic.
+
+A sample of camera channel c is ``m_c = mean_c + alpha_c a + e_c``: alpha_c, the slope on the common texture a, is smooth; e_c
+is what only this channel shows there, the erratic part of a reflection and camera noise. Low-passed to the band that all
+colours resolve, two channels have the moment ``alpha_c alpha_c'`` in common and nothing else, so three channels give
+three slopes (``alpha_1^2 = M_12 M_13 / M_23``, a one-factor analysis), free of the bias that noise gives a regression; what
+a channel's own moment has beyond that is the variance of e_c.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels import texture as kernels
+from rgbmidic.illumination.mosaic import NoiseModel
+from rgbmidic.illumination.texture import LAGS, WHITE_ENERGY, BandEnergy, TextureModel, fit_texture
+
+__all__ = ["BLOCK", "MEAN_BLOCK", "ColourFactors", "Moments", "colour_factors", "gather_moments", "learn_texture"]
+
+Floats = npt.NDArray[np.float64]
+FloatImage = npt.NDArray[np.float32]
+
+MEAN_BLOCK, BLOCK = 4, 8
+"""Side of the blocks (px) of the local means and of the moments."""
+MEAN_WIDTH, MOMENT_WIDTH = 8.0, 14.0
+"""Standard deviation (px) of the windows over which means and moments are taken: several speckles wide."""
+ALIASING = 0.05
+"""Own moment beyond the common one, relative to it, that the aliasing of the coarse colour lattices may cause."""
+UNCERTAIN = 0.003
+"""Variance of e_c, relative to alpha_c^2, that the window cannot tell from none."""
+LEAST = 0.001
+"""Least such variance: how well two colours can agree."""
+DIAGONAL_LACK = 1.9
+"""How much less planes that are diagonal neighbours agree than those along a row or column (1.85 to 1.95)."""
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moments:
+    """What is gathered from the mosaic before the texture is known.
+
+    Attributes
+    ----------
+    mean : (3, h, w) float32
+        Local mean of each channel on a grid of `MEAN_BLOCK` px.
+    contrast : (H, W) float32
+        Samples minus their channel's local mean; NaN where not known.
+    own, shared : (3, h, w) float64
+        Local moments of the low-passed planes on a grid of `BLOCK` px: red², green², blue² without camera noise, and
+        red green, red blue, green blue.
+    noise : (3, h, w) float64
+        Variance of the camera noise of one sample of each channel (DN²).
+    red : (int, int)
+        Position of red in the 2x2 cell.
+    """
+
+    mean: FloatImage
+    contrast: FloatImage
+    own: Floats
+    shared: Floats
+    noise: Floats
+    red: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColourFactors:
+    """How each channel sees the common texture, on a grid of `BLOCK` px.
+
+    Attributes
+    ----------
+    slope : (3, h, w) float64
+        alpha_c in DN per standard deviation of the texture.
+    private : (3, h, w) float64
+        Variance of e_c without camera noise, relative to alpha_c².
+    noise : (3, h, w) float64
+        Variance of the camera noise, relative to alpha_c².
+    """
+
+    slope: Floats
+    private: Floats
+    noise: Floats
+
+    @property
+    def spread(self) -> Floats:
+        """Standard deviation (3, h, w) of each channel's contrast without camera noise, DN."""
+        return np.asarray(self.slope * np.sqrt(1 + self.private))
+
+    @property
+    def share(self) -> Floats:
+        """Share (3, h, w) of the common texture in each channel's variance, 0 to 1."""
+        return np.asarray(1 / (1 + self.private))
+
+
+def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel | None) -> Moments:
+    """Local means, contrast and local moments of a mosaic.
+
+    Parameters
+    ----------
+    values : (H, W) float32
+        Linearised samples, NaN where saturated.
+    red
+        Position of red in the 2x2 cell.
+    noise
+        Camera noise; None counts it with what is private to a channel.
+    """
+    mean = _local_means(values, red)
+    contrast = np.empty_like(values)
+    kernels.subtract_mean(values, mean, *red, MEAN_BLOCK, contrast)
+    height, width = (-(-side // BLOCK) for side in values.shape)
+    sums, counts = np.empty((6, height, width)), np.empty((height, width))
+    kernels.cell_moments(contrast, *red, BLOCK, sums, counts)
+    # the binomial weights of a plane sum to 256 in the kernel
+    moments = _smooth(sums / 256**2, counts, MOMENT_WIDTH / BLOCK)
+    level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in mean]).astype(np.float64)
+    variance = np.zeros_like(level) if noise is None else np.asarray(noise.variance(level), dtype=np.float64)
+    own = moments[:3] - variance * WHITE_ENERGY
+    floor = 1e-6 * moments[:3].max() + 1e-12
+    return Moments(
+        mean=mean, contrast=contrast, own=np.maximum(own, floor), shared=moments[3:], noise=variance, red=red
+    )
+
+
+def _local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
+    shape = (3, *(-(-side // MEAN_BLOCK) for side in values.shape))
+    sums, counts = np.empty(shape), np.empty(shape)
+    kernels.block_sums(values, *red, MEAN_BLOCK, sums, counts)
+    return _smooth(sums, counts, MEAN_WIDTH / MEAN_BLOCK).astype(np.float32)
+
+
+def _smooth(sums: Floats, counts: Floats, sigma: float) -> Floats:
+    """Mean (n, h, w) in a Gaussian window (blocks) of sums over `counts` entries; the overall mean where there are none."""
+
+    def blurred(grid: Floats) -> Floats:
+        return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
+
+    counts = np.broadcast_to(counts, sums.shape)
+    out = np.empty_like(sums)
+    for total, number, target in zip(sums, counts, out, strict=True):
+        weight = blurred(np.ascontiguousarray(number))
+        overall = total.sum() / max(number.sum(), 1.0)
+        enough = weight > 1e-3 * max(float(number.max()), 1.0)
+        np.divide(blurred(np.ascontiguousarray(total)), weight, out=target, where=enough)
+        target[~enough] = overall
+    return out
+
+
+def learn_texture(moments: Moments, *, samples: int = 130_000) -> TextureModel:
+    """The texture of a specimen from one mosaic; about `samples` pixels are looked at."""
+    root = np.sqrt(moments.own)
+    padded = scaled(moments, (1 / root).astype(np.float32), pad=0)
+    local = np.stack([moments.shared[n] / (root[a] * root[b]) for n, (a, b) in enumerate(_PAIRS)])
+    # red and blue, diagonal neighbours, lack about twice as much; the best pair of each place is free of reflections
+    lacking = np.min([1 - local[0], (1 - local[1]) / DIAGONAL_LACK, 1 - local[2]], axis=0)
+    sums, counts = np.zeros((len(LAGS), 6)), np.zeros((len(LAGS), 6))
+    step = max(1, padded.size // samples)
+    kernels.lag_products(padded, *moments.red, LAGS, step, sums, counts)
+    correlations = np.maximum(local.mean(axis=(1, 2)), 1e-3)
+    return fit_texture(sums, counts, correlations, 1 - float(np.median(lacking)))
+
+
+def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None = None) -> FloatImage:
+    """Contrast times `scale` (3, h, w), mirrored by `pad` px; `width` asks for more columns, which are 0."""
+    rows, columns = moments.contrast.shape
+    out = np.empty((rows + 2 * pad, max(columns, width or 0) + 2 * pad), dtype=np.float32)
+    kernels.scaled_contrast(moments.contrast, np.ascontiguousarray(scale), *moments.red, BLOCK, pad, out)
+    return out
+
+
+def colour_factors(moments: Moments, band: BandEnergy, crosstalk: Floats) -> ColourFactors:
+    """Slopes of the channels on the common texture and what is private to each.
+
+    Parameters
+    ----------
+    moments
+        See `gather_moments`.
+    band
+        What the planes show of the texture (`TextureModel.band`).
+    crosstalk : (3, k)
+        A in channels = A . lights: one light's sparkle is seen by all channels, which is taken out of their moments.
+    """
+    energy = np.array([band.adjacent, band.diagonal, band.adjacent])[:, None, None]
+    own = moments.own / band.own
+    sparkle = np.zeros_like(own)
+    for _ in range(2):  # the correction is small and settles at once
+        leaked = np.stack([_crossed(crosstalk, sparkle, a, b) for a, b in _PAIRS])
+        red_green, red_blue, green_blue = np.maximum((moments.shared - leaked) / energy, 1e-4 * own.min(axis=0))
+        square = np.stack(
+            [red_green * red_blue / green_blue, red_green * green_blue / red_blue, red_blue * green_blue / red_green]
+        )
+        square = np.minimum(square, own)
+        excess = own / square
+        least = excess.min(axis=0)
+        # at least one channel is free of reflections at each place, unless it shows too much of its own for that
+        private = excess - least + np.maximum(least - 1 - ALIASING, 0)
+        sparkle = private * square * band.own
+    variance = np.maximum(private * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
+    return ColourFactors(slope=np.sqrt(square), private=variance, noise=moments.noise / square)
+
+
+def _crossed(crosstalk: Floats, sparkle: Floats, a: int, b: int) -> Floats:
+    """Moment of channels a and b that comes from the sparkle of lights, given each channel's own."""
+    lights = np.maximum(np.tensordot(np.linalg.pinv(crosstalk**2), sparkle, axes=1), 0)
+    return np.asarray(np.tensordot(crosstalk[a] * crosstalk[b], lights, axes=1))

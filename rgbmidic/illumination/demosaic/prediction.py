@@ -1,0 +1,145 @@
+"""Linear prediction of every channel at every pixel from the samples around it (simple kriging).
+
+The contrast of channel c, divided by its own spread, is ``sqrt(s_c) a + sqrt(1 - s_c) e_c + n_c``: common texture a of
+autocorrelation C, what is private to the channel, and camera noise, with s_c the share of the common texture. The best
+linear prediction of a channel at a pixel from the N x N samples around it has the filter ``(K + V)^-1 k``, with K the
+covariance of the samples, V their noise and k their covariance with what is wanted. It depends on the pixel's phase in
+the 2x2 cell and on the three shares alone, so the filters of a frame are a small table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.kriging import TILE
+from rgbmidic.illumination.mosaic import cfa_channels
+from rgbmidic.illumination.texture import TextureModel
+
+__all__ = ["SIZE", "FilterTable", "prediction_filters"]
+
+Floats = npt.NDArray[np.float64]
+
+SIZE = 5
+"""Side of the square of samples that a value is predicted from."""
+LEVELS_PER_OCTAVE = 1
+"""Fineness in which a channel's private variance is rounded; twice as fine measures the same."""
+LARGEST, SMALLEST = 10, -10
+"""Range (powers of two) of the private variance relative to the common one."""
+OFFSET_VARIANCE = 10.0
+"""Variance of an unknown constant under the texture: makes the filter's coefficients sum to one."""
+SPARKLE_VARIANCE = 0.29
+"""Variance (px²) of the aperture through which sparkle is seen: a square pixel, 1/12, and a lens blur of 0.45 px."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilterTable:
+    """Filters of the tiles of a frame.
+
+    Attributes
+    ----------
+    index : (h, w) int32
+        Row of `taps` for each tile.
+    taps : (T, 2, n, size², 16) float32
+        As `rgbmidic._kernels.kriging.predict` takes them.
+    variance : (T, n) float64
+        Variance of the prediction's error, in units of the channel's own, mean over the phases.
+    noise : (T, n, n) float64
+        Covariance of the camera noise in the predictions, mean over the phases.
+    size : int
+        Side of the square of samples.
+    """
+
+    index: npt.NDArray[np.int32]
+    taps: npt.NDArray[np.float32]
+    variance: Floats
+    noise: Floats
+    size: int = SIZE
+
+
+def prediction_filters(
+    private: Floats, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
+) -> FilterTable:
+    """The table of filters for tiles whose channels have some private variance.
+
+    Parameters
+    ----------
+    private : (3, h, w)
+        Variance private to each channel in each tile, relative to the common one.
+    noise : (3,)
+        Variance of the camera noise of each channel relative to the channel's own variance.
+    texture
+        Autocorrelation of the common texture, and of what is private.
+    cfa
+        Bayer pattern.
+    size
+        Side of the square of samples, odd.
+
+    Returns
+    -------
+    FilterTable
+        With an output for each channel and a last one for the common texture alone.
+    """
+    # the noise matters little beside the texture: coarse steps let frames of a sequence share their filters
+    steps = tuple(int(n) for n in np.round(2 * np.log2(np.maximum(noise, 1e-8))))
+    level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(private, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
+    code = (level[0] * 1000 + level[1]) * 1000 + level[2]
+    _, first, index = np.unique(code, return_index=True, return_inverse=True)
+    keys = [tuple(int(one) for one in level.reshape(3, -1)[:, n]) for n in first]
+    entries = [_entry(key, steps, texture, cfa, size) for key in keys]
+    return FilterTable(
+        index=index.reshape(level.shape[1:]).astype(np.int32),
+        taps=np.stack([taps for taps, _, _ in entries]),
+        variance=np.stack([variance for _, variance, _ in entries]),
+        noise=np.stack([covariance for _, _, covariance in entries]),
+        size=size,
+    )
+
+
+@lru_cache(maxsize=4096)
+def _entry(
+    level: tuple[int, ...], noise: tuple[int, ...], texture: TextureModel, cfa: str, size: int
+) -> tuple[npt.NDArray[np.float32], Floats, Floats]:
+    """Filters (2, 4, size², TILE), error variances (4,) and noise covariance (4, 4) of one combination of levels."""
+    share = 1 / (1 + 2.0 ** (np.array(level) / LEVELS_PER_OCTAVE))
+    camera = 2.0 ** (np.array(noise) / 2)
+    common, coarse, fine = _covariances(texture, size)
+    private = texture.private * coarse + (1 - texture.private) * fine
+    centre = size * size // 2
+    taps, variance = np.empty((4, 4, size * size)), np.zeros(4)
+    covariance = np.zeros((4, 4))
+    wanted = np.append(share, 1.0)
+    for phase, channel in enumerate(_channels_around(cfa, size)):
+        same = channel[:, None] == np.arange(3)
+        own_share = np.sqrt((1 - share) * same)
+        samples = np.outer(np.sqrt(share[channel]), np.sqrt(share[channel])) * common
+        samples += (own_share @ own_share.T) * private + np.diag(camera[channel])
+        target = np.sqrt(np.outer(share[channel], wanted)) * common[:, centre, None]
+        target[:, :3] += (1 - share) * same * private[:, centre, None]
+        solution = np.linalg.solve(samples, target)
+        taps[phase] = solution.T
+        prior = wanted * common[centre, centre]
+        prior[:3] += (1 - share) * private[centre, centre]
+        variance += (prior - (solution * target).sum(axis=0)) / 4
+        covariance += solution.T @ (camera[channel][:, None] * solution) / 4
+    lanes = np.tile(taps.reshape(2, 2, 4, -1).transpose(0, 2, 3, 1), TILE // 2)
+    return lanes.astype(np.float32), variance, covariance
+
+
+@lru_cache(maxsize=64)
+def _covariances(texture: TextureModel, size: int) -> tuple[Floats, Floats, Floats]:
+    """Covariance between the samples of the square: of the texture, of coarse and of fine private contrast."""
+    offset = np.arange(size) - size // 2
+    points = np.stack(np.meshgrid(offset, offset, indexing="ij"), -1).reshape(-1, 2)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    common = texture(apart) + OFFSET_VARIANCE
+    return common, common, np.exp(-(apart**2) / (4 * SPARKLE_VARIANCE))
+
+
+def _channels_around(cfa: str, size: int) -> list[npt.NDArray[np.intp]]:
+    """Channel of each sample of the square, for the four phases of its centre: (0, 0), (0, 1), (1, 0), (1, 1)."""
+    cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
+    return [cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel() for p in (0, 1) for q in (0, 1)]

@@ -1,0 +1,174 @@
+"""Demosaicing that survives reflections: the speckle's own statistics fill in what a colour did not sample.
+
+Usual methods assume that the three channels show one texture. Under coloured lights that holds where the paint is mat
+and breaks where one light reflects. Here it is measured, block by block, how much of each channel's contrast is common
+and how much its own (`rgbmidic.illumination.colour_factors`), and every channel is predicted from all the samples around
+with exactly that trust (`rgbmidic.illumination.demosaic.prediction`). A channel in a reflection no longer leaks into the
+others, its own sparkle is kept, the coarse lattices of red and blue are filled from what the others see; a coloured
+specimen, whose channels have nothing in common, is reconstructed channel by channel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.kriging import TILE, fill_unknown, predict
+from rgbmidic.errors import InputError
+from rgbmidic.illumination.colour_factors import (
+    BLOCK,
+    MEAN_BLOCK,
+    ColourFactors,
+    Moments,
+    colour_factors,
+    gather_moments,
+    learn_texture,
+    scaled,
+)
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.demosaic.base import check_mosaic, red_position
+from rgbmidic.illumination.demosaic.prediction import FilterTable, prediction_filters
+from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, cfa_channels
+from rgbmidic.illumination.texture import TextureModel
+
+__all__ = ["SMALLEST_FRAME", "Reconstruction", "ReflectionAwareDemosaicer"]
+
+Floats = npt.NDArray[np.float64]
+
+SMALLEST_FRAME = 64
+"""Rows and columns under which a frame holds too few speckles for statistics."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reconstruction:
+    """Channels with all that was found out on the way.
+
+    Attributes
+    ----------
+    channels : LinearChannels
+        (3, H, W).
+    texture : TextureModel
+        The one used: given, or learnt from the frame.
+    factors : ColourFactors
+        How each channel sees the texture, on a grid of 8 px.
+    mean : (3, h, w) float32
+        Local mean of each channel on a grid of 4 px.
+    table : FilterTable
+        The filters used, and the variance of their error.
+    noise : (3, 3) float64 or None
+        Covariance of the camera noise of the channels at a pixel (DN²), typical of the frame.
+    """
+
+    channels: LinearChannels
+    texture: TextureModel
+    factors: ColourFactors
+    mean: npt.NDArray[np.float32]
+    table: FilterTable
+    noise: Floats | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReflectionAwareDemosaicer:
+    """Predicts every channel from all the samples around, each trusted as far as it shows the common texture.
+
+    Attributes
+    ----------
+    crosstalk : Crosstalk or None
+        Lets the sparkle of one light that several channels see be told from the common texture; None: no crosstalk.
+    texture : TextureModel or None
+        The speckle's autocorrelation; None learns it from each frame. Frames of one test should share one.
+    """
+
+    crosstalk: Crosstalk | None = None
+    texture: TextureModel | None = None
+
+    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
+        """Demosaic; see `Demosaicer`."""
+        return self.reconstruct(mosaic).channels
+
+    def reconstruct(self, mosaic: LinearMosaic) -> Reconstruction:
+        """Demosaic and tell what was found out.
+
+        Raises
+        ------
+        InputError
+            The frame is smaller than 64 x 64 px.
+        """
+        check_mosaic(mosaic)
+        if min(mosaic.values.shape) < SMALLEST_FRAME:
+            raise InputError(
+                f"reflection-aware demosaicing needs at least {SMALLEST_FRAME} x {SMALLEST_FRAME} px to know the "
+                f'speckle; the frame has {mosaic.values.shape[1]} x {mosaic.values.shape[0]}: use method "malvar"'
+            )
+        saturated = np.asarray(mosaic.saturated, dtype=bool)
+        values = np.ascontiguousarray(mosaic.values, dtype=np.float32)
+        damaged = bool(saturated.any())
+        if damaged:
+            values = np.where(saturated, np.float32(np.nan), values)
+        moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise)
+        texture = learn_texture(moments) if self.texture is None else self.texture
+        matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
+        factors = colour_factors(moments, texture.band, matrix)
+        table = _filters(factors, texture, mosaic.cfa)
+        out, unknown = _predict(moments, factors, table, damaged=damaged)
+        valid = _validity(saturated, unknown, mosaic.cfa) if damaged else np.ones(out.shape, dtype=bool)
+        channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale, noise=mosaic.noise)
+        return Reconstruction(
+            channels=channels,
+            texture=texture,
+            factors=factors,
+            mean=moments.mean,
+            table=table,
+            noise=None if mosaic.noise is None else _noise(factors, table),
+        )
+
+
+def _filters(factors: ColourFactors, texture: TextureModel, cfa: str) -> FilterTable:
+    noise = np.median(factors.noise / (1 + factors.private), axis=(1, 2))
+    return prediction_filters(_per_tile(factors.private), noise, texture, cfa)
+
+
+def _per_tile(grid: Floats) -> Floats:
+    """Mean of a grid of blocks over the tiles; the last one may be narrower."""
+    ratio = TILE // BLOCK
+    missing = [(0, 0), *((0, -side % ratio) for side in grid.shape[1:])]
+    padded = np.pad(grid, missing, mode="edge")
+    return np.asarray(padded.reshape(len(grid), padded.shape[1] // ratio, ratio, -1, ratio).mean(axis=(2, 4)))
+
+
+def _predict(
+    moments: Moments, factors: ColourFactors, table: FilterTable, *, damaged: bool
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Channels (3, H, W) and where samples stayed unknown (H, W)."""
+    spread, pad = factors.spread.astype(np.float32), table.size // 2
+    padded = scaled(moments, 1 / spread, pad=pad, width=table.index.shape[1] * TILE)
+    rows, columns = moments.contrast.shape
+    unknown = np.zeros(padded.shape, dtype=bool)
+    if damaged:
+        source = padded.copy()
+        fill_unknown(source, _per_tile(factors.share), *moments.red, pad, padded, unknown)
+    out = np.empty((3, rows, columns), dtype=np.float32)
+    taps = np.ascontiguousarray(table.taps[:, :, :3])
+    predict(padded, table.index, taps, table.size, spread, BLOCK, moments.mean, MEAN_BLOCK, out)
+    return out, unknown[pad : pad + rows, pad : pad + columns]
+
+
+def _validity(saturated: npt.NDArray[np.bool_], unknown: npt.NDArray[np.bool_], cfa: str) -> npt.NDArray[np.bool_]:
+    """A channel is not known within a pixel of its own saturated samples, none where the texture is not known."""
+    cell = cfa_channels(cfa)
+    rows, columns = saturated.shape
+    site = np.tile(cell, (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
+    near = np.ones((3, 3), np.uint8)
+    wide = cv2.dilate(unknown.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    own = [cv2.dilate((saturated & (site == c)).astype(np.uint8), near).astype(bool) for c in range(3)]
+    return np.stack([~(mask | wide) for mask in own])
+
+
+def _noise(factors: ColourFactors, table: FilterTable) -> Floats:
+    """Covariance (3, 3) of the camera noise at a typical pixel, DN²."""
+    typical = np.bincount(table.index.ravel()).argmax()
+    spread = np.median(factors.spread, axis=(1, 2))
+    return np.asarray(table.noise[typical, :3, :3] * np.outer(spread, spread))
