@@ -8,6 +8,7 @@ here the one whose reflection disturbs most is taken, as the others' may lie out
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from rgbmidic.correlation import Status
 from rgbmidic.errors import InputError
 from rgbmidic.fields import at_pixels
 from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.weights import blurred
 from rgbmidic.mesh import Region
 from rgbmidic.study.competitors import Competitor
 from rgbmidic.study.perturbation import high_pass
@@ -40,6 +42,9 @@ def automatic_threshold(
 ) -> SetUpThreshold | None:
     """Threshold from the reference and one deformed state, or None where no light's reflection disturbs.
 
+    A threshold that would exclude more than half of any light's image is not taken: without the margin below the
+    contour if that helps, else not at all, as the reflection is not told from the rest by its brightness.
+
     Parameters
     ----------
     reference, deformed
@@ -54,6 +59,7 @@ def automatic_threshold(
         Of the correlation; a Bayer mosaic needs ``"binomial"``.
     """
     found = []
+    typical = float(np.median(blurred(reference, blur)[:, region.mask], axis=1).max()) / reference.full_scale
     for light, name in enumerate(reference.names):
         for component, field in _displacement(reference, deformed, region, light, element_size, prefilter):
             try:
@@ -61,8 +67,11 @@ def automatic_threshold(
             except InputError as error:
                 logger.info("%s alone, without weights, %s: %s", name, component, error)
                 continue
-            if 0 < threshold.value <= 1:
-                found.append(threshold)
+            values = [value for value in (threshold.value, threshold.contour) if typical < value <= 1]
+            if not values:
+                logger.info("%s alone, %s: the disturbed zone is not brighter than the rest", name, component)
+                continue
+            found.append(replace(threshold, value=values[0]))
     return max(found, key=lambda threshold: threshold.zone.contrast, default=None)
 
 
