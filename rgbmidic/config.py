@@ -37,7 +37,7 @@ BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
 def _bounded(default: Any, **bounds: float) -> Any:
-    """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`."""
+    """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`."""
     return field(default=default, metadata={"bounds": bounds})
 
 
@@ -148,19 +148,37 @@ class WeightSettings:
     ----------
     method
         ``"statistics"``: inverse variance of each light's own residual around each pixel, robust; ``"threshold"``: the
-        paper's second method, 0 where the blurred image exceeds `threshold`, 1 elsewhere; ``"none"``: 1 everywhere.
+        paper's second method, 0 where the blurred image exceeds `threshold`, 1 elsewhere; ``"geometry"``: the paper's
+        first method, from lamps, camera and specimen; ``"none"``: 1 everywhere.
     threshold
-        Fraction of the camera's dynamic range (the paper: 2/3).
+        Fraction of the camera's dynamic range (the paper: 2/3); ``"auto"``: found as in the paper, section 3.2, on the
+        first deformed frame.
     blur
         Standard deviation of the Gaussian blur in px; several speckles wide.
+    geometry
+        SCENE.toml with lamps, camera, paint and body, for ``"geometry"``.
+    height_map
+        npy file with the height (mm, towards the camera) of the specimen at every pixel of the reference over the plane
+        of the scene's front point; instead of the scene's body.
+    limit_deg
+        Light is excluded within this angle of the mirror direction (the paper: 15); None: soft weights, the inverse of
+        the variance that geometry, paint and camera noise let expect.
     """
 
-    method: Literal["statistics", "threshold", "none"] = "statistics"
-    threshold: float = _bounded(2 / 3, above=0, at_most=1)
+    method: Literal["statistics", "threshold", "geometry", "none"] = "statistics"
+    threshold: float | Literal["auto"] = _bounded(2 / 3, above=0, at_most=1)
     blur: float = _bounded(10.0, above=0)
+    geometry: Path | None = None
+    height_map: Path | None = None
+    limit_deg: float | None = _bounded(None, above=0, below=180)
 
     def __post_init__(self) -> None:
         _check_bounds(self, "weights")
+        if (self.method == "geometry") != (self.geometry is not None):
+            raise ConfigurationError('weights.method = "geometry" and weights.geometry = "SCENE.toml" go together')
+        for key in ("height_map", "limit_deg"):
+            if self.method != "geometry" and getattr(self, key) is not None:
+                raise ConfigurationError(f'weights.{key} is for weights.method = "geometry"')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,8 +198,8 @@ class SolverSettings:
     curvature
         Correct the nodal values for the curvature that linear elements cannot follow.
     fill
-        Longest distance in px over which nodes that are not measured get a value carried over from measured ones, flagged
-        and with an uncertainty that grows with the distance; 0 leaves them NaN.
+        Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
+        flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
     search_radius
         Largest motion in px that the coarse start looks for.
     tolerance
@@ -375,7 +393,13 @@ _WORDS = {
 def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
     """A value of the file as the type that the field states; what does not fit is an error that names the key."""
     origin, kinds = get_origin(hint), get_args(hint)
-    if origin in (Union, UnionType):  # X | None: a file states no None
+    if origin in (Union, UnionType):  # X | None: a file states no None; a number | a word
+        words = [word for kind in kinds[1:] if get_origin(kind) is Literal for word in get_args(kind)]
+        if value in words:
+            return value
+        if words and isinstance(value, str):
+            known = ", ".join(map(_quoted, words))
+            raise ConfigurationError(f"{where} must be {_WORDS[kinds[0]]} or {known}, not {_quoted(value)}")
         return _convert(value, kinds[0], where, base)
     if origin is tuple:
         return _convert_list(value, kinds, where, base)
@@ -417,7 +441,12 @@ def _check_bounds(settings: Any, section: str) -> None:
             if not math.isfinite(number):
                 raise ConfigurationError(f"{where} must be finite, not {number}")
             for bound, limit in entry.metadata.get("bounds", {}).items():
-                kept = {"above": number > limit, "at_least": number >= limit, "at_most": number <= limit}[bound]
+                kept = {
+                    "above": number > limit,
+                    "at_least": number >= limit,
+                    "at_most": number <= limit,
+                    "below": number < limit,
+                }[bound]
                 if not kept:
                     raise ConfigurationError(f"{where} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
 

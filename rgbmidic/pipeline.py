@@ -7,14 +7,15 @@ its uncertainty, frame after frame, each kept as it finishes.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.config import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.config import FrameSettings, RegionSettings, TestSettings, WeightSettings
 from rgbmidic.correlation import Deformed, Reference, Solution, SolveOptions, Status, solve
 from rgbmidic.correlation.start import coarse_start, refine_start
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError, RgbmidicError
@@ -32,7 +33,10 @@ from rgbmidic.sequence.frames import FrameSequence, list_frames, open_frames
 from rgbmidic.sequence.readers import read_frame, tells_camera
 from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
 
-__all__ = ["Separator", "Start", "average", "measure", "read_region", "texture", "track"]
+if TYPE_CHECKING:
+    from rgbmidic.virtual.prediction import GeometryWeights
+
+__all__ = ["Separator", "Start", "Weigher", "average", "measure", "read_region", "texture", "track"]
 
 logger = logging.getLogger(__name__)
 
@@ -75,10 +79,11 @@ def measure(
     images = average([separator(frames.read(index)) for index in settings.frames.reference])
     region = read_region(settings.region, images.shape)
     mesh = Tri3Mesh.from_region(region, settings.element_size)
+    weigher = Weigher.prepare(settings, images, region, frames, separator)
     reference = Reference.prepare(
         texture(images, settings),
         region,
-        light_weights(images, settings.weights),
+        weigher.reference(images),
         mesh=mesh,
         prefilter=settings.solver.prefilter or "binomial",
     )
@@ -90,11 +95,12 @@ def measure(
         lights=images.names,
         settings=settings,
         reference=images.values,
+        notes=weigher.notes,
         overwrite=overwrite,
     )
     last = Start(displacement=None)
     for index in range(len(frames)):
-        record, last = _measure_frame(index, frames, separator, settings, reference, last)
+        record, last = _measure_frame(index, frames, separator, settings, weigher, reference, last)
         store.write_frame(index, record)
         if progress is not None:
             progress(index + 1, len(frames), _line(frames.name(index), record))
@@ -121,6 +127,7 @@ def _measure_frame(
     frames: FrameSequence,
     separator: Separator,
     settings: TestSettings,
+    weigher: Weigher,
     reference: Reference,
     last: Start,
 ) -> tuple[FrameRecord, Start]:
@@ -132,7 +139,7 @@ def _measure_frame(
             raise FrameError(
                 f"{frames.name(index)} has the shape {images.values.shape}, the reference {reference.images.shape}"
             )
-        weights = light_weights(images, settings.weights)
+        weights = weigher.deformed(images, index)
         deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
         start = Start(displacement=np.zeros((nodes, 2))) if settings.frames.reference == (index,) else last
         solution = track(reference, deformed, start, _options(settings), search_radius=settings.solver.search_radius)
@@ -173,7 +180,7 @@ class Start:
 
 
 _LOSS = 0.01
-"""Share of the nodes whose loss each further start makes acceptable: a few may really be gone."""
+"""Share of the nodes whose loss each further start makes acceptable, half of it at the first: a few may really go."""
 
 
 def track(
@@ -197,7 +204,7 @@ def track(
         trial = solve(reference, deformed, initial, options)
         if best is None or (trial.status, trial.unmeasured_share) < (best.status, best.unmeasured_share):
             best = trial
-        if best.status is Status.CONVERGED and best.unmeasured_share <= start.unmeasured + number * _LOSS:
+        if best.status is Status.CONVERGED and best.unmeasured_share <= start.unmeasured + (number + 0.5) * _LOSS:
             break
     assert best is not None
     return best
@@ -222,6 +229,101 @@ def _options(settings: TestSettings) -> SolveOptions:
         tolerance=settings.solver.tolerance,
         max_iterations=settings.solver.max_iterations,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weigher:
+    """The lights' weights in every state, by the method of the settings.
+
+    Attributes
+    ----------
+    settings
+        With a threshold that is a number.
+    reference_frames
+        Indices of the reference frames.
+    predicted
+        Weights from geometry, or None.
+    notes
+        What was found out about the weights, for the provenance.
+    """
+
+    settings: WeightSettings
+    reference_frames: tuple[int, ...]
+    predicted: GeometryWeights | None = None
+    notes: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def prepare(
+        cls,
+        settings: TestSettings,
+        images: IlluminationImages,
+        region: Region,
+        frames: FrameSequence,
+        separator: Separator,
+    ) -> Weigher:
+        """Read the scene that the settings name, or find the automatic threshold, if either is asked for."""
+        weights, notes, predicted = settings.weights, {}, None
+        if weights.method == "geometry":
+            from rgbmidic.virtual.prediction import GeometryWeights
+
+            predicted = GeometryWeights.prepare(settings, lights=images.names, shape=images.shape, frames=len(frames))
+        elif weights.method == "threshold" and weights.threshold == "auto":
+            notes["weights_threshold"] = _find_threshold(settings, images, region, frames, separator)
+            weights = replace(weights, threshold=notes["weights_threshold"])
+        return cls(settings=weights, reference_frames=settings.frames.reference, predicted=predicted, notes=notes)
+
+    def reference(self, images: IlluminationImages) -> FloatImage:
+        """Weights (k, H, W) of the reference images."""
+        weights = light_weights(images, self.settings)
+        return weights if self.predicted is None else weights * self.predicted.reference(self.reference_frames)
+
+    def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
+        """Weights (k, H, W) of the images of frame `index`."""
+        weights = light_weights(images, self.settings)
+        return weights if self.predicted is None else weights * self.predicted.frame(index, self.reference_frames[0])
+
+
+def _find_threshold(
+    settings: TestSettings,
+    images: IlluminationImages,
+    region: Region,
+    frames: FrameSequence,
+    separator: Separator,
+) -> float:
+    """The automatic threshold from the first deformed frame, else the paper's; says which."""
+    from rgbmidic.study.automatic import FALLBACK, automatic_threshold
+
+    index = next((i for i in range(len(frames)) if i not in settings.frames.reference), None)
+    if index is None:
+        logger.warning('weights.threshold = "auto": there is no deformed frame; %.3g is taken', FALLBACK)
+        return FALLBACK
+    try:
+        found = automatic_threshold(
+            images,
+            separator(frames.read(index)),
+            region,
+            blur=settings.weights.blur,
+            element_size=settings.element_size,
+            prefilter=settings.solver.prefilter or "binomial",
+        )
+    except RgbmidicError as error:
+        logger.warning('weights.threshold = "auto": %s cannot be used: %s', frames.name(index), error)
+        found = None
+    if found is None:
+        logger.warning(
+            'weights.threshold = "auto": no disturbed zone in %s; the threshold is %.3g of the dynamic range',
+            frames.name(index),
+            FALLBACK,
+        )
+        return FALLBACK
+    logger.info(
+        "threshold %.3f: disturbed zone of radius %.0f px around %s in %s",
+        found.value,
+        found.zone.radius,
+        found.zone.centre,
+        frames.name(index),
+    )
+    return found.value
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

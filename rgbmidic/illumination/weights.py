@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.config import WeightSettings
+from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import IlluminationImages
 
 __all__ = ["blurred", "light_weights", "threshold_weights"]
@@ -20,9 +21,19 @@ FloatImage = npt.NDArray[np.float32]
 
 
 def light_weights(images: IlluminationImages, settings: WeightSettings) -> FloatImage:
-    """Weights (k, H, W) in [0, 1] of one state by the method of `settings`; 0 where an image is not valid."""
-    if settings.method != "threshold":  # the statistics come from the residual, in the solve
+    """Weights (k, H, W) in [0, 1] of one state by the method of `settings`; 0 where an image is not valid.
+
+    Only the threshold acts on the images: statistics come from the residual, in the solve, and geometry from a scene.
+
+    Raises
+    ------
+    InputError
+        The threshold is ``"auto"``: it must be found first (`rgbmidic.study.automatic_threshold`).
+    """
+    if settings.method != "threshold":
         return images.valid.astype(np.float32)
+    if isinstance(settings.threshold, str):
+        raise InputError('weights.threshold is "auto": it must be found from two states before it can be applied')
     return threshold_weights(images, threshold=settings.threshold, blur=settings.blur)
 
 

@@ -103,6 +103,19 @@ def test_several_lights_one_after_the_other(tmp_path: Path) -> None:
     assert (frames.path, frames.reference) == (("left/*.tif", "right/*.tif"), (1,))
 
 
+def test_the_threshold_is_a_number_or_automatic(tmp_path: Path) -> None:
+    assert _read(tmp_path, LEAST + '[weights]\nthreshold = "auto"').weights.threshold == "auto"
+    assert _read(tmp_path, LEAST + "[weights]\nthreshold = 1").weights.threshold == 1.0
+
+
+def test_geometry_is_relative_to_the_file_and_survives_the_mapping(tmp_path: Path) -> None:
+    text = LEAST + '[weights]\nmethod = "geometry"\ngeometry = "scene.toml"\nheight_map = "h.npy"\nlimit_deg = 15'
+    settings = _read(tmp_path, text)
+    assert settings.weights.geometry == tmp_path.resolve() / "scene.toml"
+    assert settings.weights.height_map == tmp_path.resolve() / "h.npy"
+    assert TestSettings.from_mapping(settings.to_mapping(), settings.base) == settings
+
+
 def test_mask_is_relative_to_the_file(tmp_path: Path) -> None:
     settings = _read(tmp_path, LEAST.replace("rectangle = [10, 20, 110, 220]", 'mask = "masks/region.png"'))
     assert settings.region.mask == tmp_path.resolve() / "masks" / "region.png"
@@ -147,6 +160,15 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST.replace('dng"', 'dng"\nshape = [10]'), r"frames\.shape must be 2 values"),
         (LEAST.replace('dng"', 'dng"\nshape = [10, 0]'), r"frames\.shape must be at least 1"),
         (LEAST.replace('dng"', 'dng"\ndtype = "float32"'), r'dtype must be one of "uint8", "uint16", ">u2"'),
+        (LEAST + '[weights]\nthreshold = "otto"', r'weights\.threshold must be a number or "auto", not "otto"'),
+        (LEAST + "[weights]\nthreshold = 1.5", r"weights\.threshold must be at most 1"),
+        (LEAST + '[weights]\nmethod = "geometry"', r'weights\.geometry = "SCENE\.toml" go together'),
+        (LEAST + '[weights]\ngeometry = "s.toml"', r"weights\.method.* go together"),
+        (LEAST + "[weights]\nlimit_deg = 15", r"weights\.limit_deg is for weights\.method"),
+        (
+            LEAST + '[weights]\nmethod = "geometry"\ngeometry = "s.toml"\nlimit_deg = 180',
+            r"weights\.limit_deg must be below 180",
+        ),
         (LEAST + 'mask = "m.png"', r"exactly one of rectangle, polygon, mask; given are 2"),
         (LEAST.replace("rectangle = [10, 20, 110, 220]", ""), r"exactly one of .*; given are 0"),
         (LEAST.replace("10, 20, 110", "110, 20, 10"), r"rectangle is \[x0, y0, x1, y1\] with x0 < x1"),
