@@ -154,6 +154,44 @@ def virtual(
         write_dataset(scene, out, progress)
 
 
+@app.command()
+def plan(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Lamps, camera, paint, body and its states.")],
+    out: Out,
+    overwrite: Overwrite = False,
+) -> None:
+    """Where each lamp will reflect, what uncertainty to expect, and where the lamps would stand better."""
+    from rgbmidic.report import planning
+    from rgbmidic.virtual.lamps import propose_colours, propose_lamps
+    from rgbmidic.virtual.planning import make_plan
+    from rgbmidic.virtual.scenefile import read_scene
+
+    planning.check_folder(out, overwrite=overwrite)
+    made = make_plan(read_scene(scene))
+    proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
+    planning.write_plan(made, proposals, out, overwrite=overwrite)
+    title = "share of the field where lights reflect, all of them do, and only one or none is clean"
+    _print_table(title, *planning.zone_rows(made))
+    _print_table("standard uncertainty to expect over the field, px", *planning.uncertainty_rows(made))
+    better = {name: proposal.plan for name, proposal in proposals.items() if proposal.gain > 1}
+    for name, one in {"lamps as they are": made, **better}.items():
+        _print_table(f"{name}: {planning.summary(one)}", *planning.lamp_rows(one))
+    if not better:
+        print("no better place was found for the lamps")
+    print(f"plan: {out / 'plan.json'}   picture: {out / 'plan.png'}")
+
+
+def _print_table(title: str, headings: list[str], rows: list[list[str]]) -> None:
+    table = Table(box=None, pad_edge=False)
+    for number, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if number else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    print(title)
+    Console(soft_wrap=True).print(table)
+    print()
+
+
 @study.command()
 def paper(
     out: Annotated[Path, typer.Option("--out", help="Folder for what is written; must be empty or new.")],

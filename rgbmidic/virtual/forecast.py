@@ -33,9 +33,9 @@ __all__ = ["Energies", "Forecast", "Instrument", "channel_mixing", "node_constan
 
 Array = npt.NDArray[np.float64]
 
-WRINKLE_AREA = 0.072
-"""Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared (measured;
-see the tests)."""
+WRINKLE_AREA = 0.085
+"""Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared (measured,
+see the tests, at a lobe of 4 and slopes of 6 degrees; 0.06 at 3 and 8 degrees, 0.11 at 6 and 4)."""
 _SATURATED = 0.98
 """Fraction of full scale from which the white paint is taken to saturate a channel: noise does the rest."""
 
@@ -176,17 +176,16 @@ class Instrument:
             dome_pull=spectrum.pull(relief[0, 1]),
         )
 
-    def forecast(self, before: Zones, after: Zones, displacement: Array) -> Forecast:
+    def forecast(self, before: Zones, after: Zones, change: Array) -> Forecast:
         """Uncertainty between two states, at the points at which their zones were predicted.
 
         Parameters
         ----------
         before, after
             Predictions at the same material points.
-        displacement : ndarray, shape (2, ...)
-            Between the two, px: the mosaic's trace differs most where the texture has moved by an odd number of pixels.
+        change : ndarray, shape (3, ...)
+            Of the mosaic's trace between them (`trace_change`), as a mean over the elements of a node.
         """
-        change = trace_change(displacement)
         residual = self.variance(self.residual, before, after, change)
         seen = np.isfinite(residual) & ~self.saturated(before) & ~self.saturated(after)
         contrast = np.where(seen, 1 - (before.share + after.share) / 2, 0.0)
@@ -242,6 +241,28 @@ class Instrument:
         variance += np.einsum("cjj,c...->j...", energies.mosaic, change)
         for zones in (before, after):
             variance += np.einsum("cjj,c...->j...", energies.noise, self._sample_variance(zones)) / zones.level**2
+        return np.asarray(variance)
+
+    def light_variance(self, light: int, before: Zones, after: Zones, brightness: Array) -> Array:
+        """Variance of the pull (n, ...) of one light that is tried in n places, the others as bright as they are.
+
+        Parameters
+        ----------
+        light
+            Its index.
+        before, after
+            Predictions of this light alone in its n places.
+        brightness : ndarray, shape (k,)
+            Mean grey level of every light, for the noise that crosstalk brings.
+        """
+        variance = self._reflections(self.score, before, after)
+        variance += 2 * float(self.score.mosaic[:, light, light].sum())
+        mixing = channel_mixing(self.scene)
+        others = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
+        for zones in (before, after):
+            for colour, share in enumerate(self.score.noise[:, light, light]):
+                samples = self.scene.camera.noise.variance(others[colour] + mixing[colour, light] * zones.level)
+                variance += share * (samples + QUANTISATION) / zones.level**2
         return np.asarray(variance)
 
     def _score(self, before: Zones, after: Zones, change: Array, pull: Array) -> Array:
@@ -308,7 +329,10 @@ class Instrument:
 
 
 def trace_change(displacement: Array) -> Array:
-    """Mean square change (3, ...) of the three carriers of the mosaic under a displacement (2, ...) in px."""
+    """Mean square change (3, ...) of the three carriers of the mosaic under a displacement (2, ...) in px.
+
+    The trace stays with the sensor: it differs most where the texture has moved by an odd number of pixels.
+    """
     x, y = np.cos(np.pi * displacement)
     return np.asarray(2 * (1 - np.stack([x, y, x * y])))
 

@@ -103,7 +103,9 @@ def placed(scene: Scene, material: Array, state: State | None = None) -> tuple[A
     return points, np.einsum("ij,j...->i...", turn, _normals(scene, material))
 
 
-def truth(scene: Scene, state: State, reference: State | None = None) -> Array:
+def truth(
+    scene: Scene, state: State, reference: State | None = None, pixels: tuple[Array, Array] | None = None
+) -> Array:
     """Exact displacement of the material point seen at every pixel of the reference image.
 
     Parameters
@@ -114,18 +116,22 @@ def truth(scene: Scene, state: State, reference: State | None = None) -> Array:
         The deformed state.
     reference
         State of the reference image; None: the scene's rest.
+    pixels
+        Image points (x, y) in px of the reference image, two arrays of one shape; None: all pixels.
 
     Returns
     -------
-    ndarray, shape (2, H, W)
+    ndarray, shape (2, H, W), or (2, ...) as `pixels`
         (u, v) in px; NaN where the pixel is not on the body or the point is hidden in `state`. Points that leave the
         frame keep their displacement.
     """
-    point, normal = placed(scene, material_points(scene, reference), state)
+    point, normal = placed(scene, material_points(scene, reference, pixels), state)
     hidden = ~((normal * point).sum(axis=0) < 0)
     camera = scene.camera
-    x = camera.focal_px * point[0] / point[2] + camera.centre[0] - np.arange(camera.shape[1])
-    y = camera.focal_px * point[1] / point[2] + camera.centre[1] - np.arange(camera.shape[0])[:, None]
+    if pixels is None:
+        pixels = np.arange(camera.shape[1], dtype=float), np.arange(camera.shape[0], dtype=float)[:, None]
+    x = camera.focal_px * point[0] / point[2] + camera.centre[0] - pixels[0]
+    y = camera.focal_px * point[1] / point[2] + camera.centre[1] - pixels[1]
     return np.where(hidden, np.nan, np.stack([x, y]))
 
 

@@ -52,8 +52,8 @@ def test_version_and_help(command: Run) -> None:
     for arguments in ((), ("--help",)):
         status, out, _ = command(*arguments)
         assert status == 0
-        assert all(word in out for word in ("run", "export", "demo", "virtual"))
-    for name in ("run", "export", "demo", "virtual"):
+        assert all(word in out for word in ("run", "export", "demo", "virtual", "plan"))
+    for name in ("run", "export", "demo", "virtual", "plan"):
         assert command(name, "--help")[0] == 0
 
 
@@ -67,6 +67,7 @@ def test_version_and_help(command: Run) -> None:
         (["run", "none.toml", "--out", "out", "--bogus"], "--bogus"),
         (["export", "none", "--to", "npz", "--out", "a"], "none is not a result folder"),
         (["virtual", "none.toml", "--out", "out"], "none.toml"),
+        (["plan", "none.toml", "--out", "out"], "none.toml"),
     ],
 )
 def test_wrong_input_is_one_line_and_status_2(
