@@ -94,13 +94,14 @@ class IlluminationSettings:
     Attributes
     ----------
     demosaic
-        Method of `rgbmidic.illumination.separate` for Bayer frames.
+        Method of `rgbmidic.illumination.separate` for Bayer frames; ``"auto"``: the reflection-aware one, and Malvar's
+        for frames too small for it.
     normalise
         Standard deviation in px of the local mean by which each light's image is divided before the solve; 0 leaves
         the grey levels as they are.
     """
 
-    demosaic: str = "malvar"
+    demosaic: str = "auto"
     normalise: float = _bounded(10.0, at_least=0)
 
     def __post_init__(self) -> None:

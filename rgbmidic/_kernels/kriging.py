@@ -22,9 +22,9 @@ def _channel(i, j, red_row, red_column):
 def fill_unknown(padded, share, red_row, red_column, pad, out, unknown):
     """Replace samples that are NaN by what the known ones around tell of the common texture.
 
-    `padded` as written by `scaled_contrast`; `share` (3, h, w) is the share of the common texture in each tile. `out`, a
-    copy of `padded`, receives ``sqrt(share) * texture``; where too little is known within one pixel it receives 0 and
-    `unknown` (like `padded`) is set.
+    `padded` as written by `scaled_contrast`; `share` (3, h, w) is the share of the common texture in each tile. `out`,
+    a copy of `padded`, receives ``sqrt(share) * texture``; where too little is known within one pixel it receives 0
+    and `unknown` (like `padded`) is set.
     """
     height, width = padded.shape
     for i in prange(height):

@@ -1,10 +1,10 @@
 """How each colour sees the common texture, block by block, from a single mosaic.
 
-A sample of camera channel c is ``m_c = mean_c + alpha_c a + e_c``: alpha_c, the slope on the common texture a, is smooth; e_c
-is what only this channel shows there, the erratic part of a reflection and camera noise. Low-passed to the band that all
-colours resolve, two channels have the moment ``alpha_c alpha_c'`` in common and nothing else, so three channels give
-three slopes (``alpha_1^2 = M_12 M_13 / M_23``, a one-factor analysis), free of the bias that noise gives a regression; what
-a channel's own moment has beyond that is the variance of e_c.
+A sample of camera channel c is ``m_c = mean_c + alpha_c a + e_c``. alpha_c, the slope on the common texture a, is
+smooth; e_c is what only this channel shows there, the erratic part of a reflection and camera noise. Low-passed to the
+band that all colours resolve, two channels have the moment ``alpha_c alpha_c'`` in common and nothing else, so three
+channels give three slopes (``alpha_1^2 = M_12 M_13 / M_23``, a one-factor analysis), free of the bias that noise gives
+a regression; what a channel's own moment has beyond that is the variance of e_c.
 """
 
 from __future__ import annotations
@@ -19,7 +19,17 @@ from rgbmidic._kernels import texture as kernels
 from rgbmidic.illumination.mosaic import NoiseModel
 from rgbmidic.illumination.texture import LAGS, WHITE_ENERGY, BandEnergy, TextureModel, fit_texture
 
-__all__ = ["BLOCK", "MEAN_BLOCK", "ColourFactors", "Moments", "colour_factors", "gather_moments", "learn_texture"]
+__all__ = [
+    "BLOCK",
+    "MEAN_BLOCK",
+    "ColourFactors",
+    "Moments",
+    "colour_factors",
+    "gather_moments",
+    "learn_texture",
+    "local_means",
+    "scaled",
+]
 
 Floats = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
@@ -107,7 +117,7 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     noise
         Camera noise; None counts it with what is private to a channel.
     """
-    mean = _local_means(values, red)
+    mean = local_means(values, red)
     contrast = np.empty_like(values)
     kernels.subtract_mean(values, mean, *red, MEAN_BLOCK, contrast)
     height, width = (-(-side // BLOCK) for side in values.shape)
@@ -117,14 +127,13 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     moments = _smooth(sums / 256**2, counts, MOMENT_WIDTH / BLOCK)
     level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in mean]).astype(np.float64)
     variance = np.zeros_like(level) if noise is None else np.asarray(noise.variance(level), dtype=np.float64)
-    own = moments[:3] - variance * WHITE_ENERGY
-    floor = 1e-6 * moments[:3].max() + 1e-12
-    return Moments(
-        mean=mean, contrast=contrast, own=np.maximum(own, floor), shared=moments[3:], noise=variance, red=red
-    )
+    # where nothing is seen but noise, a third of it stands for the contrast that there may be
+    floor = np.maximum(variance * (WHITE_ENERGY / 3), 1e-6 * moments[:3].max() + 1e-12)
+    own = np.maximum(moments[:3] - variance * WHITE_ENERGY, floor)
+    return Moments(mean=mean, contrast=contrast, own=own, shared=moments[3:], noise=variance, red=red)
 
 
-def _local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
+def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
     shape = (3, *(-(-side // MEAN_BLOCK) for side in values.shape))
     sums, counts = np.empty(shape), np.empty(shape)
     kernels.block_sums(values, *red, MEAN_BLOCK, sums, counts)
@@ -132,7 +141,7 @@ def _local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
 
 
 def _smooth(sums: Floats, counts: Floats, sigma: float) -> Floats:
-    """Mean (n, h, w) in a Gaussian window (blocks) of sums over `counts` entries; the overall mean where there are none."""
+    """Mean (n, h, w) in a Gaussian window (blocks) of sums over `counts` entries; the overall mean where none are."""
 
     def blurred(grid: Floats) -> Floats:
         return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))

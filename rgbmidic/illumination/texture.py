@@ -1,14 +1,14 @@
 """The speckle's autocorrelation: what one sample of the paint tells of its neighbours.
 
-A DIC speckle is black on white, so one texture a(x) is common to all lights. Its autocorrelation is read from products of
-samples of *different* colours, in which neither camera noise nor the sparkle of a reflection takes part, and is fitted by
-a sum of Gaussians with positive weights, which keeps it positive definite and tells its value at distance 0.
+A DIC speckle is black on white, so one texture a(x) is common to all lights. Its autocorrelation is read from products
+of samples of *different* colours, in which neither camera noise nor the sparkle of a reflection takes part, and is
+fitted by a sum of Gaussians with positive weights, which keeps it positive definite and tells its value at distance 0.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -26,11 +26,15 @@ FARTHEST = 4.3
 """Products farther apart (px) do not enter: they tell of the spacing of the speckles, not of their edges."""
 NARROWEST = 0.6
 """Standard deviation (px) of the narrowest Gaussian: what a square pixel lets through."""
-MOST_FINE = 0.05
-"""Most of the texture's variance that is taken to be too fine to be seen in products of samples."""
-WIDTHS = NARROWEST * 1.3 ** np.arange(12)
+OFFSET_PENALTY = 0.05
+"""Least-squares error (of products) that an offset of 1 costs; the true one is -0.02 to -0.15."""
+USUAL_AGREEMENT = 0.985
+"""Agreement of neighbouring planes for a speckle of about 4 px."""
+WIDTHS: Floats = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
 COLOURED = 0.5
 """Below this mean correlation of any two colours they do not show the same texture."""
+AGREEING = 0.93
+"""Colours that agree less than this nowhere show the texture alone."""
 
 _BINOMIAL = np.array([1, 5, 10, 10, 5, 1]) / 16
 _OFFSETS = np.array([-2, -1, 0, 1, 2, 3])
@@ -59,21 +63,24 @@ class BandEnergy:
 
 @dataclass(frozen=True, kw_only=True)
 class TextureModel:
-    """Autocorrelation of the common texture: ``C(r) = sum_m w_m exp(-r^2 / (2 s_m^2))``, C(0) = 1.
+    """Autocorrelation of the common texture: ``C(r) = c + sum_m w_m exp(-r^2 / (2 s_m^2))``, C(0) = 1.
 
     Attributes
     ----------
     weights, widths : tuple of float
         w_m and s_m (px).
-    private
-        Share (0 to 1) of what a colour shows of its own that is as coarse as the speckle: 0 for the sparkle of reflections,
-        towards 1 for a coloured specimen.
-    correlation
+    offset : float
+        c: what the removal of the local mean has taken away; not positive.
+    private : float
+        Share (0 to 1) of what a colour shows of its own that is as coarse as the speckle: 0 for the sparkle of
+        reflections, towards 1 for a coloured specimen.
+    correlation : float
         Mean correlation of the two colours that agree best, about 1 for a black and white speckle.
     """
 
     weights: tuple[float, ...]
     widths: tuple[float, ...]
+    offset: float = 0.0
     private: float = 0.0
     correlation: float = 1.0
 
@@ -81,20 +88,25 @@ class TextureModel:
         w, s = np.asarray(self.weights, float), np.asarray(self.widths, float)
         if w.ndim != 1 or w.shape != s.shape or not (w >= 0).all() or not w.sum() > 0 or not (s > 0).all():
             raise InputError(f"a texture needs weights >= 0 and widths > 0, equally many; given are {w} and {s}")
+        if not (0 <= self.private <= 1 and self.offset <= 0 and abs(w.sum() + self.offset - 1) < 1e-6):
+            raise InputError(
+                f"weights and offset of a texture sum to 1, its private share lies in 0 to 1; given are a sum of "
+                f"{w.sum() + self.offset} and {self.private}"
+            )
 
     @classmethod
     def of_speckle(cls, diameter: float) -> TextureModel:
-        """A texture of dark discs of about this diameter (px): C falls to one half at half the diameter."""
+        """A texture of dark discs whose autocorrelation has about this full width at half maximum (px)."""
         if not diameter > 0:
             raise InputError(f"the diameter of a speckle must be positive, not {diameter!r}")
-        unit = np.array([0.30, 0.42, 0.60])
-        return cls(weights=(0.1, 0.3, 0.6), widths=tuple(float(w) for w in np.maximum(unit * diameter, NARROWEST)))
+        widths = np.maximum(np.array([0.26, 0.36, 0.51]) * diameter, NARROWEST)
+        return cls(weights=(0.1, 0.3, 0.6), widths=tuple(widths.tolist()))
 
     def __call__(self, distance: npt.ArrayLike) -> Floats:
         """C at distances in px."""
         r = np.asarray(distance, dtype=np.float64)[..., None]
-        w = np.asarray(self.weights) / np.sum(self.weights)
-        return np.asarray((w * np.exp(-0.5 * (r / np.asarray(self.widths)) ** 2)).sum(axis=-1))
+        gaussians = np.exp(-0.5 * (r / np.asarray(self.widths)) ** 2)
+        return np.asarray(gaussians @ np.asarray(self.weights) + self.offset)
 
     @cached_property
     def diameter(self) -> float:
@@ -106,20 +118,23 @@ class TextureModel:
     @cached_property
     def band(self) -> BandEnergy:
         """What the low-passed planes of a Bayer mosaic show of this texture."""
-        taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
-        planes = [(np.outer(taps[p][0], taps[q][0]).ravel(), taps[p][1], taps[q][1]) for p in (0, 1) for q in (0, 1)]
-        weights = [w for w, _, _ in planes]
-        points = [np.stack(np.meshgrid(i, j, indexing="ij"), -1).reshape(-1, 2) for _, i, j in planes]
+        own, adjacent, diagonal = np.asarray(self.weights) @ _band_energies(self.widths) + self.offset
+        return BandEnergy(own=float(own), adjacent=float(adjacent), diagonal=float(diagonal))
 
-        def moment(p: int, q: int) -> float:
-            apart = np.linalg.norm(points[p][:, None] - points[q][None], axis=-1)
-            return float(weights[p] @ self(apart) @ weights[q])
 
-        return BandEnergy(
-            own=float(np.mean([moment(p, p) for p in range(4)])),
-            adjacent=float(np.mean([moment(0, 1), moment(0, 2), moment(1, 3), moment(2, 3)])),
-            diagonal=float(np.mean([moment(0, 3), moment(1, 2)])),
-        )
+@lru_cache(maxsize=64)
+def _band_energies(widths: tuple[float, ...]) -> Floats:
+    """Moments (M, 3) own, adjacent and diagonal of the low-passed planes for Gaussian autocorrelations."""
+    taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
+
+    def line(p: int, q: int) -> Floats:
+        """Along one axis, planes of parity p and q: Gaussians factorise."""
+        apart = taps[p][1][:, None] - taps[q][1][None]
+        gaussians = np.exp(-0.5 * (apart[None] / np.asarray(widths)[:, None, None]) ** 2)
+        return np.asarray(np.einsum("i,mij,j->m", taps[p][0], gaussians, taps[q][0]))
+
+    same, other = (line(0, 0) + line(1, 1)) / 2, line(0, 1)
+    return np.stack([same * same, same * other, other * other], axis=1)
 
 
 def fit_texture(sums: Floats, counts: Floats, correlations: Floats, agreement: float) -> TextureModel:
@@ -144,56 +159,76 @@ def fit_texture(sums: Floats, counts: Floats, correlations: Floats, agreement: f
     distance = np.hypot(*LAGS.T)
     near = distance <= FARTHEST
     if best < COLOURED:
-        return _fit_own(sums[near, :3], counts[near, :3], distance[near], best)
+        seen = near[:, None] & (counts[:, :3] > 0)
+        r = np.broadcast_to(distance[:, None], seen.shape)[seen]
+        # one colour's samples are two pixels apart and tell nothing of what is finer
+        coarse = WIDTHS[WIDTHS > 1]
+        return _mixture(r, sums[:, :3][seen] / counts[:, :3][seen], best, widths=coarse, private=1.0)
     pairs = counts[:, 3:] * correlations
     adjacent, diagonal = pairs[:, 0] + pairs[:, 2], pairs[:, 1]
-    odd = near & (LAGS.sum(axis=1) % 2 == 1) & (adjacent > 0)
-    even = near & (LAGS.sum(axis=1) % 2 == 0) & (diagonal > 0) & (correlations[1] > 0)
-    r = np.concatenate([distance[odd], distance[even]])
-    kind = np.concatenate([np.ones(odd.sum(), bool), np.zeros(even.sum(), bool)])
+    parity = LAGS.sum(axis=1) % 2 == 1
+    odd, even = near & parity & (adjacent > 0), near & ~parity & (diagonal > 0)
     product = np.concatenate([(sums[odd, 3] + sums[odd, 5]) / adjacent[odd], sums[even, 4] / diagonal[even]])
-    model = TextureModel.of_speckle(4.0)
-    for _ in range(6):  # the products come in units of the band's energy, which depends on the texture: settles in 4
-        band = model.band
-        model = _mixture(r, product * np.where(kind, band.adjacent, band.diagonal), correlation=best)
-        model = _with_fine_part(model, agreement)
-    return model
+    energies = _band_energies(tuple(WIDTHS.tolist()))
+    # products come in units of the band's energy, which the same unknown weights make up
+    unit = np.concatenate([np.tile(energies[:, 1], (odd.sum(), 1)), np.tile(energies[:, 2], (even.sum(), 1))])
+    # what a lattice cannot see is hardly in the products: the fit would extrapolate it to distance 0
+    ratio = agreement if agreement > AGREEING else USUAL_AGREEMENT
+    fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
+    model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, unit=unit, fine=fine)
+    return replace(model, private=_private_share(model, sums, counts, correlations))
 
 
-def _with_fine_part(model: TextureModel, agreement: float) -> TextureModel:
-    """The texture with as much of the narrowest Gaussian more as makes neighbouring planes agree no better.
+def _mixture(
+    r: Floats,
+    product: Floats,
+    correlation: float,
+    *,
+    widths: Floats = WIDTHS,
+    unit: Floats | None = None,
+    fine: Floats | None = None,
+    private: float = 0.0,
+) -> TextureModel:
+    """Weights w >= 0 and offset c <= 0 of a texture, by least squares.
 
-    Products of samples a pixel apart and more hardly tell it: the sum of Gaussians extrapolates to distance 0.
+    ``sum w g(r) + c = product`` up to a factor, or, with `unit` (R, M) and `fine` (M + 1,),
+    ``sum w (g(r) - product unit) + c (1 - product) = 0`` with ``sum w + c = 1`` and ``fine . (w, -c) = 0``.
     """
-    band, fine = model.band, TextureModel(weights=(1.0,), widths=(NARROWEST,)).band
-    missing = band.adjacent - agreement * band.own
-    part = float(np.clip(missing / max(agreement * fine.own - fine.adjacent, 1e-6), 0, MOST_FINE))
-    if part == 0:
-        return model
-    weights = np.append(np.asarray(model.weights) / np.sum(model.weights), part)
-    return replace(model, weights=tuple((weights / weights.sum()).tolist()), widths=(*model.widths, NARROWEST))
-
-
-def _fit_own(sums: Floats, counts: Floats, distance: Floats, best: float) -> TextureModel:
-    """Texture of a specimen whose colours differ, from products of samples of one colour."""
-    seen = counts > 0
-    r = np.broadcast_to(distance[:, None], sums.shape)[seen]
-    return _mixture(r, sums[seen] / counts[seen], correlation=best, private=1.0)
-
-
-def _mixture(r: Floats, product: Floats, *, correlation: float, private: float = 0.0) -> TextureModel:
-    # a constant of either sign takes up what the removal of the local mean has shifted
-    basis = np.concatenate(
-        [np.exp(-0.5 * (r[:, None] / WIDTHS) ** 2), np.ones((r.size, 1)), -np.ones((r.size, 1))], axis=1
-    )
+    gaussians = np.exp(-0.5 * (r[:, None] / widths) ** 2)
     importance = 1 / (1 + r)
-    weights = nnls(basis * importance[:, None], product * importance)[0][:-2]
-    if not weights.sum() > 0:
+    if unit is None or fine is None:
+        system = np.column_stack([gaussians, -np.ones(r.size)]) * importance[:, None]
+        wanted = product * importance
+    else:
+        system = np.column_stack([gaussians - product[:, None] * unit, product - 1]) * importance[:, None]
+        sum_to_one = np.append(np.ones(len(widths)), -1.0)
+        # short distances tell a constant badly from a wide Gaussian
+        small_offset = np.append(np.zeros(len(widths)), OFFSET_PENALTY)
+        system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
+        wanted = np.concatenate([np.zeros(r.size), [1e3, 0.0, 0.0]])
+    found = nnls(system, wanted)[0]
+    total = found[:-1].sum() - found[-1]
+    if not total > 0.1 * found[:-1].sum():
         return TextureModel.of_speckle(4.0)
-    kept = weights > 0
+    kept = found[:-1] > 0
+    weights = found[:-1][kept] / total
     return TextureModel(
-        weights=tuple((weights[kept] / weights.sum()).tolist()),
-        widths=tuple(WIDTHS[kept].tolist()),
+        weights=tuple(weights.tolist()),
+        widths=tuple(widths[kept].tolist()),
+        offset=min(float(1 - weights.sum()), 0.0),
         private=private,
         correlation=correlation,
     )
+
+
+def _private_share(model: TextureModel, sums: Floats, counts: Floats, correlations: Floats) -> float:
+    """How much of what the colours show of their own is as coarse as the speckle, from products two pixels apart."""
+    apart = np.abs(LAGS)
+    two = (apart.max(axis=1) == 2) & (apart.min(axis=1) == 0) & (counts[:, :3] > 0).all(axis=1)
+    band = model.band
+    measured = (sums[two, :3].sum(axis=0) / counts[two, :3].sum(axis=0)).mean()
+    common = np.clip(correlations / (np.array([band.adjacent, band.diagonal, band.adjacent]) / band.own), 0, 1).mean()
+    if common > AGREEING:
+        return 0.0
+    coarse = float(model(2.0)) / band.own
+    return float(np.clip((measured - common * coarse) / ((1 - common) * max(coarse, 1e-3)), 0, 1))

@@ -19,12 +19,12 @@ from rgbmidic._kernels.kriging import TILE
 from rgbmidic.illumination.mosaic import cfa_channels
 from rgbmidic.illumination.texture import TextureModel
 
-__all__ = ["SIZE", "FilterTable", "prediction_filters"]
+__all__ = ["SIZE", "WIDE", "FilterTable", "prediction_filters"]
 
 Floats = npt.NDArray[np.float64]
 
-SIZE = 5
-"""Side of the square of samples that a value is predicted from."""
+SIZE, WIDE = 5, 7
+"""Side of the square of samples that a value is predicted from, and where the colours have nothing in common."""
 LEVELS_PER_OCTAVE = 1
 """Fineness in which a channel's private variance is rounded; twice as fine measures the same."""
 LARGEST, SMALLEST = 10, -10
@@ -81,7 +81,7 @@ def prediction_filters(
     Returns
     -------
     FilterTable
-        With an output for each channel and a last one for the common texture alone.
+        With one output for each channel.
     """
     # the noise matters little beside the texture: coarse steps let frames of a sequence share their filters
     steps = tuple(int(n) for n in np.round(2 * np.log2(np.maximum(noise, 1e-8))))
@@ -103,29 +103,26 @@ def prediction_filters(
 def _entry(
     level: tuple[int, ...], noise: tuple[int, ...], texture: TextureModel, cfa: str, size: int
 ) -> tuple[npt.NDArray[np.float32], Floats, Floats]:
-    """Filters (2, 4, size², TILE), error variances (4,) and noise covariance (4, 4) of one combination of levels."""
+    """Filters (2, 3, size², TILE), error variances (3,) and noise covariance (3, 3) of one combination of levels."""
     share = 1 / (1 + 2.0 ** (np.array(level) / LEVELS_PER_OCTAVE))
     camera = 2.0 ** (np.array(noise) / 2)
     common, coarse, fine = _covariances(texture, size)
     private = texture.private * coarse + (1 - texture.private) * fine
     centre = size * size // 2
-    taps, variance = np.empty((4, 4, size * size)), np.zeros(4)
-    covariance = np.zeros((4, 4))
-    wanted = np.append(share, 1.0)
+    taps, variance, covariance = np.empty((4, 3, size * size)), np.zeros(3), np.zeros((3, 3))
     for phase, channel in enumerate(_channels_around(cfa, size)):
         same = channel[:, None] == np.arange(3)
-        own_share = np.sqrt((1 - share) * same)
+        mine = np.sqrt(1 - share) * same
         samples = np.outer(np.sqrt(share[channel]), np.sqrt(share[channel])) * common
-        samples += (own_share @ own_share.T) * private + np.diag(camera[channel])
-        target = np.sqrt(np.outer(share[channel], wanted)) * common[:, centre, None]
-        target[:, :3] += (1 - share) * same * private[:, centre, None]
-        solution = np.linalg.solve(samples, target)
+        samples += (mine @ mine.T) * private + np.diag(camera[channel])
+        wanted = np.sqrt(np.outer(share[channel], share)) * common[:, centre, None]
+        wanted += (1 - share) * same * private[:, centre, None]
+        solution = np.linalg.solve(samples, wanted)
         taps[phase] = solution.T
-        prior = wanted * common[centre, centre]
-        prior[:3] += (1 - share) * private[centre, centre]
-        variance += (prior - (solution * target).sum(axis=0)) / 4
+        prior = share * common[centre, centre] + (1 - share) * private[centre, centre]
+        variance += (prior - (solution * wanted).sum(axis=0)) / 4
         covariance += solution.T @ (camera[channel][:, None] * solution) / 4
-    lanes = np.tile(taps.reshape(2, 2, 4, -1).transpose(0, 2, 3, 1), TILE // 2)
+    lanes = np.tile(taps.reshape(2, 2, 3, -1).transpose(0, 2, 3, 1), TILE // 2)
     return lanes.astype(np.float32), variance, covariance
 
 

@@ -2,10 +2,10 @@
 
 Usual methods assume that the three channels show one texture. Under coloured lights that holds where the paint is mat
 and breaks where one light reflects. Here it is measured, block by block, how much of each channel's contrast is common
-and how much its own (`rgbmidic.illumination.colour_factors`), and every channel is predicted from all the samples around
-with exactly that trust (`rgbmidic.illumination.demosaic.prediction`). A channel in a reflection no longer leaks into the
-others, its own sparkle is kept, the coarse lattices of red and blue are filled from what the others see; a coloured
-specimen, whose channels have nothing in common, is reconstructed channel by channel.
+and how much its own (`rgbmidic.illumination.colour_factors`), and every channel is predicted from all the samples
+around with exactly that trust (`rgbmidic.illumination.demosaic.prediction`). A channel in a reflection no longer leaks
+into the others, its own sparkle is kept, the coarse lattices of red and blue are filled from what the others see; a
+coloured specimen, whose channels have nothing in common, is reconstructed channel by channel.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rgbmidic.illumination.colour_factors import (
 )
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic.base import check_mosaic, red_position
-from rgbmidic.illumination.demosaic.prediction import FilterTable, prediction_filters
+from rgbmidic.illumination.demosaic.prediction import SIZE, WIDE, FilterTable, prediction_filters
 from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, cfa_channels
 from rgbmidic.illumination.texture import TextureModel
 
@@ -128,7 +128,9 @@ class ReflectionAwareDemosaicer:
 
 def _filters(factors: ColourFactors, texture: TextureModel, cfa: str) -> FilterTable:
     noise = np.median(factors.noise / (1 + factors.private), axis=(1, 2))
-    return prediction_filters(_per_tile(factors.private), noise, texture, cfa)
+    # a colour left to itself has only every other sample, so it needs to look farther
+    size = SIZE if texture.private < 0.5 else WIDE
+    return prediction_filters(_per_tile(factors.private), noise, texture, cfa, size=size)
 
 
 def _per_tile(grid: Floats) -> Floats:
@@ -144,15 +146,14 @@ def _predict(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Channels (3, H, W) and where samples stayed unknown (H, W)."""
     spread, pad = factors.spread.astype(np.float32), table.size // 2
-    padded = scaled(moments, 1 / spread, pad=pad, width=table.index.shape[1] * TILE)
+    padded = scaled(moments, np.float32(1) / spread, pad=pad, width=table.index.shape[1] * TILE)
     rows, columns = moments.contrast.shape
     unknown = np.zeros(padded.shape, dtype=bool)
     if damaged:
         source = padded.copy()
         fill_unknown(source, _per_tile(factors.share), *moments.red, pad, padded, unknown)
     out = np.empty((3, rows, columns), dtype=np.float32)
-    taps = np.ascontiguousarray(table.taps[:, :, :3])
-    predict(padded, table.index, taps, table.size, spread, BLOCK, moments.mean, MEAN_BLOCK, out)
+    predict(padded, table.index, table.taps, table.size, spread, BLOCK, moments.mean, MEAN_BLOCK, out)
     return out, unknown[pad : pad + rows, pad : pad + columns]
 
 
@@ -171,4 +172,4 @@ def _noise(factors: ColourFactors, table: FilterTable) -> Floats:
     """Covariance (3, 3) of the camera noise at a typical pixel, DN²."""
     typical = np.bincount(table.index.ravel()).argmax()
     spread = np.median(factors.spread, axis=(1, 2))
-    return np.asarray(table.noise[typical, :3, :3] * np.outer(spread, spread))
+    return np.asarray(table.noise[typical] * np.outer(spread, spread))

@@ -1,11 +1,18 @@
-"""Bilinear and Malvar demosaicing: against naive twins, against colour-demosaicing, at borders and saturation."""
+"""The usual demosaicing methods: against naive twins, against colour-demosaicing, at borders and saturation."""
 
 import naive_demosaic
 import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.demosaic import BilinearDemosaicer, Demosaicer, MalvarDemosaicer
+from rgbmidic.illumination.demosaic import (
+    BandLimitedDemosaicer,
+    BilinearDemosaicer,
+    Demosaicer,
+    MalvarDemosaicer,
+    MenonDemosaicer,
+    NormalisedMosaic,
+)
 from rgbmidic.illumination.mosaic import BAYER_PATTERNS, LinearMosaic
 
 METHODS = {"bilinear": BilinearDemosaicer(), "malvar": MalvarDemosaicer()}
@@ -61,3 +68,38 @@ def test_methods_follow_the_protocol_and_reject_bad_input(name):
     good = make_mosaic((4, 4), "RGGB")
     with pytest.raises(InputError, match="saturation mask"):
         METHODS[name](LinearMosaic(values=good.values, saturated=np.zeros((4, 5), bool), cfa="RGGB", full_scale=1.0))
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+def test_menon_agrees_with_colour_demosaicing_inside(cfa):
+    oracle = pytest.importorskip("colour_demosaicing").demosaicing_CFA_Bayer_Menon2007
+    mosaic = make_mosaic((33, 38), cfa)
+    for refine in (True, False):
+        expected = np.moveaxis(oracle(mosaic.values.astype(float), cfa, refine), -1, 0)
+        # the two differ in how they continue the image beyond its border
+        inside = np.s_[:, 6:-6, 6:-6]
+        ours = MenonDemosaicer(refine=refine)(mosaic).values
+        np.testing.assert_allclose(ours[inside], expected[inside], rtol=1e-4, atol=1e-2)
+
+
+@pytest.mark.parametrize("method", [MenonDemosaicer(), BandLimitedDemosaicer(), NormalisedMosaic()])
+def test_slower_methods_keep_a_grey_field_and_mark_saturation(method):
+    saturated = np.zeros((40, 44), bool)
+    saturated[20, 20] = True
+    values = np.where(saturated, 1000, 400).astype(np.float32)
+    channels = method(LinearMosaic(values=values, saturated=saturated, cfa="RGGB", full_scale=1000.0))
+    assert isinstance(method, Demosaicer)
+    assert not channels.valid[0, 20, 20]
+    assert channels.valid[:, :10].all()
+    np.testing.assert_allclose(channels.values[channels.valid], 400, rtol=1e-4)
+
+
+def test_normalised_mosaic_shows_one_texture_in_all_channels():
+    rows, columns = np.mgrid[:64, :64]
+    texture = 1 + 0.3 * np.cos(0.9 * columns + 0.5 * rows)
+    site = naive_demosaic.site_channels(texture.shape, "RGGB")
+    values = (np.array([300, 900, 500])[site] * texture).astype(np.float32)
+    mosaic = LinearMosaic(values=values, saturated=np.zeros(values.shape, bool), cfa="RGGB", full_scale=1000.0)
+    channels = NormalisedMosaic()(mosaic).values[:, 16:-16, 16:-16]
+    expected = np.array([300, 900, 500])[:, None, None] * texture[16:-16, 16:-16]
+    np.testing.assert_allclose(channels, expected, rtol=0.02)

@@ -67,7 +67,8 @@ def test_wrong_number_of_channels_is_an_error():
         unmix(channels_of(np.ones((3, 4, 4)), np.eye(3)[:2]), Crosstalk(matrix=A, lights=LIGHTS))
 
 
-@pytest.mark.parametrize("method", DEMOSAICERS)
+# the normalised mosaic gives contrasts, and the reflection-aware method needs a speckle: both have tests of their own
+@pytest.mark.parametrize("method", sorted(set(DEMOSAICERS) - {"normalised", "reflection-aware"}))
 def test_separate_recovers_smooth_lights(method):
     rows, columns = np.mgrid[:40, :40]
     lights = np.stack([200 + 3 * rows, 300 + 2 * columns, 500 - rows - columns])

@@ -1,0 +1,238 @@
+"""Texture model, colour factors, prediction filters and the reflection-aware demosaicer: laws and known cases."""
+
+import colour_scenes as scenes
+import numpy as np
+import pytest
+from naive_demosaic import site_channels
+
+from rgbmidic.errors import InputError
+from rgbmidic.illumination.colour_factors import colour_factors, gather_moments, learn_texture
+from rgbmidic.illumination.demosaic import Demosaicer, ReflectionAwareDemosaicer
+from rgbmidic.illumination.demosaic.prediction import prediction_filters
+from rgbmidic.illumination.mosaic import BAYER_PATTERNS
+from rgbmidic.illumination.separate import separate, separate_reflections
+from rgbmidic.illumination.texture import TextureModel
+
+SHAPE = (160, 176)
+
+
+@pytest.fixture(scope="module")
+def albedo():
+    return scenes.speckle(SHAPE)
+
+
+@pytest.fixture(scope="module")
+def mat(albedo):
+    """Three lights of different strength without reflections."""
+    return np.stack([1500 * albedo, 2000 * albedo, 1100 * albedo])
+
+
+@pytest.fixture(scope="module")
+def glaring(mat):
+    """The same with a reflection over the whole of the green light."""
+    return mat + np.stack([np.zeros(SHAPE), scenes.sparkle(SHAPE, 1200, 5), np.zeros(SHAPE)])
+
+
+def learnt(lights, **options):
+    mosaic = scenes.mosaic_of(lights, **options)
+    moments = gather_moments(mosaic.values, (0, 0), mosaic.noise)
+    texture = learn_texture(moments)
+    return texture, colour_factors(moments, texture.band, scenes.A)
+
+
+def autocorrelation(image, distance):
+    image = (image - image.mean()) / image.std()
+    pairs = [(image[:, :-distance] * image[:, distance:]).mean(), (image[:-distance] * image[distance:]).mean()]
+    return np.mean(pairs)
+
+
+def test_texture_is_learnt_through_crosstalk_noise_and_mosaic(albedo, mat):
+    texture, _ = learnt(mat)
+    assert texture(0) == pytest.approx(1)
+    for distance in (1, 2):
+        assert texture(distance) == pytest.approx(autocorrelation(albedo, distance), abs=0.04)
+    assert texture.private == 0
+
+
+def test_texture_is_the_same_with_and_without_reflection(mat, glaring):
+    without, within = learnt(mat)[0], learnt(glaring)[0]
+    distance = np.array([1.0, 1.5, 2.0, 3.0])
+    np.testing.assert_allclose(within(distance), without(distance), atol=0.03)
+
+
+def test_texture_checks_its_parameters():
+    assert TextureModel.of_speckle(4.0).diameter == pytest.approx(4, rel=0.1)
+    with pytest.raises(InputError, match="sum to 1"):
+        TextureModel(weights=(0.5,), widths=(1.0,))
+    with pytest.raises(InputError, match="equally many"):
+        TextureModel(weights=(1.0,), widths=(1.0, 2.0))
+    with pytest.raises(InputError, match="diameter"):
+        TextureModel.of_speckle(0.0)
+
+
+def test_band_energy_is_that_of_a_rendered_texture():
+    """The closed form against the moments of a field with that autocorrelation."""
+    from scipy.ndimage import gaussian_filter
+
+    rng, width = np.random.default_rng(2), 1.5
+    field = gaussian_filter(rng.normal(size=(512, 512)), width / np.sqrt(2))
+    field /= field.std()
+    moments = gather_moments(field.astype(np.float32), (0, 0), None)
+    band = TextureModel(weights=(1.0,), widths=(width,)).band
+    # the local mean takes some of the coarse texture away
+    assert moments.own.mean() == pytest.approx(band.own, rel=0.15)
+    ratios = moments.shared.mean(axis=(1, 2)) / moments.own.mean()
+    np.testing.assert_allclose(ratios, np.array([band.adjacent, band.diagonal, band.adjacent]) / band.own, atol=0.004)
+
+
+def test_slopes_follow_the_lights(mat):
+    _, factors = learnt(mat)
+    slopes = np.median(factors.slope, axis=(1, 2))
+    expected = scenes.A @ np.array([1500, 2000, 1100])
+    np.testing.assert_allclose(slopes / slopes[1], expected / expected[1], rtol=0.01)
+    assert np.median(factors.private) < 0.004
+
+
+def test_a_reflection_is_private_to_its_channel(mat, glaring):
+    _, factors = learnt(glaring)
+    red, green, blue = np.median(factors.private, axis=(1, 2))
+    channels = np.tensordot(scenes.A, glaring - mat, axes=1)
+    albedo_std = mat.std(axis=(1, 2))
+    expected = channels.var(axis=(1, 2)) / (scenes.A @ albedo_std) ** 2
+    assert green == pytest.approx(expected[1], rel=0.35)
+    assert max(red, blue) < 0.1 * green
+
+
+def test_camera_noise_is_not_taken_for_a_reflection(mat):
+    dim = mat / 10
+    _, factors = learnt(dim)
+    assert np.median(factors.private) < 0.01
+    assert np.median(factors.noise) > 0.005
+
+
+def test_filters_sum_to_one_and_follow_the_trust():
+    texture = TextureModel.of_speckle(4.0)
+    alike = prediction_filters(np.full((3, 1, 1), 1e-3), (1e-4,) * 3, texture, "RGGB")
+    apart = prediction_filters(np.array([1e-3, 1.0, 1e-3]).reshape(3, 1, 1), (1e-4,) * 3, texture, "RGGB")
+    np.testing.assert_allclose(alike.taps.sum(axis=3), 1, atol=0.02)
+    site = site_channels((5, 5), "RGGB").ravel()
+    # red at a blue pixel: what green tells counts for much less when green is in a reflection
+    share = [abs(table.taps[0, 0, 0, site == 1, 0]).sum() for table in (alike, apart)]
+    assert share[1] < 0.3 * share[0]
+    assert (apart.variance >= alike.variance - 1e-9).all()
+
+
+def test_filters_of_nothing_in_common_use_the_own_colour_alone():
+    texture = TextureModel(**{**vars_of(TextureModel.of_speckle(4.0)), "private": 1.0})
+    table = prediction_filters(np.full((3, 1, 1), 2000.0), (1e-4,) * 3, texture, "RGGB")
+    site = site_channels((5, 5), "RGGB").ravel()
+    for channel in range(3):
+        others = table.taps[0, 0, channel, site != channel, 0]
+        assert abs(others).max() < 0.01
+
+
+def vars_of(model):
+    return {name: getattr(model, name) for name in ("weights", "widths", "offset", "private", "correlation")}
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+def test_mat_lights_are_recovered_better_than_by_malvar(cfa, mat):
+    mosaic = scenes.mosaic_of(mat, cfa=cfa)
+    ours = scenes.error(separate(mosaic, scenes.CROSSTALK, "reflection-aware"), mat)
+    usual = scenes.error(separate(mosaic, scenes.CROSSTALK, "malvar"), mat)
+    assert (ours < 0.75 * usual).all()
+
+
+def test_a_reflection_does_not_leak_into_the_other_lights(mat, glaring):
+    mosaic = scenes.mosaic_of(glaring)
+    ours = scenes.error(separate(mosaic, scenes.CROSSTALK, "reflection-aware"), glaring)
+    usual = scenes.error(separate(mosaic, scenes.CROSSTALK, "malvar"), glaring)
+    assert (ours[[0, 2]] < 0.6 * usual[[0, 2]]).all()
+    assert ours[1] < 1.02 * usual[1]
+
+
+def test_reflection_index_tells_the_light_and_its_share(mat, glaring):
+    clean = separate_reflections(scenes.mosaic_of(mat), scenes.CROSSTALK)
+    assert np.median(clean.reflection_index, axis=(1, 2)).max() < 0.05
+    index = separate_reflections(scenes.mosaic_of(glaring), scenes.CROSSTALK).reflection_index
+    reflected = (glaring - mat).mean(axis=(1, 2)) / glaring.mean(axis=(1, 2))
+    np.testing.assert_allclose(np.median(index, axis=(1, 2)), reflected, atol=0.05)
+    assert index.shape == (3, *SHAPE)
+
+
+def test_predicted_error_is_the_observed_one(mat, glaring):
+    found = separate_reflections(scenes.mosaic_of(glaring), scenes.CROSSTALK)
+    predicted = np.sqrt(found.variance.mean(axis=(1, 2)))
+    np.testing.assert_allclose(predicted, scenes.error(found.images, glaring), rtol=0.45)
+    # without a reflection it is an upper bound: two colours are never trusted to agree perfectly
+    clean = separate_reflections(scenes.mosaic_of(mat), scenes.CROSSTALK)
+    assert (np.sqrt(clean.variance.mean(axis=(1, 2))) > scenes.error(clean.images, mat)).all()
+
+
+def test_predicted_camera_noise_is_the_observed_one(mat):
+    runs = [
+        separate(scenes.mosaic_of(mat, seed=seed), scenes.CROSSTALK, texture=TextureModel.of_speckle(4.2))
+        for seed in range(8)
+    ]
+    observed = np.var([run.values for run in runs], axis=0, ddof=1).mean(axis=(1, 2))
+    np.testing.assert_allclose(np.diag(runs[0].covariance), observed, rtol=0.25)
+
+
+def test_a_coloured_specimen_is_no_worse_than_colour_by_colour():
+    lights = 1500 * np.stack([scenes.speckle(SHAPE, seed=seed) for seed in (1, 2, 3)])
+    mosaic = scenes.mosaic_of(lights)
+    found = separate_reflections(mosaic, scenes.CROSSTALK)
+    assert found.texture.private == 1
+    assert found.texture.correlation < 0.5
+    alone = scenes.error(separate(mosaic, scenes.CROSSTALK, "band-limited"), lights)
+    assert (scenes.error(found.images, lights) < 1.05 * alone).all()
+
+
+def test_saturated_samples_are_unknown_and_their_neighbours_survive(mat):
+    lights = mat.copy()
+    lights[1, 60:63, 80:84] += 9000
+    mosaic = scenes.mosaic_of(lights)
+    channels = ReflectionAwareDemosaicer(crosstalk=scenes.CROSSTALK)(mosaic)
+    site = site_channels(SHAPE, "RGGB")
+    hit = mosaic.saturated & (site == 1)
+    assert hit.any()
+    assert not channels.valid[1][hit].any()
+    assert channels.valid[1].mean() > 0.99
+    images = separate(mosaic, scenes.CROSSTALK)
+    assert not np.isfinite(images.values[1][hit]).any()
+    far = np.ones(SHAPE, bool)
+    far[52:71, 72:92] = False
+    clean = separate(scenes.mosaic_of(mat), scenes.CROSSTALK)
+    assert np.abs(images.values[0] - clean.values[0])[far].max() < 60
+
+
+def test_a_dead_frame_gives_numbers_or_unknown_but_no_failure():
+    black = scenes.mosaic_of(np.zeros((3, 80, 80)))
+    assert np.isfinite(separate(black, scenes.CROSSTALK).values).all()
+    white = scenes.mosaic_of(np.full((3, 80, 80), 9000.0))
+    assert not separate(white, scenes.CROSSTALK).valid.any()
+    flat = scenes.mosaic_of(np.full((3, 80, 80), 900.0))
+    assert scenes.error(separate(flat, scenes.CROSSTALK), np.full((3, 80, 80), 900.0)).max() < 20
+
+
+def test_the_same_frame_gives_the_same_bits(glaring):
+    mosaic = scenes.mosaic_of(glaring)
+    first, second = (separate(mosaic, scenes.CROSSTALK).values for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_fewer_lights_than_channels(albedo):
+    from rgbmidic.illumination.crosstalk import Crosstalk
+
+    lights = np.stack([1500 * albedo, np.zeros(SHAPE), 1100 * albedo])
+    two = Crosstalk(matrix=scenes.A[:, [0, 2]], lights=("red", "blue"))
+    images = separate(scenes.mosaic_of(lights), two)
+    assert images.names == ("red", "blue")
+    assert (scenes.error(images, lights[[0, 2]]) < 60).all()
+
+
+def test_small_frames_are_refused_with_the_way_out():
+    method = ReflectionAwareDemosaicer()
+    assert isinstance(method, Demosaicer)
+    with pytest.raises(InputError, match='use method "malvar"'):
+        method(scenes.mosaic_of(np.ones((3, 40, 80))))

@@ -1,0 +1,92 @@
+"""Kernels of the reflection-aware demosaicing against their naive twins, odd sizes and unknown samples included."""
+
+import naive_texture
+import numpy as np
+import pytest
+
+from rgbmidic._kernels import kriging, texture
+from rgbmidic.illumination.demosaic.base import red_position
+from rgbmidic.illumination.mosaic import BAYER_PATTERNS
+
+SHAPES = [(16, 24), (19, 21), (33, 18)]
+
+
+def make_contrast(shape, unknown=0.02, seed=0):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(0, 100, shape).astype(np.float32)
+    values[rng.random(shape) < unknown] = np.nan
+    return values
+
+
+def grid_for(shape, block, seed=1):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.5, 2, (3, *(-(-n // block) for n in shape))).astype(np.float32)
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_sums_means_and_scaling(cfa, shape):
+    values, red = make_contrast(shape), red_position(cfa)
+    sums, counts = np.empty((2, 3, *(-(-n // 4) for n in shape)))
+    texture.block_sums(values, *red, 4, sums, counts)
+    expected = naive_texture.block_sums(values, cfa, 4)
+    np.testing.assert_allclose(sums, expected[0], rtol=1e-5, atol=1e-3)
+    np.testing.assert_array_equal(counts, expected[1])
+    mean, out = grid_for(shape, 4), np.empty_like(values)
+    texture.subtract_mean(values, mean, *red, 4, out)
+    np.testing.assert_allclose(out, naive_texture.subtract_mean(values, mean, cfa, 4), rtol=1e-5, atol=1e-4)
+    scale, padded = grid_for(shape, 8), np.empty((shape[0] + 4, shape[1] + 4 + 7), dtype=np.float32)
+    texture.scaled_contrast(values, scale, *red, 8, 2, padded)
+    expected = naive_texture.scaled_contrast(values, scale, cfa, 8, 2, padded.shape[1])
+    np.testing.assert_allclose(padded, expected, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_moments_of_the_planes(cfa, shape):
+    values = make_contrast(shape, unknown=0.005)
+    sums = np.empty((6, *(-(-n // 8) for n in shape)))
+    counts = np.empty(sums.shape[1:])
+    texture.cell_moments(values, *red_position(cfa), 8, sums, counts)
+    expected = naive_texture.cell_moments(values, cfa, 8)
+    np.testing.assert_array_equal(counts, expected[1])
+    np.testing.assert_allclose(sums, expected[0], rtol=1e-4, atol=1e5)
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "GBRG"])
+def test_products_at_lags(cfa):
+    values, lags = make_contrast((19, 14)), np.array([(0, 1), (1, -1), (2, 0), (3, 2)])
+    sums, counts = np.zeros((2, len(lags), 6))
+    texture.lag_products(values, *red_position(cfa), lags, 2, sums, counts)
+    expected = naive_texture.lag_products(values, cfa, lags, 2)
+    np.testing.assert_array_equal(counts, expected[1])
+    np.testing.assert_allclose(sums, expected[0], rtol=1e-4, atol=1)
+
+
+@pytest.mark.parametrize("size", [5, 7])
+def test_prediction_with_different_filters_per_tile(size):
+    rng, shape = np.random.default_rng(3), (37, 43)
+    tiles = tuple(-(-n // kriging.TILE) for n in shape)
+    index = rng.integers(0, 5, tiles).astype(np.int32)
+    pair = rng.normal(size=(5, 2, 3, size**2, 2))
+    taps = np.tile(pair, kriging.TILE // 2).astype(np.float32)
+    pad = size // 2
+    padded = rng.normal(size=(shape[0] + 2 * pad, tiles[1] * kriging.TILE + 2 * pad)).astype(np.float32)
+    scale, mean, out = grid_for(shape, 8), grid_for(shape, 4), np.empty((3, *shape), dtype=np.float32)
+    kriging.predict(padded, index, taps, size, scale, 8, mean, 4, out)
+    expected = naive_texture.predict(padded, index, taps, size, scale, 8, mean, 4, shape, kriging.TILE)
+    np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_unknown_samples_get_what_the_others_tell():
+    share = np.ones((3, 1, 1))
+    padded = np.full((12, 12), 2.0, dtype=np.float32)
+    padded[5, 5] = np.nan
+    out, unknown = padded.copy(), np.zeros(padded.shape, dtype=bool)
+    kriging.fill_unknown(padded, share, 0, 0, 2, out, unknown)
+    assert out[5, 5] == pytest.approx(2)
+    assert not unknown.any()
+    padded[3:8, 3:8] = np.nan
+    kriging.fill_unknown(padded, share, 0, 0, 2, out, unknown)
+    assert unknown[5, 5]
+    assert np.isfinite(out).all()
