@@ -157,7 +157,7 @@ def _smooth(sums: Floats, counts: Floats, sigma: float) -> Floats:
     return out
 
 
-def learn_texture(moments: Moments, *, samples: int = 130_000) -> TextureModel:
+def learn_texture(moments: Moments, *, samples: int = 80_000) -> TextureModel:
     """The texture of a specimen from one mosaic; about `samples` pixels are looked at."""
     root = np.sqrt(moments.own)
     padded = scaled(moments, (1 / root).astype(np.float32), pad=0)

@@ -20,10 +20,12 @@ __all__ = ["LAGS", "WHITE_ENERGY", "BandEnergy", "TextureModel", "fit_texture"]
 
 Floats = npt.NDArray[np.float64]
 
-LAGS = np.array([(i, j) for i in range(5) for j in range(-4, 5) if (i, j) > (0, 0)], dtype=np.int64)
-"""Distances (rows, columns) at which products of samples are taken."""
 FARTHEST = 4.3
 """Products farther apart (px) do not enter: they tell of the spacing of the speckles, not of their edges."""
+LAGS = np.array(
+    [(i, j) for i in range(5) for j in range(-4, 5) if (i, j) > (0, 0) and np.hypot(i, j) <= FARTHEST], dtype=np.int64
+)
+"""Distances (rows, columns) at which products of samples are taken."""
 NARROWEST = 0.6
 """Standard deviation (px) of the narrowest Gaussian: what a square pixel lets through."""
 OFFSET_PENALTY = 0.05
@@ -157,9 +159,8 @@ def fit_texture(sums: Floats, counts: Floats, correlations: Floats, agreement: f
     """
     best = float(np.max(correlations))
     distance = np.hypot(*LAGS.T)
-    near = distance <= FARTHEST
     if best < COLOURED:
-        seen = near[:, None] & (counts[:, :3] > 0)
+        seen = counts[:, :3] > 0
         r = np.broadcast_to(distance[:, None], seen.shape)[seen]
         # one colour's samples are two pixels apart and tell nothing of what is finer
         coarse = WIDTHS[WIDTHS > 1]
@@ -167,7 +168,7 @@ def fit_texture(sums: Floats, counts: Floats, correlations: Floats, agreement: f
     pairs = counts[:, 3:] * correlations
     adjacent, diagonal = pairs[:, 0] + pairs[:, 2], pairs[:, 1]
     parity = LAGS.sum(axis=1) % 2 == 1
-    odd, even = near & parity & (adjacent > 0), near & ~parity & (diagonal > 0)
+    odd, even = parity & (adjacent > 0), ~parity & (diagonal > 0)
     product = np.concatenate([(sums[odd, 3] + sums[odd, 5]) / adjacent[odd], sums[even, 4] / diagonal[even]])
     energies = _band_energies(tuple(WIDTHS.tolist()))
     # products come in units of the band's energy, which the same unknown weights make up

@@ -83,47 +83,42 @@ def prediction_filters(
     FilterTable
         With one output for each channel.
     """
-    # the noise matters little beside the texture: coarse steps let frames of a sequence share their filters
-    steps = tuple(int(n) for n in np.round(2 * np.log2(np.maximum(noise, 1e-8))))
     level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(private, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
     code = (level[0] * 1000 + level[1]) * 1000 + level[2]
     _, first, index = np.unique(code, return_index=True, return_inverse=True)
-    keys = [tuple(int(one) for one in level.reshape(3, -1)[:, n]) for n in first]
-    entries = [_entry(key, steps, texture, cfa, size) for key in keys]
+    share = 1 / (1 + 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE))
+    taps, variance, covariance = _solved(share, np.asarray(noise, dtype=np.float64), texture, cfa, size)
+    lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
     return FilterTable(
         index=index.reshape(level.shape[1:]).astype(np.int32),
-        taps=np.stack([taps for taps, _, _ in entries]),
-        variance=np.stack([variance for _, variance, _ in entries]),
-        noise=np.stack([covariance for _, _, covariance in entries]),
+        taps=lanes.astype(np.float32),
+        variance=variance,
+        noise=covariance,
         size=size,
     )
 
 
-@lru_cache(maxsize=4096)
-def _entry(
-    level: tuple[int, ...], noise: tuple[int, ...], texture: TextureModel, cfa: str, size: int
-) -> tuple[npt.NDArray[np.float32], Floats, Floats]:
-    """Filters (2, 3, size², TILE), error variances (3,) and noise covariance (3, 3) of one combination of levels."""
-    share = 1 / (1 + 2.0 ** (np.array(level) / LEVELS_PER_OCTAVE))
-    camera = 2.0 ** (np.array(noise) / 2)
+def _solved(share: Floats, noise: Floats, texture: TextureModel, cfa: str, size: int) -> tuple[Floats, Floats, Floats]:
+    """Filters (T, 4, 3, size²), error variances (T, 3) and noise covariances (T, 3, 3) for shares (T, 3)."""
     common, coarse, fine = _covariances(texture, size)
     private = texture.private * coarse + (1 - texture.private) * fine
-    centre = size * size // 2
-    taps, variance, covariance = np.empty((4, 3, size * size)), np.zeros(3), np.zeros((3, 3))
+    centre, count = size * size // 2, len(share)
+    taps = np.empty((count, 4, 3, size * size))
+    variance, covariance = np.zeros((count, 3)), np.zeros((count, 3, 3))
     for phase, channel in enumerate(_channels_around(cfa, size)):
-        same = channel[:, None] == np.arange(3)
-        mine = np.sqrt(1 - share) * same
-        samples = np.outer(np.sqrt(share[channel]), np.sqrt(share[channel])) * common
-        samples += (mine @ mine.T) * private + np.diag(camera[channel])
-        wanted = np.sqrt(np.outer(share[channel], share)) * common[:, centre, None]
-        wanted += (1 - share) * same * private[:, centre, None]
+        root, own = np.sqrt(share[:, channel]), np.sqrt(1 - share[:, channel])
+        same = channel[:, None] == channel[None]
+        samples = root[:, :, None] * root[:, None] * common + own[:, :, None] * own[:, None] * (same * private)
+        samples[:, np.arange(size * size), np.arange(size * size)] += np.maximum(noise, 1e-8)[channel]
+        mine = channel[:, None] == np.arange(3)
+        wanted = root[:, :, None] * np.sqrt(share)[:, None] * common[:, centre, None]
+        wanted += (1 - share)[:, None] * (mine * private[:, centre, None])
         solution = np.linalg.solve(samples, wanted)
-        taps[phase] = solution.T
+        taps[:, phase] = solution.transpose(0, 2, 1)
         prior = share * common[centre, centre] + (1 - share) * private[centre, centre]
-        variance += (prior - (solution * wanted).sum(axis=0)) / 4
-        covariance += solution.T @ (camera[channel][:, None] * solution) / 4
-    lanes = np.tile(taps.reshape(2, 2, 3, -1).transpose(0, 2, 3, 1), TILE // 2)
-    return lanes.astype(np.float32), variance, covariance
+        variance += (prior - (solution * wanted).sum(axis=1)) / 4
+        covariance += solution.transpose(0, 2, 1) @ (noise[channel][:, None] * solution) / 4
+    return taps, variance, covariance
 
 
 @lru_cache(maxsize=64)
