@@ -22,11 +22,10 @@ from rgbmidic.errors import ConfigurationError, FrameError, RegionError, Rgbmidi
 from rgbmidic.fields import fill
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
-from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.mosaic import ChannelFrame, LinearChannels, LinearMosaic, Mosaic, linearise
 from rgbmidic.illumination.normalise import normalise
-from rgbmidic.illumination.separate import DEFAULT_METHOD, separate
+from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.illumination.weights import light_weights
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -367,17 +366,11 @@ class Separator:
         crosstalk = self._crosstalk()
         (only,) = linear
         if isinstance(only, LinearMosaic):
-            images = separate(only, crosstalk, self._method(only))
+            images = separate(only, crosstalk, self.settings.illumination.demosaic)
         else:
             images = unmix(only, crosstalk)
         registration = self.calibration.registration if self.calibration else None
         return images if registration is None else align(images, registration)
-
-    def _method(self, mosaic: LinearMosaic) -> str:
-        stated = self.settings.illumination.demosaic
-        if stated != "auto":
-            return stated
-        return DEFAULT_METHOD if min(mosaic.values.shape) >= SMALLEST_FRAME else "malvar"
 
     def _crosstalk(self) -> Crosstalk:
         if self.calibration is None or self.calibration.crosstalk is None:

@@ -23,6 +23,7 @@ from rgbmidic.illumination.demosaic import (
     Reconstruction,
     ReflectionAwareDemosaicer,
 )
+from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.mosaic import LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
@@ -109,7 +110,7 @@ def separate(
     crosstalk
         Which camera channel sees how much of which light, shape (3, k).
     method
-        One of `DEMOSAICERS`.
+        One of `DEMOSAICERS`, or ``"auto"``: reflection-aware where the frame is large enough, else Malvar.
     texture
         The speckle's autocorrelation for the methods that use it; None: they learn it from the frame.
 
@@ -118,6 +119,8 @@ def separate(
     InputError
         Unknown method, a frame too small for it, or a crosstalk matrix that is not for three camera channels.
     """
+    if method == "auto":
+        method = DEFAULT_METHOD if min(mosaic.values.shape) >= SMALLEST_FRAME else "malvar"
     if method not in DEMOSAICERS:
         raise InputError(f"unknown demosaicing method {method!r}; allowed are {', '.join(DEMOSAICERS)}")
     _check_channels(crosstalk)
