@@ -29,6 +29,8 @@ _COARSE = 4
 """Reduction of the grid on which that window is applied."""
 _BLOCK = 9
 """Side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
+_EVEN = 0.7
+"""Standard deviation (blocks) of the window in which the information of a block is taken."""
 _SCORE_RANGE = 20.0
 """Standard deviation (px) of the window over which block sums are averaged."""
 
@@ -190,20 +192,28 @@ class Comparison:
         """
         reference, pixels = self.reference, self.reference.pixels
         score = np.zeros((2, pixels.rows.size), dtype=np.float32)
-        for light, (weight, residual) in enumerate(zip(step_weights, self.residual, strict=True)):
+        information = np.zeros(pixels.rows.size, dtype=np.float32)
+        for weight, residual, gx, gy in zip(
+            step_weights, self.residual, reference.gradient_x, reference.gradient_y, strict=True
+        ):
             pull = weight * residual
-            score[0] += pull * reference.gradient_x[light]
-            score[1] += pull * reference.gradient_y[light]
+            score[0] += pull * gx
+            score[1] += pull * gy
+            information += weight * (gx * gx + gy * gy)
         used = np.asarray(step_weights.any(axis=0), dtype=np.float32)
-        x, y, count = (self._block_sums(values) for values in (score[0], score[1], used))
+        x, y, known, count = (self._block_sums(values) for values in (*score, information, used))
+        # a light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
+        # smooth, and averaged, is the ratio of that variance to the information, 1 for white noise and ideal weights
+        level = _blur(known, _EVEN) / np.maximum(_blur(count, _EVEN), np.float32(1e-6))
+        scale = np.divide(1, level, out=np.zeros_like(level), where=(level > 0) & (count > 0))
         around = _blur(count, _SCORE_RANGE / _BLOCK)
         # half a block's worth of the mean over the region: beside a hole few blocks speak
         prior, total = 0.5 * _BLOCK**2, max(float(count.sum()), 1.0)
         fitted = min(_BLOCK**2 * measured / max(float(used.sum()), 1.0), 0.75)
         density = np.stack(
             [
-                (_blur(product, _SCORE_RANGE / _BLOCK) + prior * float(product.sum()) / total) / (around + prior)
-                for product in (x * x, x * y, y * y)
+                level * (_blur(ratio, _SCORE_RANGE / _BLOCK) + prior * float(ratio.sum()) / total) / (around + prior)
+                for ratio in (x * x * scale, x * y * scale, y * y * scale)
             ]
         )
         return self._spread(density.astype(np.float64) / (1 - fitted), used)
