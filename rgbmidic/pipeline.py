@@ -36,7 +36,7 @@ from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
 if TYPE_CHECKING:
     from rgbmidic.virtual.prediction import GeometryWeights
 
-__all__ = ["Separator", "Start", "Weigher", "average", "measure", "read_region", "texture", "track"]
+__all__ = ["Separator", "Start", "Weigher", "average", "measure", "read_region", "texture", "track", "with_camera"]
 
 logger = logging.getLogger(__name__)
 
@@ -75,7 +75,8 @@ def measure(
         The settings, the calibration, the region or the reference frames are not usable.
     """
     separator = Separator.from_settings(settings)
-    frames = open_frames(_with_camera(settings, separator.calibration), settings.base)
+    first = list_frames(settings.frames.path[0], settings.base)[0]
+    frames = open_frames(with_camera(settings.frames, first, separator.calibration), settings.base)
     images = average([separator(frames.read(index)) for index in settings.frames.reference])
     region = read_region(settings.region, images.shape)
     mesh = Tri3Mesh.from_region(region, settings.element_size)
@@ -108,10 +109,11 @@ def measure(
     return Result.open(out)
 
 
-def _with_camera(settings: TestSettings, calibration: Calibration | None) -> FrameSettings:
-    """Frame settings with pattern and levels of the calibration where neither the file nor the settings tell them."""
-    frames = settings.frames
-    first = list_frames(frames.path[0], settings.base)[0]
+def with_camera(frames: FrameSettings, first: Path, calibration: Calibration | None) -> FrameSettings:
+    """Frame settings with pattern and levels of the calibration where neither the file nor the settings tell them.
+
+    `first` is one of the files, which stands for all of them.
+    """
     if calibration is None or tells_camera(first):
         return frames
     return replace(

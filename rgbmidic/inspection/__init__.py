@@ -1,0 +1,6 @@
+"""What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect."""
+
+from rgbmidic.inspection.inspect import inspect_files, inspect_frame
+from rgbmidic.inspection.results import ChannelFacts, Finding, Inspection, LightFacts, Spread
+
+__all__ = ["ChannelFacts", "Finding", "Inspection", "LightFacts", "Spread", "inspect_files", "inspect_frame"]
