@@ -9,20 +9,47 @@ field; between the nodes that field is not linear any more.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import curvature_deviation, element_vector
 from rgbmidic.correlation.problem import Reference
 from rgbmidic.correlation.step import Step
+from rgbmidic.mesh import Tri3Mesh
 
-__all__ = ["curvature_correction"]
+__all__ = ["Bent", "curvature_correction"]
 
 FloatArray = npt.NDArray[np.float64]
 
+_FARTHEST = 3.5
+"""Sides of an element over which a curvature is carried to nodes that do not know it."""
 
-def curvature_correction(reference: Reference, step: Step, displacement: FloatArray) -> FloatArray:
-    """What to subtract from the nodal displacement (N, 2) in px; 0 beside nodes that are not measured.
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bent:
+    """What linear elements make of a curved field.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (N, 2)
+        Offset of the nodal displacement in px.
+    one_sided : ndarray, shape (N, 3)
+        Offset of the nodal strain exx, eyy, exy where the elements around a node do not surround it evenly: at an edge
+        their mean slope is that of a point half an element inside.
+    strain : ndarray, shape (N, 3)
+        Offset of the nodal strain for both reasons.
+    """
+
+    displacement: FloatArray
+    one_sided: FloatArray
+    strain: FloatArray
+
+
+def curvature_correction(reference: Reference, step: Step, displacement: FloatArray) -> Bent:
+    """Offsets of nodal displacement and strain; 0 where no curvature is known within a few elements.
 
     Parameters
     ----------
@@ -33,12 +60,20 @@ def curvature_correction(reference: Reference, step: Step, displacement: FloatAr
     displacement : ndarray, shape (N, 2)
         The solution, finite everywhere.
     """
+    curvature = _curvature(reference, displacement, step.measured)
+    offset = _offset(reference, step, curvature[reference.mesh.elements].mean(axis=1))
+    one_sided = _one_sided(reference.mesh, curvature)
+    return Bent(displacement=offset, one_sided=one_sided, strain=reference.strain(offset) + one_sided)
+
+
+def _offset(reference: Reference, step: Step, curvature: FloatArray) -> FloatArray:
+    """Offset (N, 2) of the nodes for second derivatives (E, 2, 3): the deviation projected as a residual is."""
     mesh, pixels = reference.mesh, reference.pixels
     deviation = np.empty((2, pixels.rows.size), dtype=np.float32)
     curvature_deviation(
         mesh.nodes,
         mesh.elements,
-        _curvature(reference, displacement, step.measured),
+        curvature,
         pixels.local_x,
         pixels.local_y,
         pixels.offsets,
@@ -56,17 +91,35 @@ def curvature_correction(reference: Reference, step: Step, displacement: FloatAr
     return step.solve(total).reshape(-1, 2)
 
 
+def _one_sided(mesh: Tri3Mesh, curvature: FloatArray) -> FloatArray:
+    """Mean slope of the elements around each node less the slope at the node, as a strain (N, 3), for second
+    derivatives (N, 2, 3) at the nodes."""
+    slopes = mesh.shape_gradients() * mesh.areas[:, None, None]
+    corners = mesh.nodes[mesh.elements]
+    gradient = np.zeros((len(mesh.nodes), 2, 2))
+    for node in range(3):
+        arm = corners - corners[:, node, None]
+        squares = np.stack([arm[..., 0] ** 2, 2 * arm[..., 0] * arm[..., 1], arm[..., 1] ** 2], axis=-1) / 2
+        values = np.einsum("ebq,ecq->ecb", squares, curvature[mesh.elements[:, node]])
+        np.add.at(gradient, mesh.elements[:, node], np.einsum("ecb,ebd->ecd", values, slopes))
+    gradient /= mesh.to_nodes(mesh.areas)[:, None, None]
+    shear = (gradient[:, 0, 1] + gradient[:, 1, 0]) / 2
+    return np.stack([gradient[:, 0, 0], gradient[:, 1, 1], shear], axis=1)
+
+
 def _curvature(reference: Reference, displacement: FloatArray, measured: npt.NDArray[np.bool_]) -> FloatArray:
-    """Second derivatives (E, 2, 3) of u and v: the gradient recovered at the nodes, and once more."""
+    """Second derivatives (N, 2, 3) of u and v: the gradient recovered at the nodes, and once more."""
     mesh = reference.mesh
     slopes = mesh.nodal_gradient(displacement)
     second = mesh.nodal_gradient(slopes.reshape(-1, 4)).reshape(-1, 2, 2, 2)
     symmetric = np.stack([second[..., 0, 0], (second[..., 0, 1] + second[..., 1, 0]) / 2, second[..., 1, 1]], axis=-1)
-    symmetric[~_deep(reference, measured)] = np.nan
-    corners = symmetric[mesh.elements]
-    known = np.isfinite(corners).all(axis=(2, 3))
-    share = np.maximum(known.sum(axis=1), 1)[:, None, None]
-    return np.asarray(np.nan_to_num(corners).sum(axis=1) / share)
+    deep = np.flatnonzero(_deep(reference, measured))
+    if not len(deep):
+        return np.zeros_like(symmetric)
+    distance, nearest = (np.asarray(a) for a in cKDTree(mesh.nodes[deep]).query(mesh.nodes))
+    # towards an edge the gradient is one-sided: there the curvature is that of the nearest node that knows it
+    near = distance <= _FARTHEST * mesh.size
+    return np.where(near[:, None, None], symmetric[deep][nearest], 0)
 
 
 def _deep(reference: Reference, measured: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

@@ -118,6 +118,10 @@ class Reference:
             prefilter=prefilter,
         )
 
+    def strain(self, displacement: FloatArray) -> FloatArray:
+        """Strain (N, 3) exx, eyy, exy at the nodes for a nodal displacement (N, 2)."""
+        return np.stack([functional @ displacement.ravel() for functional in self.functionals[2:]], axis=1)
+
     def blocks(self, weight: FloatImage, gradient_x: FloatImage, gradient_y: FloatImage) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""
         pixels = self.pixels

@@ -41,6 +41,8 @@ _REFINED = {"none": 1, "global": 1, "local": 4}
 _PASS_ITERATIONS = 12
 _LOST = 0.5
 """Uncertainty (px) from which a node is lost: a position uncertain by half a pixel is not within reach of a match."""
+_MISFIT = 4.0
+"""Residual around a node, over the median, from which it is lost where elements near it do not match."""
 _WANDERING = 0.1
 """Motion (px) in the last iteration of a pass from which a node is lost."""
 _PATIENCE = 5
@@ -174,7 +176,9 @@ class _Run:
             if step is not None and change <= _SETTLED * weights.sum() and not self._refining(number):
                 break
             try:
-                step = Step.build(self.reference, weights, self.functions)
+                step = Step.build(
+                    self.reference, weights, self.functions, None if self.factor is None else self._given()
+                )
             except RuntimeError as error:  # what SuperLU raises on a matrix that is singular in double precision
                 return self._failed(f"the equations cannot be solved: {error}")
             if not step.measured.any():
@@ -202,10 +206,12 @@ class _Run:
 
     def _weights(self) -> FloatImage:
         """Pixel weights (k, P) of the next pass: those last brought back, where the images match."""
-        weights = self.seen.weights * np.repeat(self.matched, np.diff(self.reference.pixels.offsets))
-        if self.factor is not None:
-            weights *= self.factor
-        return weights
+        weights = self._given()
+        return weights if self.factor is None else weights * self.factor
+
+    def _given(self) -> FloatImage:
+        """Those weights without the precision of the lights."""
+        return self.seen.weights * np.repeat(self.matched, np.diff(self.reference.pixels.offsets))
 
     def _compare(self) -> Comparison:
         lights = range(len(self.values))
@@ -271,22 +277,25 @@ class _Run:
     def _conclude(self, step: Step) -> Solution:
         elements = self.reference.mesh.elements
         std, strain_std = np.split(self._std(self.seen, step, 5), [2], axis=1)
-        lost = step.measured & (std.max(axis=1) > _LOST)
+        beside_mismatch = np.zeros(len(std), dtype=bool)
+        beside_mismatch[elements[~self.matched]] = True
+        misfit = self.seen.misfit(step.weights, step.measured)
+        lost = step.measured & ((std.max(axis=1) > _LOST) | (self._beside(beside_mismatch) & (misfit > _MISFIT)))
         measured = step.measured & ~lost
         if not measured.any():
             return self._failed("the images do not match anywhere in the region")
-        beside_mismatch = np.zeros(len(measured), dtype=bool)
-        beside_mismatch[elements[~self.matched]] = True
         decorrelated = lost | (beside_mismatch & ~measured)
         node_status = np.where(measured, NodeStatus.MEASURED, NodeStatus.NOT_SEEN).astype(np.uint8)
         node_status[decorrelated] = NodeStatus.DECORRELATED
         displacement = self.displacement
-        offset = curvature_correction(self.reference, step, displacement)
+        bent = curvature_correction(self.reference, step, displacement)
         if self.options.curvature:
-            displacement = displacement - offset
+            displacement = displacement - bent.displacement
         else:
-            std = np.hypot(std, offset)
-        strain = np.stack([f @ displacement.ravel() for f in self.reference.functionals[2:]], axis=1)
+            std, strain_std = np.hypot(std, bent.displacement), np.hypot(strain_std, bent.strain)
+        strain = self.reference.strain(displacement)
+        if self.options.curvature:
+            strain = strain - bent.one_sided
         inner = measured & ~self._beside(~measured)
         with np.errstate(invalid="ignore", divide="ignore"):
             residual = np.sqrt(self.sums[:, 0] / self.sums[:, 1])
@@ -301,7 +310,7 @@ class _Run:
             strain_std=np.where(inner[:, None], strain_std, np.nan),
             node_status=node_status,
             light_share=step.light_share,
-            misfit=np.where(measured, self.seen.misfit(step.weights, measured), np.nan),
+            misfit=np.where(measured, misfit, np.nan),
             status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
             reason="" if converged else f"the last iteration still moved a node by {last:.3g} px",
             rigid=self.rigid,

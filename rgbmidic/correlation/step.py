@@ -26,7 +26,9 @@ _SMOOTHNESS = 1e-4
 _ROUNDING = 1e-4
 """Share of a node's texture under which what it sees in its worse direction may be rounding."""
 _SEEN = 0.05
-"""A node is measured if it has this share of the median texture around a node of its area."""
+"""A node is measured if it has this share of the median texture around a node of its area..."""
+_INFORMED = 0.01
+"""...and this share of the median information, its texture over the variance of the residual: 10 times the noise."""
 
 
 def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
@@ -77,12 +79,20 @@ class Step:
     light_share: FloatArray
 
     @classmethod
-    def build(cls, reference: Reference, weights: FloatImage, functions: FloatArray) -> Step:
-        """Assemble and factorise for pixel weights (k, P) and rigid functions (2 N, m)."""
+    def build(
+        cls, reference: Reference, weights: FloatImage, functions: FloatArray, given: FloatImage | None = None
+    ) -> Step:
+        """Assemble and factorise for pixel weights (k, P) and rigid functions (2 N, m).
+
+        `given` are the weights without the precision of the lights, where it is part of `weights`.
+        """
         equations = reference.equations
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
         hessian = equations.matrix(np.sum(per_light, axis=0))
-        measured, scale = _observability(hessian, equations.nodal_area)
+        measured, scale = _observability(hessian, equations.nodal_area, _SEEN if given is None else _INFORMED)
+        if given is not None:
+            texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
+            measured &= _observability(equations.matrix(np.asarray(texture)), equations.nodal_area, _SEEN)[0]
         smoothness = sp.csc_matrix((_SMOOTHNESS * scale) * equations.smoothness)
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
         anchor = 1e-9 * scale * sp.eye(equations.size, format="csc")
@@ -130,8 +140,8 @@ def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArra
     return np.asarray(light / np.where(total > 0, total, 1.0))
 
 
-def _observability(hessian: sp.csc_matrix, area: FloatArray) -> tuple[npt.NDArray[np.bool_], float]:
-    """Which nodes see enough texture, and the typical diagonal entry of the Hessian.
+def _observability(hessian: sp.csc_matrix, area: FloatArray, least: float) -> tuple[npt.NDArray[np.bool_], float]:
+    """Which nodes see at least that share of the median texture, and the typical diagonal entry of the Hessian.
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
     """
@@ -143,5 +153,5 @@ def _observability(hessian: sp.csc_matrix, area: FloatArray) -> tuple[npt.NDArra
     smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only
     density = smallest / area
     typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
-    seen = density > _SEEN * typical if typical > 0 else np.zeros(len(density), dtype=bool)
+    seen = density > least * typical if typical > 0 else np.zeros(len(density), dtype=bool)
     return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0

@@ -72,6 +72,11 @@ class Tri3Mesh:
         """Area of each element in square px, shape (E,)."""
         return _signed_area(self.nodes, self.elements)
 
+    @property
+    def size(self) -> float:
+        """Typical leg of an element in px: that of a right isosceles triangle of the median area."""
+        return float(np.sqrt(2 * np.median(self.areas)))
+
     def to_nodes(self, per_element: FloatArray) -> FloatArray:
         """Sum of a value per element (E,) over the elements around each node, shape (N,)."""
         sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
