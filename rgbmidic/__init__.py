@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rgbmidic.correlation import NodeStatus, Solution, Status, correlate
     from rgbmidic.errors import RgbmidicError
     from rgbmidic.illumination.calibration import Calibration
+    from rgbmidic.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import Region, Tri3Mesh
     from rgbmidic.pipeline import measure
     from rgbmidic.sequence.readers import read_frame
@@ -23,6 +24,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Calibration",
+    "Inspection",
     "NodeStatus",
     "Region",
     "Result",
@@ -33,6 +35,7 @@ __all__ = [
     "Tri3Mesh",
     "__version__",
     "correlate",
+    "inspect_frame",
     "measure",
     "read_frame",
     "read_test",
@@ -40,6 +43,7 @@ __all__ = [
 
 _HOMES = {
     "Calibration": "rgbmidic.illumination.calibration",
+    "Inspection": "rgbmidic.inspection",
     "NodeStatus": "rgbmidic.correlation",
     "Region": "rgbmidic.mesh",
     "Result": "rgbmidic.sequence.store",
@@ -49,6 +53,7 @@ _HOMES = {
     "TestSettings": "rgbmidic.config",
     "Tri3Mesh": "rgbmidic.mesh",
     "correlate": "rgbmidic.correlation",
+    "inspect_frame": "rgbmidic.inspection",
     "measure": "rgbmidic.pipeline",
     "read_frame": "rgbmidic.sequence.readers",
     "read_test": "rgbmidic.config",

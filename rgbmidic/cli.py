@@ -181,6 +181,60 @@ def plan(
     print(f"plan: {out / 'plan.json'}   picture: {out / 'plan.png'}")
 
 
+@app.command()
+def inspect(
+    frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; one per light in succession.")],
+    test: Annotated[Path | None, typer.Option("--test", help="TEST.toml the frame is meant for.")] = None,
+    calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
+    kind: Annotated[str | None, typer.Option("--kind", help="bayer, rgb or monochrome.")] = None,
+    cfa: Annotated[str | None, typer.Option("--cfa", help="Bayer pattern, such as RGGB.")] = None,
+    black_level: Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample.")] = None,
+    white_level: Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level.")] = None,
+    shape: Annotated[str, typer.Option("--shape", help="ROWS,COLUMNS of a headerless file.")] = "",
+    dtype: Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")] = None,
+    region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or the frame.")] = "",
+    element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's or 25.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
+    from rgbmidic.config import read_test
+    from rgbmidic.inspection import inspect_files, state_frames
+    from rgbmidic.report import inspection
+
+    if out is not None:
+        inspection.check_folder(out, overwrite=overwrite)
+    settings = None if test is None else read_test(test)
+    stated: dict[str, object] = {
+        "kind": kind,
+        "cfa": cfa,
+        "black_level": black_level,
+        "white_level": white_level,
+        "dtype": dtype,
+    }
+    stated["shape"] = tuple(int(one) for one in _numbers(shape, "--shape")) if shape else None
+    seen = inspect_files(
+        frames,
+        test=settings,
+        calibration=calibration,
+        frame=state_frames(settings, count=len(frames), **stated),
+        region=_numbers(region, "--region") if region else None,
+        element_size=element_size,
+    )
+    if out is not None:
+        inspection.write_inspection(seen, out, overwrite=overwrite)
+    print(f"{seen.name}: {seen.kind}, {seen.region.shape[1]} x {seen.region.shape[0]} px\n")
+    _print_table("samples in the region, shares of the full scale", *inspection.channel_rows(seen))
+    _print_table("lights", *inspection.light_rows(seen))
+    known = "" if seen.noise_known else " (noise estimated, not calibrated)"
+    size = f"elements of {seen.element_size:g} px"
+    _print_table(f"standard uncertainty of u and v to expect{known}, px, {size}", *inspection.uncertainty_rows(seen))
+    for finding in seen.findings:
+        print(f"warning: {finding.text}")
+    if out is not None:
+        print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")
+
+
 def _print_table(title: str, headings: list[str], rows: list[list[str]]) -> None:
     table = Table(box=None, pad_edge=False)
     for number, heading in enumerate(headings):

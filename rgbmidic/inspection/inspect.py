@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,7 @@ from rgbmidic.config import (
     TestSettings,
 )
 from rgbmidic.correlation import correlate
-from rgbmidic.errors import FrameError, InputError
+from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import ReflectionAwareDemosaicer
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
@@ -29,12 +29,12 @@ from rgbmidic.illumination.separate import separate_reflections
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.inspection.repeat import BayerRepeat, noise_difference
 from rgbmidic.inspection.results import BLIND, REFLECTING, ChannelFacts, Inspection, LightFacts, Spread
-from rgbmidic.inspection.samples import Channel, channels_of, noise_bound, speckle_size
+from rgbmidic.inspection.samples import Channel, channels_of, noise_estimate, speckle_size
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Separator, read_region, with_camera
 from rgbmidic.sequence.readers import read_frame
 
-__all__ = ["inspect_files", "inspect_frame"]
+__all__ = ["inspect_files", "inspect_frame", "state_frames"]
 
 Floats = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
@@ -134,7 +134,7 @@ def inspect_frame(
         A raw frame, or one monochrome frame per light of lights fired in succession.
     calibration
         Crosstalk, noise and registration as far as they are known. Without crosstalk the channels stand for the lights,
-        without noise an upper bound is read from the frame.
+        without noise it is estimated from the frame.
     region
         What will be measured; None: the whole frame.
     element_size
@@ -206,6 +206,27 @@ def inspect_frame(
     )
 
 
+def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) -> FrameSettings:
+    """The test's frame settings, or none, with what is stated in their place (`FrameSettings`; None: not stated).
+
+    Raises
+    ------
+    ConfigurationError
+        Something stated is not allowed, or several frames that are not monochrome.
+    """
+    given = {key: value for key, value in stated.items() if value is not None}
+    allowed = ("bayer", "rgb", "monochrome")
+    if given.get("kind", "bayer") not in allowed:
+        raise ConfigurationError(f"kind must be one of {', '.join(allowed)}, not {given['kind']!r}")
+    if given.get("dtype", "uint8") not in ("uint8", "uint16", ">u2"):
+        raise ConfigurationError(f"dtype must be one of uint8, uint16, >u2, not {given['dtype']!r}")
+    if len(given.get("shape", (1, 1))) != 2:
+        raise ConfigurationError("shape is two numbers, rows and columns")
+    if test is not None:
+        return replace(test.frames, **given)
+    return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
+
+
 def _settings(frames: FrameSettings | None, test: TestSettings | None) -> TestSettings:
     """The test's settings with other frames, or default ones; their region is not used."""
     if test is not None:
@@ -236,7 +257,7 @@ class _Seen:
     crosstalk_known: bool
     noise: NoiseModel
     noise_known: bool
-    bounds: tuple[float, ...]
+    estimates: tuple[float, ...]
 
     @classmethod
     def prepare(
@@ -256,8 +277,10 @@ class _Seen:
         _check_light(channels, place.mask)
         single = not isinstance(linear[0], LinearMosaic) and len(linear[0].values) == 1
         crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
-        bounds = [] if known.noise else noise_bound(channels, place.mask)
-        typical = float(np.sqrt(np.nanmean(np.square(bounds)))) if bounds and not np.isnan(bounds).all() else 0.0
+        estimates = [] if known.noise else noise_estimate(channels, place.mask)
+        typical = (
+            float(np.sqrt(np.nanmean(np.square(estimates)))) if estimates and not np.isnan(estimates).all() else 0.0
+        )
         return cls(
             frames=frames,
             linear=linear,
@@ -268,7 +291,7 @@ class _Seen:
             crosstalk_known=single or known.crosstalk is not None,
             noise=known.noise or NoiseModel(gain=float("inf"), read_noise=typical),
             noise_known=known.noise is not None,
-            bounds=tuple(bounds),
+            estimates=tuple(estimates),
         )
 
     def lights(self) -> IlluminationImages:
@@ -313,7 +336,7 @@ class _Seen:
                     high=float(high),
                     saturated=float(channel.saturated[self.region.mask].sum() / samples.size),
                     speckle_px=speckle_size(channel, self._mat(index, number), self._known_noise()),
-                    noise_dn=calibrated if self.noise_known else self.bounds[number],
+                    noise_dn=calibrated if self.noise_known else self.estimates[number],
                 )
             )
         return tuple(facts)

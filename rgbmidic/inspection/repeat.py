@@ -119,7 +119,7 @@ def noise_difference(
     for _ in range(2):
         noisy = [replace(one, values=one.values + _noise(noise, one.values, random)) for one in frames]
         errors.append(np.nan_to_num(lights(noisy).values - quiet))
-    return _back(errors[1]) - errors[0]
+    return np.asarray(_back(errors[1]) - errors[0])
 
 
 def gaussian_states(texture: TextureModel, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:

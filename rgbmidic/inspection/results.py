@@ -63,8 +63,8 @@ class ChannelFacts:
     speckle_px : float
         Full width at half maximum of the autocorrelation, px (`rgbmidic.inspection.samples.speckle_size`).
     noise_dn : float
-        Standard deviation of the camera noise of a sample at the mean level, DN; an upper bound where the calibration
-        does not know the noise.
+        Standard deviation of the camera noise of a sample at the mean level, DN; estimated from the frame where the
+        calibration does not know the noise.
     """
 
     name: str
@@ -145,7 +145,7 @@ class Inspection:
     texture : TextureModel or None
         The texture that the colours of a mosaic have in common; None for cameras without a mosaic.
     noise : NoiseModel
-        Camera noise, calibrated or bounded from the frame.
+        Camera noise, calibrated or estimated from the frame.
     noise_known, crosstalk_known : bool
         Whether the calibration tells them; a monochrome camera has no crosstalk to know.
     element_size : float
@@ -155,7 +155,7 @@ class Inspection:
     elements : ndarray, shape (E, 3), int32
     std : ndarray, shape (N, 2), float64
         Predicted standard uncertainty of u and v, px, all lights together, camera noise and separation; NaN where no
-        light sees enough. With unknown noise an upper bound.
+        light sees enough.
     noise_std, sampling_std : ndarray, shape (N, 2), float64
         The parts of it from camera noise, and from what the mosaic did not sample.
     greens : float
@@ -224,8 +224,8 @@ def _of_set_up(seen: Inspection) -> Iterator[Finding]:
     if not seen.noise_known:
         yield Finding(
             code="noise unknown",
-            text="no noise calibration: the noise stated is an upper bound from the frame, often some times too high, "
-            "and so is the uncertainty from it; rgbmidic-calibrate noise",
+            text="no noise calibration: noise and the uncertainty from it are estimated from the frame, some times too "
+            "high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
         )
     for light in seen.lights:
         if light.negative > NEGATIVE:
@@ -264,8 +264,8 @@ def _of_speckle(seen: Inspection) -> Iterator[Finding]:
         yield Finding(
             code="fine speckle",
             text=f"the speckle is too fine for the colour lattice: neighbouring colours agree to "
-            f"{texture.correlation:.2f}, {TOO_FINE} is needed (speckles of about 2.6 px); displacements will be pulled towards whole pixels by "
-            "0.01 px and more: coarser speckle, a nearer camera or a softer lens",
+            f"{texture.correlation:.2f}, {TOO_FINE} is needed (speckles of about 2.6 px); displacements will be pulled "
+            "towards whole pixels by 0.01 px and more: coarser speckle, a nearer camera or a softer lens",
         )
     if np.isnan(size):
         yield Finding(code="no texture", text="no speckle is seen: its autocorrelation has no width")

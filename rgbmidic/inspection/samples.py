@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, NoiseModel, cfa_channels
 from rgbmidic.illumination.normalise import local_mean
 
-__all__ = ["Channel", "channels_of", "noise_bound", "speckle_size"]
+__all__ = ["Channel", "channels_of", "noise_estimate", "speckle_size"]
 
 Floats = npt.NDArray[np.float64]
 BoolImage = npt.NDArray[np.bool_]
@@ -26,8 +26,8 @@ FARTHEST = 24
 """Largest distance (px) at which the autocorrelation is looked at."""
 _WIDTHS = 0.5 * 1.25 ** np.arange(17)
 """Standard deviations (px) of the Gaussians that are fitted to it."""
-_REGRESSED = 8000
-"""Samples that a regression looks at."""
+_REGRESSED, _FLATTEST = 20_000, 0.05
+"""Samples that are looked at, and the share of them, with the flattest surroundings, that the regression is made on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,7 +95,7 @@ def speckle_size(channel: Channel, inside: BoolImage, noise: NoiseModel | None) 
         product[at_zero] -= float((noise.variance(mean[known]) / mean[known] ** 2).mean())
     kept = (count > 0.05 * count.max()) & (~at_zero if noise is None else True)
     narrowest = 0.0 if noise is not None else channel.step / 2  # nothing tells narrower ones from noise
-    return _width(distance[kept], product[kept], _WIDTHS[narrowest < _WIDTHS])
+    return _width(distance[kept], product[kept], np.asarray(_WIDTHS[narrowest < _WIDTHS], dtype=np.float64))
 
 
 def _autocorrelation(contrast: FloatImage, known: BoolImage) -> tuple[Floats, Floats, Floats]:
@@ -112,7 +112,7 @@ def _autocorrelation(contrast: FloatImage, known: BoolImage) -> tuple[Floats, Fl
         np.bincount(square.ravel(), weights=one[np.ix_(lag, lag)].ravel())[:-1] for one in (sums, np.round(pairs))
     )
     seen = np.flatnonzero(counts > 0)
-    return np.sqrt(seen.astype(np.float64)), totals[seen] / counts[seen], counts[seen]
+    return np.sqrt(seen.astype(np.float64)), np.asarray(totals[seen] / counts[seen]), counts[seen].astype(np.float64)
 
 
 def _width(distance: Floats, product: Floats, widths: Floats) -> float:
@@ -127,13 +127,14 @@ def _width(distance: Floats, product: Floats, widths: Floats) -> float:
     return float(2 * r[below[0]]) if curve[0] > 0 and below.size else float("nan")
 
 
-def noise_bound(channels: list[Channel], inside: BoolImage) -> list[float]:
-    """Standard deviation (DN) of the noise of a sample of each channel, at most, read from a single frame.
+def noise_estimate(channels: list[Channel], inside: BoolImage) -> list[float]:
+    """Standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
 
-    Every sample's contrast is predicted from the 24 samples around it, of whatever channel, by the linear regression
-    that fits the frame best, one for each position in the cell of the mosaic. What is left is the sample's own noise,
-    that of its neighbours through the regression, and texture that they do not tell: an upper bound. Its scale is
-    1.4826 times the median absolute value, since the edges of speckles are told worst.
+    Where its surroundings are flattest, a sample's contrast is predicted from the 24 samples around it, of whatever
+    channel, by linear regression, one for each position in the cell of the mosaic. What is left is the sample's own
+    noise, that of its neighbours through the regression, and texture that they do not tell: fair where paint is flat
+    over five samples, too high for finer speckle and in reflections (docs/inspect.md). Its scale is 1.4826 times the
+    median absolute value.
     """
     means = [_mean(channel) for channel in channels]
     if channels[0].step == 1:
@@ -143,15 +144,15 @@ def noise_bound(channels: list[Channel], inside: BoolImage) -> list[float]:
         for channel, mean in zip(channels, means, strict=True):
             total = np.where(np.isfinite(channel.values), channel.values / mean - 1, total)
         images = [total] * len(channels)
-    bounds = []
+    estimates = []
     for channel, mean, image in zip(channels, means, images, strict=True):
         lattice = inside & np.isfinite(channel.values) & ~channel.saturated
         phases = [(p, q) for p in range(channel.step) for q in range(channel.step)]
         left = [_unpredicted(image, lattice, phase, channel.step) for phase in phases]
         found = np.concatenate([one for one in left if one.size] or [np.full(1, np.nan)])
         level = float(np.nanmean(mean[lattice])) if lattice.any() else float("nan")
-        bounds.append(1.4826 * float(np.median(np.abs(found))) * level)
-    return bounds
+        estimates.append(1.4826 * float(np.median(np.abs(found))) * level)
+    return estimates
 
 
 def _mean(channel: Channel) -> FloatImage:
@@ -169,6 +170,9 @@ def _unpredicted(image: FloatImage, lattice: BoolImage, phase: tuple[int, int], 
     patches = patches[np.isfinite(patches).all(axis=1)].astype(np.float64)
     if len(patches) < 100:
         return np.empty(0, dtype=np.float32)
+    # where the samples around differ least, the paint is flat; the sample itself takes no part in the choice
+    spread = np.delete(patches, 12, axis=1).std(axis=1)
+    patches = patches[spread <= np.quantile(spread, max(_FLATTEST, 250 / len(patches)) if len(patches) > 250 else 1)]
     around = np.delete(patches, 12, axis=1)
     system = np.column_stack([around, np.ones(len(around))])
     coefficients = np.linalg.lstsq(system, patches[:, 12], rcond=None)[0]
