@@ -42,8 +42,8 @@ BoolImage = npt.NDArray[np.bool_]
 Frames = tuple[Mosaic | ChannelFrame, ...]
 Prefilter = Literal["none", "binomial", "gaussian"]
 
-CONTRAST_WIDTH = 10.0
-"""Standard deviation (px) of the window in which local contrast is taken."""
+CONTRAST_WIDTH = (10.0, 40.0)
+"""Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
 
 
 def inspect_files(
@@ -156,10 +156,12 @@ def inspect_frame(
     frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
     seen = _Seen.prepare(frames, calibration, region, demosaic, normalise)
     images, index, texture = seen.lights(), None, None
+    channels = seen.channel_facts()
     if isinstance(first := seen.linear[0], LinearMosaic):
         found = separate_reflections(first, seen.crosstalk)
         index, texture = found.reflection_index, found.texture
-    contrast = _local_contrast(images)
+    window = _contrast_window(channels)
+    contrast = _local_contrast(images, window)
     if index is None and len(contrast) > 1:
         index = np.asarray(1 - contrast / np.maximum(contrast.max(axis=0), 1e-6), dtype=np.float32)
     whole, noise = seen.differences(np.random.default_rng(seed))
@@ -185,7 +187,7 @@ def inspect_frame(
     return Inspection(
         name=name,
         kind="bayer" if sampled else ("rgb" if len(seen.linear[0].values) == 3 else "monochrome"),
-        channels=seen.channel_facts(index),
+        channels=channels,
         lights=_light_facts(images, contrast, index, alone, seen.region.mask),
         images=images,
         reflection_index=index,
@@ -320,7 +322,7 @@ class _Seen:
             full_scale=frames[0].full_scale,
         )
 
-    def channel_facts(self, index: FloatImage | None) -> tuple[ChannelFacts, ...]:
+    def channel_facts(self) -> tuple[ChannelFacts, ...]:
         """Figures of the samples of each channel."""
         full_scale, facts = self.linear[0].full_scale, []
         for number, channel in enumerate(self.channels):
@@ -335,23 +337,11 @@ class _Seen:
                     low=float(low),
                     high=float(high),
                     saturated=float(channel.saturated[self.region.mask].sum() / samples.size),
-                    speckle_px=speckle_size(channel, self._mat(index, number), self._known_noise()),
+                    speckle_px=speckle_size(channel, self.region.mask, self.noise if self.noise_known else None),
                     noise_dn=calibrated if self.noise_known else self.estimates[number],
                 )
             )
         return tuple(facts)
-
-    def _known_noise(self) -> NoiseModel | None:
-        return self.noise if self.noise_known else None
-
-    def _mat(self, index: FloatImage | None, channel: int) -> BoolImage:
-        """The region without the reflections of the light that a channel sees best, if enough is left."""
-        if index is None:
-            return self.region.mask
-        rows = len(self.crosstalk.matrix) == len(self.channels) and len(self.linear) == 1
-        light = int(self.crosstalk.matrix[channel].argmax()) if rows else channel
-        mat = self.region.mask & (index[light] < REFLECTING)
-        return mat if mat.sum() > 0.25 * self.region.mask.sum() else self.region.mask
 
 
 def _check_frames(linear: list[LinearMosaic | LinearChannels]) -> None:
@@ -359,7 +349,7 @@ def _check_frames(linear: list[LinearMosaic | LinearChannels]) -> None:
     if len(shapes) > 1:
         raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")
     if len(linear) > 1 and (isinstance(linear[0], LinearMosaic) or len(linear[0].values) > 1):
-        raise InputError(f"{len(linear)} frames are given, which is for lights before a monochrome camera only")
+        raise InputError(f"{len(linear)} frames are for lights in succession before a monochrome camera")
     rows, columns = linear[0].values.shape[-2:]
     if min(rows, columns) < SMALLEST_FRAME:
         raise InputError(
@@ -381,11 +371,17 @@ def _rectangle(region: Sequence[float] | None, shape: tuple[int, ...]) -> Sequen
     return (0, 0, shape[1] - 1, shape[0] - 1) if region is None else region
 
 
-def _local_contrast(images: IlluminationImages) -> FloatImage:
+def _contrast_window(channels: tuple[ChannelFacts, ...]) -> float:
+    """Standard deviation (px) of a window that holds many speckles."""
+    sizes = [one.speckle_px for one in channels if np.isfinite(one.speckle_px)]
+    return float(np.clip(2.5 * np.median(sizes) if sizes else 0.0, *CONTRAST_WIDTH))
+
+
+def _local_contrast(images: IlluminationImages, window: float) -> FloatImage:
     """Local standard deviation over the local mean (k, H, W); 0 where a light is dark or unknown."""
     out = np.zeros_like(images.values)
     for image, target in zip(images.values, out, strict=True):
-        mean, square = local_mean(image, CONTRAST_WIDTH), local_mean(image**2, CONTRAST_WIDTH)
+        mean, square = local_mean(image, window), local_mean(image**2, window)
         lit = np.isfinite(image) & (mean > 0.01 * images.full_scale)
         target[lit] = np.sqrt(np.maximum(square[lit] - mean[lit] ** 2, 0)) / mean[lit]
     return out
@@ -406,7 +402,7 @@ def _light_facts(
     facts = []
     for j, light in enumerate(images.names):
         values, valid = images.values[j][inside], images.valid[j][inside]
-        mean = local_mean(images.values[j], CONTRAST_WIDTH)[inside]
+        mean = local_mean(images.values[j], CONTRAST_WIDTH[0])[inside]
         facts.append(
             LightFacts(
                 name=light,

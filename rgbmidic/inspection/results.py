@@ -195,10 +195,9 @@ class Inspection:
 
     @property
     def speckle_px(self) -> float:
-        """Speckle size: of the common texture where it is known, else the median over the channels; px."""
-        if self.texture is not None and self.texture.correlation >= TOO_FINE:
-            return self.texture.diameter
-        return float(np.nanmedian([one.speckle_px for one in self.channels]))
+        """Speckle size: the median over the channels; px, NaN where there is no texture."""
+        sizes = [one.speckle_px for one in self.channels if np.isfinite(one.speckle_px)]
+        return float(np.median(sizes)) if sizes else float("nan")
 
 
 def findings(seen: Inspection) -> Iterator[Finding]:

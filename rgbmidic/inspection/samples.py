@@ -130,11 +130,11 @@ def _width(distance: Floats, product: Floats, widths: Floats) -> float:
 def noise_estimate(channels: list[Channel], inside: BoolImage) -> list[float]:
     """Standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
 
-    Where its surroundings are flattest, a sample's contrast is predicted from the 24 samples around it, of whatever
-    channel, by linear regression, one for each position in the cell of the mosaic. What is left is the sample's own
-    noise, that of its neighbours through the regression, and texture that they do not tell: fair where paint is flat
-    over five samples, too high for finer speckle and in reflections (docs/inspect.md). Its scale is 1.4826 times the
-    median absolute value.
+    Where its surroundings are bright and flattest, a sample's contrast is predicted from the 24 samples around it, of
+    whatever channel, by linear regression, one for each position in the cell of the mosaic. What is left is the
+    sample's own noise, that of its neighbours through the regression, and texture that they do not tell: fair where
+    paint is flat over five samples, too high for finer speckle and in reflections (docs/inspect.md). Its scale is
+    1.4826 times the median absolute value.
     """
     means = [_mean(channel) for channel in channels]
     if channels[0].step == 1:
@@ -170,9 +170,13 @@ def _unpredicted(image: FloatImage, lattice: BoolImage, phase: tuple[int, int], 
     patches = patches[np.isfinite(patches).all(axis=1)].astype(np.float64)
     if len(patches) < 100:
         return np.empty(0, dtype=np.float32)
-    # where the samples around differ least, the paint is flat; the sample itself takes no part in the choice
-    spread = np.delete(patches, 12, axis=1).std(axis=1)
-    patches = patches[spread <= np.quantile(spread, max(_FLATTEST, 250 / len(patches)) if len(patches) > 250 else 1)]
+    # the sample itself takes no part in the choice; dark places would be flattest, but have less photon noise
+    others = np.delete(patches, 12, axis=1)
+    patches, others = (one[others.mean(axis=1) >= 0] for one in (patches, others))
+    if len(patches) < 100:
+        return np.empty(0, dtype=np.float32)
+    spread = others.std(axis=1)
+    patches = patches[spread <= np.quantile(spread, min(max(_FLATTEST, 250 / len(patches)), 1.0))]
     around = np.delete(patches, 12, axis=1)
     system = np.column_stack([around, np.ones(len(around))])
     coefficients = np.linalg.lstsq(system, patches[:, 12], rcond=None)[0]
