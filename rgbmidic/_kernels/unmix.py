@@ -14,7 +14,7 @@ def unmix(channels, valid, matrix, needed, out, out_valid):
     """``out = matrix @ channels`` at every pixel; invalid, and NaN, where a `needed` channel is invalid.
 
     channels, valid: (C, P); matrix, needed: (k, C); out, out_valid: (k, P). An invalid channel that is not needed
-    contributes nothing.
+    contributes the value it has, NaN nothing.
     """
     lights, colours = matrix.shape
     pixels = channels.shape[1]
@@ -27,8 +27,8 @@ def unmix(channels, valid, matrix, needed, out, out_valid):
             for colour in range(colours):
                 factor, counts = matrix[light, colour], needed[light, colour]
                 for p in range(stop - start):
-                    good = valid[colour, start + p]
-                    values[p] += factor * channels[colour, start + p] if good else np.float32(0.0)
-                    ok[p] &= good or not counts
+                    value = channels[colour, start + p]
+                    values[p] += factor * value if np.isfinite(value) else np.float32(0.0)
+                    ok[p] &= valid[colour, start + p] or not counts
             for p in range(stop - start):
                 values[p] = values[p] if ok[p] else np.float32(np.nan)

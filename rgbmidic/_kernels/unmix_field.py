@@ -11,7 +11,8 @@ def unmix_field(channels, valid, grid, step, needed, out, out_valid):
     """``out = matrix(x, y) @ channels`` with the matrix interpolated linearly between grid points `step` px apart.
 
     channels, valid: (C, H, W); grid: (GY, GX, k, C) at x, y = 0, step, 2 step ... beyond the last pixel; needed:
-    (k, C); out, out_valid: (k, H, W). Invalid where a `needed` channel is; one not needed contributes nothing.
+    (k, C); out, out_valid: (k, H, W). Invalid where a `needed` channel is; one not needed
+    contributes the value it has, NaN nothing.
     """
     colours, height, width = channels.shape
     lights = out.shape[0]
@@ -31,9 +32,9 @@ def unmix_field(channels, valid, grid, step, needed, out, out_valid):
                     above, below = grid[gy, gx + 1, light, colour], grid[gy + 1, gx + 1, light, colour]
                     slope = (above + (below - above) * down - left) / np.float32(step)
                     for x in range(start, stop):
-                        good = valid[colour, y, x]
+                        value = channels[colour, y, x]
                         factor = left + slope * np.float32(x - start)
-                        values[x] += factor * channels[colour, y, x] if good else np.float32(0.0)
-                        ok[x] &= good or not counts
+                        values[x] += factor * value if np.isfinite(value) else np.float32(0.0)
+                        ok[x] &= valid[colour, y, x] or not counts
             for x in range(width):
                 values[x] = values[x] if ok[x] else np.float32(np.nan)

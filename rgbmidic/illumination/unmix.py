@@ -14,9 +14,10 @@ from rgbmidic.illumination.mosaic import LinearChannels
 
 __all__ = ["NEGLIGIBLE", "unmix"]
 
-NEGLIGIBLE = 1e-3
-"""A channel whose coefficient is below this fraction of the light's largest does not make the light invalid: clipped at
-full scale it would change the light by less than a thousandth of full scale."""
+NEGLIGIBLE = 0.25
+"""A clipped channel makes a light invalid only if its coefficient is above this fraction of the light's largest: the
+light's own channel does, a neighbour's crosstalk of some 10 % does not. Two lights of three see on where the third
+saturates; what leaks from beyond full scale is smooth or judged by the residual like the rest of a reflection."""
 
 GRID = 32
 """Largest distance (px) of the points between which a matrix that varies over the field is interpolated."""
@@ -32,7 +33,8 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
     crosstalk
         A, shape (C, k), everywhere the same or varying over the field.
     negligible
-        Coefficients of A^-1 below this fraction of the largest of their row do not make a light invalid.
+        Coefficients of A^-1 below this fraction of the largest of their row do not make a light invalid; a clipped
+        channel then counts with the value it has.
 
     Returns
     -------

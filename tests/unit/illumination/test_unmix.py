@@ -9,7 +9,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.separate import DEMOSAICERS, separate
-from rgbmidic.illumination.unmix import unmix
+from rgbmidic.illumination.unmix import NEGLIGIBLE, unmix
 
 A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 LIGHTS = ("red", "green", "blue")
@@ -37,17 +37,27 @@ def test_unmix_undoes_mix(k, seed, neighbours):
     assert images.valid.all()
 
 
-def test_an_invalid_channel_spoils_the_lights_it_enters_and_no_other():
-    matrix = np.array([[1.0, 0.1, 0], [0.1, 1.0, 0], [0, 0, 1.0]])
+@pytest.mark.parametrize("crosstalk", [0.1, 0.4])
+def test_a_clipped_channel_spoils_the_lights_it_dominates_and_no_other(crosstalk):
+    matrix = np.array([[1.0, crosstalk, 0], [crosstalk, 1.0, 0], [0, 0, 1.0]])
     valid = np.ones((3, 4, 4), bool)
     valid[0, 1, 2] = False
     values = channels_of(np.full((3, 4, 4), 100.0), matrix, valid)
-    values.values[0, 1, 2] = np.nan
     images = unmix(values, Crosstalk(matrix=matrix, lights=LIGHTS))
-    assert images.valid[:, 1, 2].tolist() == [False, False, True]
-    assert np.isnan(images.values[:2, 1, 2]).all()
-    assert images.values[2, 1, 2] == pytest.approx(100)
-    assert images.valid.sum() == 3 * 16 - 2
+    weak = crosstalk < NEGLIGIBLE
+    assert images.valid[:, 1, 2].tolist() == [False, weak, True]
+    assert np.isnan(images.values[~images.valid]).all()
+    np.testing.assert_allclose(images.values[images.valid], 100, rtol=1e-5)
+    assert images.valid.sum() == 3 * 16 - (1 if weak else 2)
+
+
+def test_a_channel_without_any_value_adds_nothing_to_the_lights_that_hardly_need_it():
+    matrix = np.array([[1.0, 0, 0], [0.1, 1.0, 0], [0, 0, 1.0]])
+    values = channels_of(np.full((3, 4, 4), 100.0), matrix, np.ones((3, 4, 4), bool))
+    values.values[0, 1, 2], values.valid[0, 1, 2] = np.nan, False
+    images = unmix(values, Crosstalk(matrix=matrix, lights=LIGHTS))
+    assert images.valid[:, 1, 2].tolist() == [False, True, True]
+    np.testing.assert_allclose(images.values[1:, 1, 2], [110, 100], rtol=1e-5)
 
 
 def test_covariance_predicts_the_scatter_of_unmixed_noise():
