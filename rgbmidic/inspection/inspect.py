@@ -17,7 +17,7 @@ from rgbmidic.config import (
     SolverSettings,
     TestSettings,
 )
-from rgbmidic.correlation import correlate
+from rgbmidic.correlation import Solution, correlate
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import ReflectionAwareDemosaicer
@@ -160,29 +160,21 @@ def inspect_frame(
     if isinstance(first := seen.linear[0], LinearMosaic):
         found = separate_reflections(first, seen.crosstalk)
         index, texture = found.reflection_index, found.texture
-    window = _contrast_window(channels)
-    contrast = _local_contrast(images, window)
+    contrast = _local_contrast(images, _contrast_window(channels))
     if index is None and len(contrast) > 1:
         index = np.asarray(1 - contrast / np.maximum(contrast.max(axis=0), 1e-6), dtype=np.float32)
     whole, noise = seen.differences(np.random.default_rng(seed))
 
-    def predicted(change: FloatImage, light: slice = slice(None)) -> tuple[Floats, Floats, npt.NDArray[np.int32]]:
-        first, second = images.values[light], (images.values + change)[light]
-        solution = correlate(
-            first,
-            second,
-            region=seen.region,
-            element_size=element_size,
-            initial=(0.0, 0.0),
-            prefilter=prefilter,
-            normalise=normalise or None,
-            curvature=True,
-        )
-        return solution.displacement_std, solution.nodes, solution.elements
+    smoothing: dict[str, Any] = {"prefilter": prefilter, "normalise": normalise or None, "curvature": True}
 
-    std, nodes, elements = predicted(whole)
+    def predicted(change: FloatImage, light: slice = slice(None)) -> Solution:
+        pair = images.values[light], (images.values + change)[light]
+        return correlate(*pair, region=seen.region, element_size=element_size, initial=(0.0, 0.0), **smoothing)
+
+    together = predicted(whole)
+    std = together.displacement_std
     many = len(images.names) > 1
-    alone = [predicted(whole, slice(j, j + 1))[0] if many else std for j in range(len(images.names))]
+    alone = [predicted(whole, slice(j, j + 1)).displacement_std if many else std for j in range(len(images.names))]
     sampled = isinstance(first, LinearMosaic)
     return Inspection(
         name=name,
@@ -199,11 +191,11 @@ def inspect_frame(
         noise_known=seen.noise_known,
         crosstalk_known=seen.crosstalk_known,
         element_size=element_size,
-        nodes=nodes,
-        elements=elements,
+        nodes=together.nodes,
+        elements=together.elements,
         std=std,
-        noise_std=predicted(noise)[0] if sampled else std,
-        sampling_std=predicted(whole - noise)[0] if sampled else np.where(np.isnan(std), np.nan, 0.0),
+        noise_std=predicted(noise).displacement_std if sampled else std,
+        sampling_std=predicted(whole - noise).displacement_std if sampled else 0 * std,
         greens=_greens(first) if isinstance(first, LinearMosaic) else 0.0,
     )
 
