@@ -1,7 +1,9 @@
 """What each demosaicing method costs in displacement error, with and without reflections, on scenes with exact truth.
 
-    python benchmarks/demosaicing.py [--seeds 11 12 13] [--paint smooth|sparkling] [--speckle 4.2] [--figure FILE]
-    python benchmarks/demosaicing.py --speckles 3 4.2 6 8 --figure FILE
+    python benchmarks/demosaicing.py [--study main] [--seeds 11 12 13] [--paint smooth|sparkling] [--plates-only]
+    python benchmarks/demosaicing.py --study phases|blur|aberration|coloured
+    python benchmarks/demosaicing.py --speckles 3 4.2 6 8 --plates-only --figure docs/figures/demosaicing.png
+    python benchmarks/demosaicing.py --study speed
 
 Scenes of `rgbmidic.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, crosstalk 10 to 16 % between neighbours, specular
 peak 1.5 times an ideal white. Three lights are solved together with the true crosstalk, TRI3 of 25 px started within
@@ -9,14 +11,17 @@ half a pixel of the truth; errors over the field without its border element. "sp
 large, traced with 3 x 3 rays per pixel, so that a reflection changes erratically from state to state.
 
 The 3-CCD camera is the ideal: all three colours at every pixel, the same solve. One sample instead of three costs a
-factor of sqrt(3) in noise; what is above that is the demosaicing's doing.
+factor of sqrt(3) in noise; what is above that is the demosaicing's doing. The studies vary one thing at a time: the
+Bayer phase, the lens blur, the lens's lateral colour aberration (calibrated, and undone after the separation), and a
+specimen whose colours show partly or wholly different textures.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,9 +31,11 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
 from rgbmidic.correlation import correlate
+from rgbmidic.illumination.align import align
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, linearise
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.registration import Registration
+from rgbmidic.illumination.separate import separate, separate_reflections
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.illumination.weights import threshold_weights
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -40,17 +47,25 @@ TILT = (float(-np.degrees(0.15)), 0.0)
 """The plate leans towards green's lamp."""
 MASKED_ABOVE = 0.4
 """Blurred grey level, as a share of the full scale, above which the paper's masks exclude a light."""
+ABERRATION = (-2e-4, 0.0, 3e-4)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A pair of states."""
+    """A pair of states. `coloured` is the share of each light's contrast that no other light shows."""
 
     name: str
     scene: Callable[..., Scene]
     state: State
     size: int
     is_plate: bool = True
+    options: dict[str, Any] = field(default_factory=dict)
+    coloured: float = 0.0
+
+    def called(self, name: str, **changes: Any) -> Case:
+        """The same with other options of the scene (or `coloured`) and something added to its name."""
+        coloured = changes.pop("coloured", self.coloured)
+        return replace(self, name=f"{self.name}, {name}", options=self.options | changes, coloured=coloured)
 
 
 def _glaring(**options: Any) -> Scene:
@@ -61,11 +76,19 @@ def _mat(**options: Any) -> Scene:
     return plate_scene(tilt_deg=TILT, **options)
 
 
-CASES = [
-    Case("plate in green's reflection", _glaring, strained_plate(), 512),
-    *(Case(f"sphere {a:g}°", sphere_scene, turned(a), 640, is_plate=False) for a in (0.33, 1, 2, 4, 8)),
-    Case("plate without reflection", _mat, strained_plate(), 512),
-]
+GLARING = Case("plate in green's reflection", _glaring, strained_plate(), 512)
+MAT = Case("plate without reflection", _mat, strained_plate(), 512)
+SPHERES = [Case(f"sphere {a:g}°", sphere_scene, turned(a), 640, is_plate=False) for a in (0.33, 1, 2, 4, 8)]
+BASE = [GLARING, SPHERES[1], SPHERES[3], MAT]
+STUDIES = {
+    "main": [GLARING, *SPHERES, MAT],
+    "phases": [case.called(cfa, cfa=cfa) for case in BASE for cfa in ("RGGB", "BGGR", "GRBG", "GBRG")],
+    "blur": [case.called(f"blur {blur:g}", lens_blur=blur) for case in BASE for blur in (0.3, 0.45, 0.6, 0.8)],
+    "aberration": [case.called("aberration", aberration=ABERRATION) for case in [GLARING, *SPHERES, MAT]],
+    "coloured": [
+        case.called(f"{share:.0%} coloured", coloured=share) for case in (MAT, GLARING) for share in (0.1, 0.3, 0.6, 1)
+    ],
+}
 
 
 @dataclass(frozen=True)
@@ -102,24 +125,28 @@ CONTENDERS = [
 
 @dataclass(frozen=True)
 class Error:
-    """Displacement error over the field, px."""
+    """Displacement error over the field, px, and of the lights' images, as a share of their mean."""
 
     bias: tuple[float, float]
     scatter: float
     rms: float
     unmeasured: float
+    image: float
 
     @classmethod
     def mean(cls, errors: list[Error]) -> Error:
         """Over several seeds: biases averaged, the rest as root mean square."""
         x, y = np.mean([error.bias for error in errors], axis=0)
-        scatter, rms = np.sqrt(np.mean([(e.scatter**2, e.rms**2) for e in errors], axis=0))
-        return cls((float(x), float(y)), float(scatter), float(rms), max(e.unmeasured for e in errors))
+        scatter, rms, image = np.sqrt(np.mean([(e.scatter**2, e.rms**2, e.image**2) for e in errors], axis=0))
+        missing = max(e.unmeasured for e in errors)
+        return cls((float(x), float(y)), float(scatter), float(rms), missing, float(image))
 
-    def text(self, is_plate: bool) -> str:
+    def text(self, case: Case) -> str:
         """As in the table: bias x/y, scatter for plates, rms for spheres."""
         flag = "" if self.unmeasured < 0.001 else f" ({self.unmeasured:.1%} not measured)"
-        if is_plate:
+        if case.coloured:
+            flag += f"; image {self.image:.1%}"
+        if case.is_plate:
             return f"{self.bias[0]:+.4f}/{self.bias[1]:+.4f}, {self.scatter:.4f}{flag}"
         return f"{self.rms:.4f}{flag}"
 
@@ -134,22 +161,51 @@ def painted(scene: Scene, paint: str) -> Scene:
     )
 
 
+def seen_in_colours(scene: Scene, state: State | None, share: float) -> Any:
+    """The lights' images; a `share` of each light's variance comes from a spray of its own."""
+    images = render(scene, state)
+    if share == 0:
+        return images
+    for light in range(len(images)):
+        own = replace(scene, surface=replace(scene.surface, seed=scene.surface.seed + 1000 * (light + 1)))
+        other = render(own, state)[light]
+        mean = float(images[light].mean())
+        images[light] = mean + (1 - share) ** 0.5 * (images[light] - mean) + share**0.5 * (other - mean)
+    return np.maximum(images, 0)
+
+
 @cache
-def rendered(index: int, paint: str, seed: int, speckle: float) -> tuple[Scene, Any, Any, Array]:
+def rendered(study: str, index: int, paint: str, seed: int, speckle: float) -> tuple[Scene, Any, Any, Array]:
     """Scene, lights in both states without noise, and truth (2, H, W); rendered once for all contenders."""
-    case = CASES[index]
-    scene = painted(case.scene(size=case.size, seed=seed, droplet=speckle * PIXEL), paint)
-    return scene, render(scene), render(scene, case.state), truth(scene, case.state)
+    case = STUDIES[study][index]
+    scene = painted(case.scene(size=case.size, seed=seed, droplet=speckle * PIXEL, **case.options), paint)
+    images = [seen_in_colours(scene, state, case.coloured) for state in (None, case.state)]
+    # the first light's pixels are the frame of reference
+    zoom = 1 + scene.lights[0].magnification
+    (x, y), (rows, columns) = scene.camera.centre, scene.camera.shape
+    pixels = np.meshgrid((np.arange(columns) - x) / zoom + x, (np.arange(rows) - y) / zoom + y)
+    return scene, images[0], images[1], zoom * truth(scene, case.state, pixels=(pixels[0], pixels[1]))
 
 
-def measured(index: int, contender: Contender, *, paint: str, seed: int, speckle: float) -> Error:
+def registered(images: IlluminationImages, scene: Scene) -> IlluminationImages:
+    """The lights aligned as a perfect calibration would."""
+    zoom = np.array([1 + light.magnification for light in scene.lights])
+    identity = Registration.identity(images.names, images.shape)
+    parameters = identity.parameters.copy()
+    parameters[:, 3] = zoom / zoom[0] - 1
+    return align(images, replace(identity, parameters=parameters))
+
+
+def measured(study: str, index: int, contender: Contender, *, paint: str, seed: int, speckle: float) -> Error:
     """Error of one contender on one case."""
-    scene, first, second, exact = rendered(index, paint, seed, speckle)
+    scene, first, second, exact = rendered(study, index, paint, seed, speckle)
     camera = replace(scene.camera, kind="rgb" if contender.method == "3-CCD" else "bayer")
     seen = replace(scene, camera=camera)
     frames = [record(i, camera, seen.lights, seed=1000 * seed + n) for n, i in enumerate((first, second))]
-    reference, deformed = (contender.lights(frame, seen) for frame in frames)
-    size = CASES[index].size
+    found = [contender.lights(frame, seen) for frame in frames]
+    image = (found[0].values - first)[:, 16:-16, 16:-16] / first.mean(axis=(1, 2), keepdims=True)
+    reference, deformed = (registered(images, scene) for images in found)
+    size = STUDIES[study][index].size
     margin = (size - 1 - (size - 17) // 25 * 25) // 2
     far = margin + (size - 17) // 25 * 25
     region = Region.from_rectangle((margin, margin, far, far), (size, size))
@@ -167,7 +223,8 @@ def measured(index: int, contender: Contender, *, paint: str, seed: int, speckle
         normalise=contender.normalise,
         statistics=not contender.masks,
     )
-    return field_error(solution.nodes, solution.elements, solution.displacement, exact, (margin + 25, far - 25))
+    error = field_error(solution.nodes, solution.elements, solution.displacement, exact, (margin + 25, far - 25))
+    return replace(error, image=float(np.sqrt(np.nanmean(image**2))))
 
 
 def field_error(nodes: Array, elements: Any, displacement: Array, exact: Array, inside: tuple[int, int]) -> Error:
@@ -184,26 +241,58 @@ def field_error(nodes: Array, elements: Any, displacement: Array, exact: Array, 
     bias = np.nanmean(error, axis=0)
     missing = float(np.isnan(error).any(axis=1).mean())
     scatter, rms = np.sqrt(np.nanmean((error - bias) ** 2)), np.sqrt(np.nanmean(error**2))
-    return Error((float(bias[0]), float(bias[1])), float(scatter), float(rms), missing)
+    return Error((float(bias[0]), float(bias[1])), float(scatter), float(rms), missing, 0.0)
 
 
-def table(paint: str, seeds: list[int], speckle: float, contenders: list[Contender]) -> list[list[Error]]:
-    """Print the table of one paint and speckle; errors by case and contender."""
-    print(f"\n{paint} paint, speckle {speckle:g} px, seeds {seeds}\n")
+def table(study: str, paint: str, seeds: list[int], speckle: float, contenders: list[Contender]) -> list[list[Error]]:
+    """Print the table of one study, paint and speckle; errors by case and contender."""
+    print(f"\n{study}: {paint} paint, speckle {speckle:g} px, seeds {seeds}\n")
     print("| scene | " + " | ".join(c.name for c in contenders) + " | 3-CCD × √3 |")
     print("|---" * (len(contenders) + 2) + "|")
     rows = []
-    for index, case in enumerate(CASES):
+    for index, case in enumerate(STUDIES[study]):
         row = [
-            Error.mean([measured(index, c, paint=paint, seed=seed, speckle=speckle) for seed in seeds])
+            Error.mean([measured(study, index, c, paint=paint, seed=seed, speckle=speckle) for seed in seeds])
             for c in contenders
         ]
         ideal = row[-1].scatter if case.is_plate else row[-1].rms
-        cells = [error.text(case.is_plate) for error in row]
+        cells = [error.text(case) for error in row]
         print(f"| {case.name} | " + " | ".join(cells) + f" | {ideal * 3**0.5:.4f} |", flush=True)
         rows.append(row)
         rendered.cache_clear()
     return rows
+
+
+def speed(sizes: tuple[int, ...] = (1024, 2048), repeats: int = 5) -> None:
+    """Print the time per pixel from a linearised frame to the lights (least of several runs)."""
+    import numba
+
+    patch = plate_scene(size=512, seed=3)
+    frame = record(render(patch), patch.camera, patch.lights, seed=0)
+    small = linearise(frame, patch.camera.noise)
+    assert isinstance(small, LinearMosaic)
+    crosstalk = patch.camera.true_crosstalk(patch.lights)
+    texture = separate_reflections(small, crosstalk).texture
+    ways: dict[str, Callable[[LinearMosaic], Any]] = {
+        "reflection-aware, texture given": lambda mosaic: separate(mosaic, crosstalk, texture=texture),
+        "reflection-aware, texture learnt": lambda mosaic: separate(mosaic, crosstalk),
+        "Malvar": lambda mosaic: separate(mosaic, crosstalk, "malvar"),
+    }
+    print(f"\nns per pixel, {numba.get_num_threads()} threads\n")
+    print("| size | " + " | ".join(ways) + " |\n" + "|---" * (len(ways) + 1) + "|")
+    for size in sizes:
+        copies = (size // 512, size // 512)
+        mosaic = replace(small, values=np.tile(small.values, copies), saturated=np.tile(small.saturated, copies))
+        best = []
+        for way in ways.values():
+            way(mosaic)
+            runs = []
+            for _ in range(repeats):
+                start = time.perf_counter()
+                way(mosaic)
+                runs.append(time.perf_counter() - start)
+            best.append(min(runs) / size**2 * 1e9)
+        print(f"| {size} | " + " | ".join(f"{ns:.0f}" for ns in best) + " |", flush=True)
 
 
 def figure(path: Path, results: dict[float, list[list[Error]]], contenders: list[Contender]) -> None:
@@ -214,8 +303,8 @@ def figure(path: Path, results: dict[float, list[list[Error]]], contenders: list
     import matplotlib.pyplot as plt
 
     sizes = sorted(results)
-    panels = [(len(CASES) - 1, "without reflection"), (0, "in green's reflection")]
-    fig, axes = plt.subplots(2, 2, figsize=(10, 7), sharex=True, sharey="row", layout="constrained")
+    panels = [(-1, "without reflection"), (0, "in green's reflection")]
+    fig, axes = plt.subplots(2, 2, figsize=(9, 6.5), sharex=True, sharey="row", layout="constrained")
     for column, (index, title) in enumerate(panels):
         for n, contender in enumerate(contenders):
             errors = [results[size][index][n] for size in sizes]
@@ -232,23 +321,31 @@ def figure(path: Path, results: dict[float, list[list[Error]]], contenders: list
         axis.set_yscale("log")
         axis.grid(alpha=0.3)
     axes[0, 1].legend(fontsize=7)
-    fig.savefig(path, dpi=130)
+    fig.savefig(path, dpi=110)
 
 
 def main() -> None:
     """Read the command line, print the tables, write the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--study", choices=(*STUDIES, "speed"), default="main")
     parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12, 13])
     parser.add_argument("--paint", choices=("smooth", "sparkling"), default="smooth")
     parser.add_argument("--speckles", type=float, nargs="+", default=[4.2])
     parser.add_argument("--plates-only", action="store_true", help="leave the spheres out")
+    parser.add_argument("--methods", nargs="+", help="of DEMOSAICERS; the ideal 3-CCD is always there")
     parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
+    if arguments.study == "speed":
+        speed()
+        return
     if arguments.plates_only:
-        CASES[:] = [case for case in CASES if case.is_plate]
-    results = {size: table(arguments.paint, arguments.seeds, size, CONTENDERS) for size in arguments.speckles}
+        STUDIES[arguments.study] = [case for case in STUDIES[arguments.study] if case.is_plate]
+    chosen = [c for c in CONTENDERS if not arguments.methods or c.method in (*arguments.methods, "3-CCD")]
+    results = {
+        size: table(arguments.study, arguments.paint, arguments.seeds, size, chosen) for size in arguments.speckles
+    }
     if arguments.figure:
-        figure(arguments.figure, results, CONTENDERS)
+        figure(arguments.figure, results, chosen)
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def cell_moments(contrast, cfa, block):
     weight = {-2: 1, -1: 5, 0: 10, 1: 10, 2: 5, 3: 1}
     red_row = 0 if 0 in channels[0] else 1
     shape = (-(-rows // block), -(-columns // block))
-    sums, counts = np.zeros((6, *shape)), np.zeros(shape)
+    sums, counts = np.zeros((7, *shape)), np.zeros(shape)
     for i in range(2, rows - 3, 2):
         for j in range(2, columns - 3, 2):
             planes = np.zeros(4)
@@ -65,7 +65,8 @@ def cell_moments(contrast, cfa, block):
                 continue
             r, g1, g2, b = planes
             g = (g1 + g2) / 2
-            sums[:, i // block, j // block] += [r * r, (g1 * g1 + g2 * g2) / 2, b * b, r * g, r * b, g * b]
+            own, greens = [r * r, (g1 * g1 + g2 * g2) / 2, b * b], g1 * g2
+            sums[:, i // block, j // block] += [*own, r * g, r * b, g * b, greens]
             counts[i // block, j // block] += 1
     return sums, counts
 

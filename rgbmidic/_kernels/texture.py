@@ -107,8 +107,9 @@ def cell_moments(contrast, red_row, red_column, block, sums, counts):
 
     At the middle of each 2x2 cell the binomial [1 5 10 10 5 1] along both axes takes from each of the planes red, green
     in red rows, green in blue rows and blue its own share, with the same weight and the same centroid. `sums`
-    (6, h, w) float64 receives red², green², blue², red green, red blue, green blue, the greens averaged after
-    multiplying; `counts` (h, w) the cells; a cell with a sample that is not finite in reach is left out.
+    (7, h, w) float64 receives red², green², blue², red green, red blue, green blue, the greens averaged after
+    multiplying, and the product of the two greens; `counts` (h, w) the cells; a cell with a sample that is not finite
+    in reach is left out.
     """
     rows, columns = contrast.shape
     half = block // 2
@@ -149,6 +150,7 @@ def cell_moments(contrast, red_row, red_column, block, sums, counts):
                     sums[3, bi, bj] += r * g
                     sums[4, bi, bj] += r * b
                     sums[5, bi, bj] += g * b
+                    sums[6, bi, bj] += g1 * g2
                     counts[bi, bj] += 1.0
 
 

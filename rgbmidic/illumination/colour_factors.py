@@ -62,6 +62,8 @@ class Moments:
     own, shared : (3, h, w) float64
         Local moments of the low-passed planes on a grid of `BLOCK` px: red², green², blue² without camera noise, and
         red green, red blue, green blue.
+    greens : (h, w) float64
+        Shared moment of the two green planes: what a colour that agrees with itself shows of the coarse lattice.
     noise : (3, h, w) float64
         Variance of the camera noise of one sample of each channel (DN²).
     red : (int, int)
@@ -72,6 +74,7 @@ class Moments:
     contrast: FloatImage
     own: Floats
     shared: Floats
+    greens: Floats
     noise: Floats
     red: tuple[int, int]
 
@@ -121,7 +124,7 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     contrast = np.empty_like(values)
     kernels.subtract_mean(values, mean, *red, MEAN_BLOCK, contrast)
     height, width = (-(-side // BLOCK) for side in values.shape)
-    sums, counts = np.empty((6, height, width)), np.empty((height, width))
+    sums, counts = np.empty((7, height, width)), np.empty((height, width))
     kernels.cell_moments(contrast, *red, BLOCK, sums, counts)
     # the binomial weights of a plane sum to 256 in the kernel
     moments = _smooth(sums / 256**2, counts, MOMENT_WIDTH / BLOCK)
@@ -130,7 +133,8 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     # where nothing is seen but noise, a third of it stands for the contrast that there may be
     floor = np.maximum(variance * (WHITE_ENERGY / 3), 1e-6 * moments[:3].max() + 1e-12)
     own = np.maximum(moments[:3] - variance * WHITE_ENERGY, floor)
-    return Moments(mean=mean, contrast=contrast, own=own, shared=moments[3:], noise=variance, red=red)
+    shared, greens = moments[3:6], moments[6]
+    return Moments(mean=mean, contrast=contrast, own=own, shared=shared, greens=greens, noise=variance, red=red)
 
 
 def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
@@ -162,8 +166,10 @@ def learn_texture(moments: Moments, *, samples: int = 80_000) -> TextureModel:
     root = np.sqrt(moments.own)
     padded = scaled(moments, (1 / root).astype(np.float32), pad=0)
     local = np.stack([moments.shared[n] / (root[a] * root[b]) for n, (a, b) in enumerate(_PAIRS)])
-    # red and blue, diagonal neighbours, lack about twice as much; the best pair of each place is free of reflections
-    lacking = np.min([1 - local[0], (1 - local[1]) / DIAGONAL_LACK, 1 - local[2]], axis=0)
+    # red and blue, diagonal neighbours as the two greens, lack about twice as much; the best pair of each place is free
+    # of reflections, and of the specimen's colour where it is the greens
+    greens = moments.greens / moments.own[1]
+    lacking = np.min([1 - local[0], (1 - local[1]) / DIAGONAL_LACK, 1 - local[2], (1 - greens) / DIAGONAL_LACK], axis=0)
     sums, counts = np.zeros((len(LAGS), 6)), np.zeros((len(LAGS), 6))
     step = max(1, padded.size // samples)
     kernels.lag_products(padded, *moments.red, LAGS, step, sums, counts)
@@ -179,7 +185,7 @@ def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None =
     return out
 
 
-def colour_factors(moments: Moments, band: BandEnergy, crosstalk: Floats) -> ColourFactors:
+def colour_factors(moments: Moments, band: BandEnergy, crosstalk: Floats, *, coloured: float = 0.0) -> ColourFactors:
     """Slopes of the channels on the common texture and what is private to each.
 
     Parameters
@@ -190,10 +196,13 @@ def colour_factors(moments: Moments, band: BandEnergy, crosstalk: Floats) -> Col
         What the planes show of the texture (`TextureModel.band`).
     crosstalk : (3, k)
         A in channels = A . lights: one light's sparkle is seen by all channels, which is taken out of their moments.
+    coloured
+        `TextureModel.private`: 1 for a specimen on which no colour shows the common texture alone.
     """
     energy = np.array([band.adjacent, band.diagonal, band.adjacent])[:, None, None]
     own = moments.own / band.own
     sparkle = np.zeros_like(own)
+    allowed = ALIASING * (1 - coloured)
     for _ in range(2):  # the correction is small and settles at once
         leaked = np.stack([_crossed(crosstalk, sparkle, a, b) for a, b in _PAIRS])
         red_green, red_blue, green_blue = np.maximum((moments.shared - leaked) / energy, 1e-4 * own.min(axis=0))
@@ -204,7 +213,7 @@ def colour_factors(moments: Moments, band: BandEnergy, crosstalk: Floats) -> Col
         excess = own / square
         least = excess.min(axis=0)
         # at least one channel is free of reflections at each place, unless it shows too much of its own for that
-        private = excess - least + np.maximum(least - 1 - ALIASING, 0)
+        private = excess - least + np.maximum(least - 1 - allowed, 0)
         sparkle = private * square * band.own
     variance = np.maximum(private * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
     return ColourFactors(slope=np.sqrt(square), private=variance, noise=moments.noise / square)

@@ -30,6 +30,8 @@ NARROWEST = 0.6
 """Standard deviation (px) of the narrowest Gaussian: what a square pixel lets through."""
 OFFSET_PENALTY = 0.05
 """Least-squares error (of products) that an offset of 1 costs; the true one is -0.02 to -0.15."""
+INDISTINCT = 0.02
+"""Share of its own in a colour's variance under which products do not tell whether it is coarse."""
 USUAL_AGREEMENT = 0.985
 """Agreement of neighbouring planes for a speckle of about 4 px."""
 WIDTHS: Floats = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
@@ -229,7 +231,6 @@ def _private_share(model: TextureModel, sums: Floats, counts: Floats, correlatio
     band = model.band
     measured = (sums[two, :3].sum(axis=0) / counts[two, :3].sum(axis=0)).mean()
     common = np.clip(correlations / (np.array([band.adjacent, band.diagonal, band.adjacent]) / band.own), 0, 1).mean()
-    if common > AGREEING:
-        return 0.0
-    coarse = float(model(2.0)) / band.own
-    return float(np.clip((measured - common * coarse) / ((1 - common) * max(coarse, 1e-3)), 0, 1))
+    # how much of the colours' own share is still seen two pixels away, shrunk to 0 where that share is nearly nothing
+    coarse = measured / max(float(model(2.0)) / band.own, 1e-3) - common
+    return float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + INDISTINCT**2), 0, 1))

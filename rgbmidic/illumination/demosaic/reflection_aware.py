@@ -111,7 +111,7 @@ class ReflectionAwareDemosaicer:
         moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise)
         texture = learn_texture(moments) if self.texture is None else self.texture
         matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
-        factors = colour_factors(moments, texture.band, matrix)
+        factors = colour_factors(moments, texture.band, matrix, coloured=texture.private)
         table = _filters(factors, texture, mosaic.cfa)
         out, unknown = _predict(moments, factors, table, damaged=damaged)
         valid = _validity(saturated, unknown, mosaic.cfa) if damaged else np.ones(out.shape, dtype=bool)

@@ -51,7 +51,7 @@ def test_texture_is_learnt_through_crosstalk_noise_and_mosaic(albedo, mat):
     assert texture(0) == pytest.approx(1)
     for distance in (1, 2):
         assert texture(distance) == pytest.approx(autocorrelation(albedo, distance), abs=0.04)
-    assert texture.private == 0
+    assert texture.private < 0.1
 
 
 def test_texture_is_the_same_with_and_without_reflection(mat, glaring):

@@ -45,7 +45,7 @@ def test_sums_means_and_scaling(cfa, shape):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_moments_of_the_planes(cfa, shape):
     values = make_contrast(shape, unknown=0.005)
-    sums = np.empty((6, *(-(-n // 8) for n in shape)))
+    sums = np.empty((7, *(-(-n // 8) for n in shape)))
     counts = np.empty(sums.shape[1:])
     texture.cell_moments(values, *red_position(cfa), 8, sums, counts)
     expected = naive_texture.cell_moments(values, cfa, 8)
