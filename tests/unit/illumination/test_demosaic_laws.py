@@ -1,0 +1,204 @@
+"""Laws of the demosaicing methods: symmetry, no leak between colours, gains, unknown samples, flat frames."""
+
+import warnings
+from dataclasses import replace
+
+import colour_scenes as scenes
+import cv2
+import numpy as np
+import pytest
+from naive_demosaic import site_channels
+
+from rgbmidic.illumination.demosaic import (
+    BandLimitedDemosaicer,
+    BilinearDemosaicer,
+    MalvarDemosaicer,
+    MenonDemosaicer,
+    ReflectionAwareDemosaicer,
+)
+from rgbmidic.illumination.mosaic import BAYER_PATTERNS, LinearMosaic, shift_cfa
+from rgbmidic.illumination.separate import DEMOSAICERS, separate, separate_reflections
+from rgbmidic.illumination.texture import TextureModel
+
+SHAPE = (128, 144)
+TEXTURE = TextureModel.of_speckle(4.2)
+INSIDE = np.s_[:, 24:-24, 24:-24]
+
+
+def plain_mosaic(channels, cfa="RGGB"):
+    """The noise-free mosaic of full channels (3, H, W)."""
+    site = site_channels(channels.shape[1:], cfa)
+    values = np.take_along_axis(channels, site[None], axis=0)[0].astype(np.float32)
+    return LinearMosaic(values=values, saturated=np.zeros(values.shape, bool), cfa=cfa, full_scale=4000.0)
+
+
+@pytest.fixture(scope="module")
+def lights():
+    """A common texture, a reflection over the green light."""
+    albedo = scenes.speckle(SHAPE)
+    found = np.array([1500, 2000, 1100])[:, None, None] * albedo
+    found[1] += scenes.sparkle(SHAPE, 900, 5)
+    return found
+
+
+def wave(phase, shape=(64, 70), kx=0.7, ky=0.4):
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return 500 + 100 * np.cos(kx * columns + ky * rows + phase)
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+def test_band_limited_recovers_a_wave_of_its_band(cfa):
+    channels = np.stack([wave(0), wave(1.0, kx=1.0, ky=0.6), wave(2.0)])
+    found = BandLimitedDemosaicer()(plain_mosaic(channels, cfa)).values
+    error = np.abs(found - channels)[INSIDE].max(axis=(1, 2))
+    assert (error < 2.5).all(), error  # of an amplitude of 100
+
+
+@pytest.mark.parametrize("method", [BandLimitedDemosaicer(), BilinearDemosaicer()])
+@pytest.mark.parametrize("colour", [0, 1, 2])
+def test_one_colours_samples_leave_the_others_as_they_are(method, colour):
+    channels = np.stack([wave(0), wave(1), wave(2)])
+    changed = channels.copy()
+    changed[colour] = np.random.default_rng(1).uniform(0, 2000, changed[colour].shape)
+    before, after = (method(plain_mosaic(one, "GRBG")).values for one in (channels, changed))
+    others = [c for c in range(3) if c != colour]
+    np.testing.assert_array_equal(after[others], before[others])
+    assert np.abs(after[colour] - before[colour]).max() > 100
+
+
+@pytest.mark.parametrize("flip", [(slice(None, None, -1), slice(None)), (slice(None), slice(None, None, -1))])
+@pytest.mark.parametrize(
+    "method", [BilinearDemosaicer(), MalvarDemosaicer(), BandLimitedDemosaicer(), ReflectionAwareDemosaicer()]
+)
+def test_a_flipped_frame_gives_flipped_channels(method, flip, lights):
+    mosaic = scenes.mosaic_of(lights, cfa="RGGB")
+    # sizes are even, so a flip exchanges the rows or columns of the cell
+    cfa = shift_cfa("RGGB", int(flip[0].step == -1), int(flip[1].step == -1))
+    flipped = replace(mosaic, values=mosaic.values[flip].copy(), saturated=mosaic.saturated[flip].copy(), cfa=cfa)
+    expected = method(mosaic).values[(slice(None), *flip)]
+    # the reflection-aware texture is read from one half plane of distances: rounding of a fit, not of a sum
+    np.testing.assert_allclose(method(flipped).values[INSIDE], expected[INSIDE], atol=0.5, rtol=1e-3)
+
+
+def test_a_frame_cropped_by_one_row_and_column_gives_the_same_channels(lights):
+    mosaic = scenes.mosaic_of(lights)
+    cropped = replace(mosaic, values=mosaic.values[1:, 1:], saturated=mosaic.saturated[1:, 1:], cfa="BGGR")
+    method = ReflectionAwareDemosaicer(texture=TEXTURE)
+    whole, part = method(mosaic).values[:, 1:, 1:], method(cropped).values
+    # tiles and blocks lie elsewhere, so trust is rounded differently: small against the contrast
+    difference = np.sqrt(np.mean((whole - part)[INSIDE] ** 2, axis=(1, 2)))
+    assert (difference < 0.06 * whole[INSIDE].std(axis=(1, 2))).all()
+
+
+@pytest.mark.parametrize("colour", [0, 1, 2])
+def test_a_channels_gain_changes_that_channel_alone(colour, lights):
+    mosaic = scenes.mosaic_of(lights, noise=None)
+    gain = np.where(site_channels(SHAPE, "RGGB") == colour, np.float32(2), np.float32(1))
+    louder = replace(mosaic, values=mosaic.values * gain)
+    method = ReflectionAwareDemosaicer(texture=TEXTURE)
+    before, after = method(mosaic).values, method(louder).values
+    expected = before * np.where(np.arange(3) == colour, 2, 1)[:, None, None]
+    np.testing.assert_allclose(after[INSIDE], expected[INSIDE], rtol=2e-3, atol=1)
+
+
+def test_own_samples_are_nearly_kept(lights):
+    mosaic = scenes.mosaic_of(lights)
+    found = ReflectionAwareDemosaicer(crosstalk=scenes.CROSSTALK)(mosaic).values
+    own = np.take_along_axis(found, site_channels(SHAPE, "RGGB")[None], axis=0)[0]
+    moved = (own - mosaic.values)[16:-16, 16:-16]
+    # what is taken off is camera noise, whose standard deviation is 13 to 25 DN here
+    assert np.sqrt(np.mean(moved**2)) < 15
+
+
+def test_a_flat_reflection_on_one_colour_leaves_the_others_unchanged(lights):
+    albedo = scenes.speckle(SHAPE)
+    mat = np.array([1500, 1200, 1100])[:, None, None] * albedo
+    flat = mat + np.array([0, 900, 0])[:, None, None]
+    before, after = (
+        separate(scenes.mosaic_of(one, noise=None), scenes.CROSSTALK, texture=TEXTURE).values for one in (mat, flat)
+    )
+    change = (after - before)[INSIDE]
+    assert np.abs(change[[0, 2]]).max() < 2
+    np.testing.assert_allclose(change[1], 900, atol=5)
+
+
+def test_dead_pixels_are_missing_data_and_hurt_nobody_else(lights):
+    clean = scenes.mosaic_of(lights)
+    rng = np.random.default_rng(3)
+    dead = rng.random(SHAPE) < 0.01
+    broken = replace(clean, values=np.where(dead, np.float32(4000), clean.values), saturated=clean.saturated | dead)
+    good, found = (separate(one, scenes.CROSSTALK, texture=TEXTURE) for one in (clean, broken))
+    near = cv2.dilate(dead.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    # farther off only the trust in a tile may be rounded differently: below the camera noise of 13 to 25 DN
+    assert np.sqrt(np.mean((found.values - good.values)[:, ~near] ** 2)) < 8
+    error = scenes.error(found, lights)
+    assert (error < 1.25 * scenes.error(good, lights)).all()
+    assert found.valid.mean() > 0.9
+
+
+def difficult_frames():
+    """Lights (3, H, W) that hold little or no texture."""
+    speckled = 1500 * np.stack([scenes.speckle(SHAPE)] * 3)
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    middle = (abs(rows - 64) < 40) & (abs(columns - 72) < 40)
+    return {
+        "uniform": np.full((3, *SHAPE), 800.0),
+        "black": np.zeros((3, *SHAPE)),
+        "all saturated": np.full((3, *SHAPE), 9000.0),
+        "black border": speckled * middle,
+        "half dark": speckled * (columns > 72),
+        "half saturated": speckled + 9000 * (columns > 72),
+        "no blue light": speckled * np.array([1, 1, 0])[:, None, None],
+        "one light alone": speckled * np.array([0, 1, 0])[:, None, None],
+        "a bright edge": 100 + 2000.0 * np.stack([columns > 71] * 3),
+    }
+
+
+@pytest.mark.parametrize("noisy", [True, False])
+@pytest.mark.parametrize("name", difficult_frames())
+def test_difficult_frames_give_numbers_or_unknown_without_a_warning(name, noisy):
+    lights = difficult_frames()[name]
+    mosaic = scenes.mosaic_of(lights, noise=scenes.NOISE if noisy else None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = separate_reflections(mosaic, scenes.CROSSTALK)
+    assert np.isfinite(found.images.values[found.images.valid]).all()
+    assert np.isfinite(found.reflection_index).all()
+    assert np.isfinite(found.variance).all()
+    sound = found.images.valid & (lights.sum(axis=0) < 3500)
+    if sound.any():
+        # Malvar rings at edges too; nothing may run away
+        assert np.abs((found.images.values - lights)[sound]).max() < 1500
+
+
+@pytest.mark.parametrize("name", DEMOSAICERS)
+def test_a_zero_channel_breaks_no_method(name):
+    mosaic = scenes.mosaic_of(difficult_frames()["no blue light"])
+    mosaic = replace(mosaic, values=np.where(site_channels(SHAPE, "RGGB") == 2, 0, mosaic.values).astype(np.float32))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        images = separate(mosaic, scenes.CROSSTALK, name)
+    assert np.isfinite(images.values[images.valid]).all()
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 1.0])
+def test_a_partly_coloured_specimen_is_no_worse_than_colour_by_colour(share):
+    base, *own = (scenes.speckle(SHAPE, seed=seed) for seed in (1, 2, 3, 4))
+    lights = [base.mean() + (1 - share) ** 0.5 * (base - base.mean()) + share**0.5 * (o - o.mean()) for o in own]
+    lights = 1500 * np.maximum(lights, 0)
+    mosaic = scenes.mosaic_of(lights)
+    ours = scenes.error(separate(mosaic, scenes.CROSSTALK), lights)
+    for other in ("band-limited", "malvar", "menon"):
+        usual = scenes.error(separate(mosaic, scenes.CROSSTALK, other), lights)
+        assert (ours < 1.05 * usual).all(), (other, ours, usual)
+
+
+@pytest.mark.parametrize("method", [MenonDemosaicer(), MalvarDemosaicer()])
+def test_usual_methods_leak_what_ours_does_not(method, lights):
+    mosaic = scenes.mosaic_of(lights)
+    truth = np.tensordot(scenes.A, lights, axes=1)
+    ours, usual = (
+        np.abs(m(mosaic).values - truth)[INSIDE].mean(axis=(1, 2))
+        for m in (ReflectionAwareDemosaicer(crosstalk=scenes.CROSSTALK), method)
+    )
+    assert (ours[[0, 2]] < 0.6 * usual[[0, 2]]).all()
