@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,11 +27,13 @@ _RANGE = 8.0
 """Standard deviation (px) of the window in which the variance of the residual is estimated."""
 _COARSE = 4
 """Reduction of the grid on which that window is applied."""
-_BLOCK = 9
+_BLOCK = 12
 """Side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
-_EVEN = 0.7
+_LEAST_RATIO = np.float32(1e-2)
+"""Least share of a residual's variance that is taken to displace."""
+_EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken."""
-_SCORE_RANGE = 20.0
+_SCORE_RANGE = 24.0
 """Standard deviation (px) of the window over which block sums are averaged."""
 
 
@@ -60,6 +62,11 @@ class Comparison:
     def residual(self) -> FloatImage:
         """f - g(x + u), shape (k, P); 0 where g is not known."""
         return np.asarray(np.nan_to_num(self.values - self.warped, nan=0.0), dtype=np.float32)
+
+    def without(self, deviation: FloatImage) -> Comparison:
+        """The same, less what a displacement known to be missing (2, P), in px, leaves in the residual."""
+        x, y = self.reference.gradient_x * deviation[0], self.reference.gradient_y * deviation[1]
+        return replace(self, values=self.values - x - y)
 
     def matched(self, least: float | None = None) -> npt.NDArray[np.bool_]:
         """Elements (E,) whose images match: zero-mean correlation coefficient of all lights together.
@@ -151,17 +158,19 @@ class Comparison:
         return corrected
 
     def precision(self) -> tuple[FloatImage, FloatImage]:
-        """Factor (k, P) on the weights: inverse variance of the residual around each pixel, and robust at the pixel;
+        """Factor (k, P) on the weights: inverse variance of a light around each pixel, and robust at the pixel;
         and the derivative of the robust loss over that factor (k, P), which the uncertainty needs.
 
-        The variance holds whatever spoils a light there: camera noise, demosaicing, the erratic part of a reflection.
-        Its unit is the median over all lights. The pixel's own factor is that of a Student distribution, so that
-        dust or a fragment does not spoil a node.
+        The variance is that of the residual, times the part of it that displaces: brightness and contrast that change
+        slowly leave a residual which the gradient of the speckle averages out, blurred noise one that it does not. It
+        holds whatever spoils a light there: camera noise, demosaicing, the erratic part of a reflection. Its unit is
+        the median over all lights. The pixel's own factor is that of a Student distribution, so that dust or a
+        fragment does not spoil a node.
         """
         squares = self.residual**2
         variance = np.stack([self._local_mean(*pair) for pair in zip(squares, self.weights, strict=True)])
         seen = self.weights > 0
-        typical = float(np.median(variance[seen][:: max(1, int(seen.sum()) // 100_000)])) if seen.any() else 0.0
+        typical = _typical(variance, seen)
         if typical <= 0:
             return np.ones_like(self.weights), np.ones_like(self.weights)
         texture = float(np.var(self.values[seen], dtype=np.float64))
@@ -169,7 +178,23 @@ class Comparison:
         ratio = squares / variance
         robust = (_FREEDOM + 1) / (_FREEDOM + ratio)
         bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
-        return np.asarray(typical / variance * robust, dtype=np.float32), np.asarray(bend, dtype=np.float32)
+        variance *= np.stack([self._displacing(light, variance[light]) for light in range(len(variance))])
+        factor = _typical(variance, seen) / variance * robust
+        return np.asarray(factor, dtype=np.float32), np.asarray(bend, dtype=np.float32)
+
+    def _displacing(self, light: int, variance: FloatImage) -> FloatImage:
+        """Variance of a light's scores over what white noise of that `variance` (P,) would give, at the pixels (P,)."""
+        reference, pixels = self.reference, self.reference.pixels
+        used = np.asarray(self.weights[light] > 0, dtype=np.float32)
+        weight = used / variance
+        gx, gy = reference.gradient_x[light], reference.gradient_y[light]
+        pull = weight * self.residual[light]
+        ratios = self._score_ratios(pull * gx, pull * gy, weight * (gx * gx + gy * gy), used)[0]
+        total = ratios[0] + ratios[2]
+        rows, columns = total.shape
+        fine = cv2.resize(total, (columns * _BLOCK, rows * _BLOCK), interpolation=cv2.INTER_LINEAR)
+        top, left, _, _ = pixels.bounds
+        return np.maximum(np.asarray(fine, dtype=np.float32)[pixels.rows - top, pixels.columns - left], _LEAST_RATIO)
 
     def _local_mean(self, values: FloatImage, weight: FloatImage) -> FloatImage:
         """Weighted Gaussian mean (P,) around each pixel, found on a coarser grid: it varies slowly."""
@@ -201,22 +226,31 @@ class Comparison:
             score[1] += pull * gy
             information += weight * (gx * gx + gy * gy)
         used = np.asarray(step_weights.any(axis=0), dtype=np.float32)
-        x, y, known, count = (self._block_sums(values) for values in (*score, information, used))
-        # a light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
-        # smooth, and averaged, is the ratio of that variance to the information, 1 for white noise and ideal weights
+        ratios, level = self._score_ratios(score[0], score[1], information, used)
+        fitted = min(_BLOCK**2 * measured / max(float(used.sum()), 1.0), 0.75)
+        return self._spread((level * ratios).astype(np.float64) / (1 - fitted), used)
+
+    def _score_ratios(
+        self, x: FloatImage, y: FloatImage, information: FloatImage, used: FloatImage
+    ) -> tuple[FloatImage, FloatImage]:
+        """Covariance (xx, xy, yy) of scores (P,) over their information (P,), and the information per pixel in use,
+        on the grid of blocks.
+
+        A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
+        smooth, and averaged, is its ratio to the information; xx + yy is 1 for white noise and ideal weights.
+        """
+        sum_x, sum_y, known, count = (self._block_sums(values) for values in (x, y, information, used))
         level = _blur(known, _EVEN) / np.maximum(_blur(count, _EVEN), np.float32(1e-6))
-        scale = np.divide(1, level, out=np.zeros_like(level), where=(level > 0) & (count > 0))
+        scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
+        sum_x, sum_y = sum_x * scale, sum_y * scale
         around = _blur(count, _SCORE_RANGE / _BLOCK)
         # half a block's worth of the mean over the region: beside a hole few blocks speak
         prior, total = 0.5 * _BLOCK**2, max(float(count.sum()), 1.0)
-        fitted = min(_BLOCK**2 * measured / max(float(used.sum()), 1.0), 0.75)
-        density = np.stack(
-            [
-                level * (_blur(ratio, _SCORE_RANGE / _BLOCK) + prior * float(ratio.sum()) / total) / (around + prior)
-                for ratio in (x * x * scale, x * y * scale, y * y * scale)
-            ]
-        )
-        return self._spread(density.astype(np.float64) / (1 - fitted), used)
+        ratios = [
+            (_blur(product, _SCORE_RANGE / _BLOCK) + prior * float(product.sum()) / total) / (around + prior)
+            for product in (sum_x * sum_x, sum_x * sum_y, sum_y * sum_y)
+        ]
+        return np.stack(ratios).astype(np.float32), np.asarray(level, dtype=np.float32)
 
     def _block_sums(self, values: FloatImage) -> FloatImage:
         """Sums of a pixel field (P,) over blocks of `_BLOCK` x `_BLOCK` px."""
@@ -242,6 +276,11 @@ class Comparison:
         area = np.bincount(owner, weights=used, minlength=len(mesh.elements))
         mass = area[:, None, None] * (np.ones((3, 3)) + np.eye(3)) / 12
         return np.asarray(mass[..., None] * density[:, row, column].T[:, None, None, :])
+
+
+def _typical(variance: FloatImage, seen: npt.NDArray[np.bool_]) -> float:
+    """Median where `seen`, from about 100 000 values."""
+    return float(np.median(variance[seen][:: max(1, int(seen.sum()) // 100_000)])) if seen.any() else 0.0
 
 
 def _blur(image: FloatImage, sigma: float) -> FloatImage:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from rgbmidic._kernels.correlation import curvature_deviation, element_vector
+from rgbmidic._kernels.correlation import curvature_deviation, element_vector, interpolate_nodal
 from rgbmidic.correlation.problem import Reference
 from rgbmidic.correlation.step import Step
 from rgbmidic.mesh import Tri3Mesh
@@ -41,11 +41,14 @@ class Bent:
         their mean slope is that of a point half an element inside.
     strain : ndarray, shape (N, 3)
         Offset of the nodal strain for both reasons.
+    deviation : ndarray, shape (2, P), float32
+        What the curved field has over the linear one at the owned pixels, px.
     """
 
     displacement: FloatArray
     one_sided: FloatArray
     strain: FloatArray
+    deviation: npt.NDArray[np.float32]
 
 
 def curvature_correction(reference: Reference, step: Step, displacement: FloatArray) -> Bent:
@@ -61,25 +64,24 @@ def curvature_correction(reference: Reference, step: Step, displacement: FloatAr
         The solution, finite everywhere.
     """
     curvature = _curvature(reference, displacement, step.measured)
-    offset = _offset(reference, step, curvature[reference.mesh.elements].mean(axis=1))
-    one_sided = _one_sided(reference.mesh, curvature)
-    return Bent(displacement=offset, one_sided=one_sided, strain=reference.strain(offset) + one_sided)
-
-
-def _offset(reference: Reference, step: Step, curvature: FloatArray) -> FloatArray:
-    """Offset (N, 2) of the nodes for second derivatives (E, 2, 3): the deviation projected as a residual is."""
     mesh, pixels = reference.mesh, reference.pixels
-    deviation = np.empty((2, pixels.rows.size), dtype=np.float32)
-    curvature_deviation(
-        mesh.nodes,
-        mesh.elements,
-        curvature,
-        pixels.local_x,
-        pixels.local_y,
-        pixels.offsets,
-        pixels.barycentric,
-        deviation,
+    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+    deviation, carried = np.empty((2, 2, pixels.rows.size), dtype=np.float32)
+    curvature_deviation(mesh.nodes, mesh.elements, curvature[mesh.elements].mean(axis=1), *geometry, deviation)
+    offset = _offset(reference, step, deviation)
+    interpolate_nodal(offset, mesh.elements, *geometry, carried)
+    one_sided = _one_sided(mesh, curvature)
+    return Bent(
+        displacement=offset,
+        one_sided=one_sided,
+        strain=reference.strain(offset) + one_sided,
+        deviation=deviation - carried,
     )
+
+
+def _offset(reference: Reference, step: Step, deviation: npt.NDArray[np.float32]) -> FloatArray:
+    """Offset (N, 2) of the nodes: the `deviation` (2, P) projected as a residual is."""
+    mesh, pixels = reference.mesh, reference.pixels
     total = np.zeros(reference.equations.size)
     parts = np.zeros((len(mesh.elements), 3, 2))
     for weight, gx, gy in zip(step.weights, reference.gradient_x, reference.gradient_y, strict=True):

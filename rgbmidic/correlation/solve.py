@@ -19,7 +19,7 @@ from rgbmidic.correlation.curvature import curvature_correction
 from rgbmidic.correlation.problem import Deformed, Reference
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.step import Step, rigid_functions
-from rgbmidic.correlation.uncertainty import functional_std
+from rgbmidic.correlation.uncertainty import exact_std, functional_std
 from rgbmidic.errors import InputError
 
 __all__ = ["BRIGHTNESS", "SolveOptions", "solve"]
@@ -276,7 +276,9 @@ class _Run:
 
     def _conclude(self, step: Step) -> Solution:
         elements = self.reference.mesh.elements
-        std, strain_std = np.split(self._std(self.seen, step, 5), [2], axis=1)
+        displacement = self.displacement
+        bent = curvature_correction(self.reference, step, displacement)
+        std, strain_std = np.split(self._std(self.seen.without(bent.deviation), step, 5), [2], axis=1)
         beside_mismatch = np.zeros(len(std), dtype=bool)
         beside_mismatch[elements[~self.matched]] = True
         misfit = self.seen.misfit(step.weights, step.measured)
@@ -287,8 +289,6 @@ class _Run:
         decorrelated = lost | (beside_mismatch & ~measured)
         node_status = np.where(measured, NodeStatus.MEASURED, NodeStatus.NOT_SEEN).astype(np.uint8)
         node_status[decorrelated] = NodeStatus.DECORRELATED
-        displacement = self.displacement
-        bent = curvature_correction(self.reference, step, displacement)
         if self.options.curvature:
             displacement = displacement - bent.displacement
         else:
@@ -324,6 +324,9 @@ class _Run:
         reference = self.reference
         scores = reference.equations.matrix(comparison.score_covariance(step.weights, int(step.measured.sum())))
         std = functional_std(step.solve, scores, reference.probing, reference.functionals[:count], step.measured)
+        if count > 2:
+            near_hole = np.flatnonzero(step.measured & self._beside(self._beside(self._beside(~step.measured))))
+            std[near_hole, 2:] = exact_std(step.solve, scores, reference.functionals[2:count], near_hole)
         return std * self._robust_loss(step)
 
     def _robust_loss(self, step: Step) -> float:

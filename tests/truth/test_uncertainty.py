@@ -143,11 +143,13 @@ def test_what_is_spoiled_is_flagged_and_spoils_nothing_else(sphere: Sphere, kind
     near = np.zeros(len(x), dtype=bool)
     if spoil in (_fragment, _glare):
         near = (np.abs(x - 240) < 75) & (np.abs(y - 185) < 70)
-    if spoil is _saturated:
-        near = x < SIZE / 3 + 15
     assert solution.measured[~near].all()
     assert sphere.ratio(solution, 1.0, ~near) < SPOILED
-    if spoil in (_fragment, _glare, _saturated):
+    if spoil is _saturated:  # the other two lights see on
+        blinded = x < SIZE / 3 - 15
+        assert solution.light_share[blinded, 1].max() < 0.5 * np.median(solution.light_share[~blinded, 1])
+        assert sphere.ratio(solution, 1.0, blinded) < SPOILED
+    if spoil in (_fragment, _glare):
         assert (~solution.measured[near]).any()
         error = solution.displacement - at_nodes(sphere.truth[1.0], solution.nodes)
         assert np.nanmax(np.abs(error)) < 0.3  # nothing wild passes for measured
