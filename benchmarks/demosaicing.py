@@ -311,7 +311,8 @@ def figure(path: Path, results: dict[float, list[list[Error]]], contenders: list
             style = {"lw": 2.5, "color": "black"} if contender.method == "reflection-aware" else {"lw": 1.2}
             style |= {"ls": "--", "color": "grey"} if contender.method == "3-CCD" else {}
             bias = [float(np.abs(e.bias).max()) for e in errors]
-            axes[0, column].plot(sizes, bias, marker="o", label=contender.name, **style)
+            label = contender.name if column == 0 else None
+            axes[0, column].plot(sizes, bias, marker="o", label=label, **style)
             axes[1, column].plot(sizes, [e.scatter for e in errors], marker="o", **style)
         axes[0, column].set_title(f"plate {title}")
         axes[1, column].set_xlabel("speckle, px")
@@ -320,7 +321,7 @@ def figure(path: Path, results: dict[float, list[list[Error]]], contenders: list
     for axis in axes.flat:
         axis.set_yscale("log")
         axis.grid(alpha=0.3)
-    axes[0, 1].legend(fontsize=7)
+    fig.legend(loc="outside lower center", ncols=4, fontsize=8)
     fig.savefig(path, dpi=110)
 
 

@@ -215,6 +215,7 @@ def colour_factors(moments: Moments, band: BandEnergy, crosstalk: Floats, *, col
         # at least one channel is free of reflections at each place, unless it shows too much of its own for that
         private = excess - least + np.maximum(least - 1 - allowed, 0)
         sparkle = private * square * band.own
+    # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side
     variance = np.maximum(private * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
     return ColourFactors(slope=np.sqrt(square), private=variance, noise=moments.noise / square)
 

@@ -10,6 +10,7 @@ import pytest
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 LIMITS = {
     "bayer_pair.py": ("rms error", 0.015),
+    "demosaicing.py": ("ratio", 1.0),
     "plain_dic.py": ("rms error", 0.002),
     "two_lights.py": ("ratio", 0.4),
 }
