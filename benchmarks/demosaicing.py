@@ -308,7 +308,9 @@ def figure(path: Path, results: dict[float, list[list[Error]]], contenders: list
     for column, (index, title) in enumerate(panels):
         for n, contender in enumerate(contenders):
             errors = [results[size][index][n] for size in sizes]
-            style = {"lw": 2.5, "color": "black"} if contender.method == "reflection-aware" else {"lw": 1.2}
+            style: dict[str, Any] = (
+                {"lw": 2.5, "color": "black"} if contender.method == "reflection-aware" else {"lw": 1.2}
+            )
             style |= {"ls": "--", "color": "grey"} if contender.method == "3-CCD" else {}
             bias = [float(np.abs(e.bias).max()) for e in errors]
             label = contender.name if column == 0 else None
