@@ -1,0 +1,242 @@
+"""Scenes of the uncertainty benchmark: bodies in two states with exact truth, and what spoils a frame.
+
+Rendering is the slow part: what has been rendered is kept on disk.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from demosaicing import TILT, painted
+
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.mosaic import ChannelFrame, LinearChannels, LinearMosaic, Mosaic, linearise
+from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.unmix import unmix
+from rgbmidic.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
+from rgbmidic.virtual.scenes import PIXEL
+
+Array = npt.NDArray[np.float64]
+FloatImage = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+Kind = Literal["rgb", "bayer"]
+
+CACHE = {"folder": Path(tempfile.gettempdir()) / "rgbmidic-uncertainty"}
+"""Where rendered images are kept."""
+
+
+def turn(angle: float) -> State:
+    """Turned about the vertical through the front point."""
+    return State(angle_deg=angle)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """A scene in two states, with everything that tells it from another."""
+
+    body: str
+    state: State
+    size: int = 448
+    seed: int = 11
+    gloss: float = 1.5
+    speckle: float = 4.2
+    paint: str = "smooth"
+
+    def scene(self, gloss: float | None = None) -> Scene:
+        """The scene; another `gloss` for its mat twin."""
+        options: dict[str, Any] = {"size": self.size, "seed": self.seed, "droplet": self.speckle * PIXEL}
+        options["gloss"] = self.gloss if gloss is None else gloss
+        if self.body == "plate":
+            scene = plate_scene(glare="green", tilt_deg=TILT, **options)
+        else:
+            scene = sphere_scene(**options)
+        if self.body == "cylinder":
+            scene = replace(scene, body=Cylinder(radius=30.0, centre=(0.0, 0.0, 630.0)))
+        return painted(scene, self.paint)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Noise-free lights (k, H, W) in both states, share of their local mean that is not diffuse, and the truth."""
+
+    scene: Scene
+    lights: tuple[FloatImage, FloatImage]
+    glare: tuple[FloatImage, FloatImage]
+    exact: Array
+
+    def cut(self, top: int, left: int, size: int) -> Pair:
+        """A square part, from an even row and column so that the colour filters stay in place."""
+        part = (slice(None), slice(top, top + size), slice(left, left + size))
+        camera = replace(self.scene.camera, shape=(size, size))
+        first, second = (image[part] for image in self.lights)
+        shine, later = (image[part] for image in self.glare)
+        return Pair(replace(self.scene, camera=camera), (first, second), (shine, later), self.exact[part])
+
+    @property
+    def size(self) -> int:
+        """Side of the frame, px."""
+        return int(self.exact.shape[1])
+
+
+def stored_render(scene: Scene, state: State | None) -> FloatImage:
+    """`render`, kept on disk: rendering is the slow part."""
+    key = hashlib.sha1(repr((scene, state)).encode()).hexdigest()[:20]
+    path = CACHE["folder"] / f"render_{key}.npy"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, render(scene, state))
+    return np.asarray(np.load(path))
+
+
+@cache
+def pair_of(setting: Setting) -> Pair:
+    """Render a setting, its mat twin and its truth."""
+    scene, mat = setting.scene(), setting.scene(gloss=0.0)
+    states = (None, setting.state)
+    lights = [stored_render(scene, state) for state in states]
+    glare = [
+        np.asarray(1 - blurred(stored_render(mat, one)) / np.maximum(blurred(full), 1), dtype=np.float32)
+        for one, full in zip(states, lights, strict=True)
+    ]
+    return Pair(scene, (lights[0], lights[1]), (glare[0], glare[1]), truth(scene, setting.state))
+
+
+def blurred(images: FloatImage) -> FloatImage:
+    """Local means (k, H, W), sigma 10 px."""
+    return np.stack([cv2.GaussianBlur(image, (0, 0), 10) for image in images]).astype(np.float32)
+
+
+def frame(lights: FloatImage, scene: Scene, kind: Kind, seed: int) -> Mosaic | ChannelFrame:
+    """The raw frame that a camera of the kind takes."""
+    return record(lights, replace(scene.camera, kind=kind), scene.lights, seed=seed)
+
+
+def images_of(raw: Mosaic | ChannelFrame, scene: Scene) -> IlluminationImages:
+    """One image per light from a raw frame, by the defaults."""
+    crosstalk = scene.camera.true_crosstalk(scene.lights)
+    linear = linearise(raw, scene.camera.noise)
+    if isinstance(linear, LinearChannels):
+        return unmix(linear, crosstalk)
+    assert isinstance(linear, LinearMosaic)
+    return separate(linear, crosstalk)
+
+
+def both(pair: Pair, kind: Kind, seed: int = 11) -> tuple[IlluminationImages, IlluminationImages]:
+    """Illumination images of both states with camera noise."""
+    scene = pair.scene
+    first, second = (images_of(frame(i, scene, kind, 1000 * seed + n), scene) for n, i in enumerate(pair.lights))
+    return first, second
+
+
+def _nothing(*_: Any) -> None:
+    return None
+
+
+def _nowhere(x: Array, y: Array) -> Flags:
+    return np.zeros(x.shape, dtype=bool)
+
+
+@dataclass(frozen=True)
+class Spoil:
+    """What spoils a frame: the zone it covers, what it does to the lights and to the samples of state 0 or 1."""
+
+    name: str
+    zone: Callable[[Any, Any], Flags] = _nowhere
+    light: Callable[[Any, Flags, int], None] = _nothing
+    sensor: Callable[[Any, Flags, int], None] = _nothing
+    overlapping: bool = False
+
+    def pair(self) -> Pair:
+        """The turning sphere, or the one on which all reflections lie in one place."""
+        return overlapping_reflections() if self.overlapping else pair_of(Setting(body="sphere", state=turn(1.0)))
+
+
+@cache
+def overlapping_reflections() -> Pair:
+    """A sphere of smoother paint whose three lamps stand in one place, so that all reflect in the same 2 % of it."""
+    scene = sphere_scene(size=448, seed=11)
+    place = scene.lights[2].position
+    white, black = (
+        replace(finish, slope_deg=1.0, lobe_deg=1.2, gloss=12.0)
+        for finish in (scene.surface.white, scene.surface.black)
+    )
+    surface = replace(scene.surface, white=white, black=black)
+    scene = replace(scene, surface=surface, lights=tuple(replace(light, position=place) for light in scene.lights))
+    first, second = (stored_render(scene, state) for state in (None, turn(1.0)))
+    return Pair(scene, (first, second), (first * 0, second * 0), truth(scene, turn(1.0)))
+
+
+def _off(lights: Any, zone: Flags, state: int) -> None:
+    lights[0] *= 1 - state
+
+
+def _flicker(lights: Any, zone: Flags, state: int) -> None:
+    if state:
+        lights *= np.array([1.2, 0.8, 1.2], dtype=np.float32)[:, None, None]
+
+
+def _fragment(lights: Any, zone: Flags, state: int) -> None:
+    if state:
+        lights[:, zone] = 150 + 100 * np.random.default_rng(1).random(int(zone.sum()))
+
+
+def _rough_fragment(lights: Any, zone: Flags, state: int) -> None:
+    if state:
+        pattern = cv2.GaussianBlur(np.random.default_rng(1).normal(size=zone.shape), (0, 0), 1.5)
+        lights[:, zone] = np.maximum(1000 + 500 * pattern / pattern.std(), 0)[zone]
+
+
+def _dead(values: Any, zone: Flags, state: int) -> None:
+    random = np.random.default_rng(5).random(values.shape)
+    values[random < 0.005] = 0
+    values[random > 0.995] = 4095
+
+
+def _saturated(channel: int) -> Callable[[Any, Flags, int], None]:
+    def spoil(values: Any, zone: Flags, state: int) -> None:
+        if values.ndim == 3:
+            values[channel][zone] = 4095
+            return
+        y, x = np.indices(values.shape)
+        samples = ((0, 0), (0, 1), (1, 1))[channel]
+        there = (y % 2 == samples[0]) & (x % 2 == samples[1]) if channel != 1 else (x + y) % 2 == 1
+        values[zone & there] = 4095
+
+    return spoil
+
+
+def _left_third(x: Any, y: Any) -> Flags:
+    return np.asarray(x < 448 // 3)
+
+
+def _box(x: Any, y: Any) -> Flags:
+    return np.asarray((abs(x - 264) < 40) & (abs(y - 210) < 35))
+
+
+def _lamp_spot(x: Any, y: Any) -> Flags:
+    """Where the overlapping reflections saturate: over a third of the local mean is not diffuse."""
+    pair = overlapping_reflections()
+    bright = blurred(pair.lights[0])[0]
+    return np.asarray(bright > 1.5 * np.median(bright))
+
+
+SPOILS = [
+    Spoil("nothing"),
+    Spoil("red light off", light=_off),
+    Spoil("20 % flicker", light=_flicker),
+    Spoil("red saturated on a third", zone=_left_third, sensor=_saturated(0)),
+    Spoil("green saturated on a third", zone=_left_third, sensor=_saturated(1)),
+    Spoil("1 % dead and hot pixels", sensor=_dead),
+    Spoil("dark fragment", zone=_box, light=_fragment),
+    Spoil("speckled fragment", zone=_box, light=_rough_fragment),
+    Spoil("all reflections in one place", zone=_lamp_spot, overlapping=True),
+]
