@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -149,7 +150,7 @@ def test_statistics_beat_the_best_threshold_where_reflections_are_erratic() -> N
     ]
 
     def error(threshold: float | None) -> float:
-        options = {}
+        options: dict[str, Any] = {}
         if threshold is not None:
             first, second = (threshold_weights(one, threshold=threshold) for one in images)
             options = {"weights": first, "deformed_weights": second, "statistics": False}
