@@ -27,13 +27,15 @@ _RANGE = 8.0
 """Standard deviation (px) of the window in which the variance of the residual is estimated."""
 _COARSE = 4
 """Reduction of the grid on which that window is applied."""
-_BLOCK = 12
+_BLOCK = 13
 """Side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
+_TRUST = 0.75
+"""Power of the inverse variance that makes the weight: under 1, for the variance is itself uncertain."""
 _LEAST_RATIO = np.float32(1e-2)
 """Least share of a residual's variance that is taken to displace."""
 _EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken."""
-_SCORE_RANGE = 24.0
+_SCORE_RANGE = 30.0
 """Standard deviation (px) of the window over which block sums are averaged."""
 
 
@@ -179,7 +181,7 @@ class Comparison:
         robust = (_FREEDOM + 1) / (_FREEDOM + ratio)
         bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
         variance *= np.stack([self._displacing(light, variance[light]) for light in range(len(variance))])
-        factor = _typical(variance, seen) / variance * robust
+        factor = (_typical(variance, seen) / variance) ** _TRUST * robust
         return np.asarray(factor, dtype=np.float32), np.asarray(bend, dtype=np.float32)
 
     def _displacing(self, light: int, variance: FloatImage) -> FloatImage:
@@ -208,6 +210,18 @@ class Comparison:
         fine = cv2.resize(total / np.maximum(share, np.float32(1e-6)), (width, height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(np.asarray(fine)[pixels.rows - top, pixels.columns - left], dtype=np.float32)
 
+    def noise_hessian(self, weights: FloatImage) -> FloatArray:
+        """Element blocks (E, 3, 3, 3) of the Hessian that noise alone has: what the residual, which holds the noise of
+        both images, differs by from pixel to pixel."""
+        pixels = self.reference.pixels
+        top, left, _, _ = pixels.bounds
+        total = np.zeros((len(self.reference.mesh.elements), 3, 3, 3))
+        for weight, residual in zip(weights, self.residual, strict=True):
+            window = pixels.window(residual) / np.float32(np.sqrt(2))
+            slopes = [np.diff(window, axis=axis, append=0)[pixels.rows - top, pixels.columns - left] for axis in (1, 0)]
+            total += self.reference.blocks(weight, *slopes)
+        return total
+
     def score_covariance(self, step_weights: FloatImage, measured: int) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side, from the residual itself.
 
@@ -228,7 +242,7 @@ class Comparison:
         used = np.asarray(step_weights.any(axis=0), dtype=np.float32)
         ratios, level = self._score_ratios(score[0], score[1], information, used)
         fitted = min(_BLOCK**2 * measured / max(float(used.sum()), 1.0), 0.75)
-        return self._spread((level * ratios).astype(np.float64) / (1 - fitted), used)
+        return self._spread(level.astype(np.float64) * ratios / (1 - fitted), used)
 
     def _score_ratios(
         self, x: FloatImage, y: FloatImage, information: FloatImage, used: FloatImage

@@ -172,6 +172,11 @@ class _Run:
             weights = self._weights()
             if not weights.any():
                 return self._failed(self._nothing_left())
+            if self.functions.shape[1] and not weights[0].any():
+                return self._failed(
+                    "the first light sees nothing, and the rigid motions of the others are counted from it: "
+                    "put a light first that sees, or measure without rigid motions"
+                )
             change = np.abs(weights - step.weights).sum() if step is not None else np.inf
             if step is not None and change <= _SETTLED * weights.sum() and not self._refining(number):
                 break
@@ -283,9 +288,13 @@ class _Run:
         beside_mismatch[elements[~self.matched]] = True
         misfit = self.seen.misfit(step.weights, step.measured)
         lost = step.measured & ((std.max(axis=1) > _LOST) | (self._beside(beside_mismatch) & (misfit > _MISFIT)))
-        measured = step.measured & ~lost
+        measured = step.measured & ~lost & ~step.blind(self.seen.noise_hessian)
         if not measured.any():
-            return self._failed("the images do not match anywhere in the region")
+            return self._failed(
+                "the texture runs in one direction only: what lies along it cannot be measured"
+                if (step.measured & ~lost).any()
+                else "the images do not match anywhere in the region"
+            )
         decorrelated = lost | (beside_mismatch & ~measured)
         node_status = np.where(measured, NodeStatus.MEASURED, NodeStatus.NOT_SEEN).astype(np.uint8)
         node_status[decorrelated] = NodeStatus.DECORRELATED

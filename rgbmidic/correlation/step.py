@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.correlation.problem import Reference
-from rgbmidic.correlation.system import factorise
+from rgbmidic.correlation.system import NormalEquations, factorise
 from rgbmidic.errors import InputError
 
 __all__ = ["RIGID", "Step", "rigid_functions"]
@@ -25,6 +25,10 @@ _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
 _ROUNDING = 1e-4
 """Share of a node's texture under which what it sees in its worse direction may be rounding."""
+_ONE_SIDED = 0.3
+"""Texture in the worse direction over that in the better one under which the former may be noise..."""
+_NOISY = 0.3
+"""...and is, if noise alone would give this share of it."""
 _SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area..."""
 _INFORMED = 0.01
@@ -66,6 +70,8 @@ class Step:
         Nodes that see enough texture.
     light_share : ndarray, shape (N, k), float64
         Share of each light in what determines a node; 0 where nothing does.
+    equations
+        Structure of the equations.
     """
 
     weights: FloatImage
@@ -77,6 +83,7 @@ class Step:
     schur: FloatArray
     measured: npt.NDArray[np.bool_]
     light_share: FloatArray
+    equations: NormalEquations
 
     @classmethod
     def build(
@@ -109,7 +116,25 @@ class Step:
             schur=corner - border.T @ solved,
             measured=measured,
             light_share=_light_share(reference, per_light),
+            equations=equations,
         )
+
+    def blind(self, noise: Callable[[FloatImage], FloatArray]) -> npt.NDArray[np.bool_]:
+        """Nodes (N,) whose texture runs in one direction only: along the other, the gradient is that of the noise.
+
+        `noise` gives the element blocks of the noise's Hessian; it is asked only where a texture is that one-sided.
+        """
+        xx, xy, yy = _node_blocks(self.hessian)
+        half, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+        weak = half - difference
+        one_sided = self.measured & (weak < _ONE_SIDED * (half + difference))
+        if not one_sided.any():
+            return one_sided
+        angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2  # of the weaker direction
+        x, y = np.cos(angle), np.sin(angle)
+        noise_xx, noise_xy, noise_yy = _node_blocks(self.equations.matrix(noise(self.weights)))
+        along = noise_xx * x * x + 2 * noise_xy * x * y + noise_yy * y * y
+        return np.asarray(one_sided & (along > _NOISY * weak))
 
     def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solve for the motion of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
@@ -140,16 +165,21 @@ def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArra
     return np.asarray(light / np.where(total > 0, total, 1.0))
 
 
+def _node_blocks(matrix: sp.csc_matrix) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Entries (xx, xy, yy) of the nodes' own 2 x 2 blocks."""
+    diagonal = matrix.diagonal().reshape(-1, 2)
+    nodes = np.arange(len(diagonal))
+    return diagonal[:, 0], np.asarray(matrix[2 * nodes, 2 * nodes + 1]).ravel(), diagonal[:, 1]
+
+
 def _observability(hessian: sp.csc_matrix, area: FloatArray, least: float) -> tuple[npt.NDArray[np.bool_], float]:
     """Which nodes see at least that share of the median texture, and the typical diagonal entry of the Hessian.
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
     """
-    diagonal = hessian.diagonal().reshape(-1, 2)
-    nodes = np.arange(len(diagonal))
-    mixed = np.asarray(hessian[2 * nodes, 2 * nodes + 1]).ravel()
-    half = diagonal.sum(axis=1) / 2
-    smallest = half - np.hypot((diagonal[:, 0] - diagonal[:, 1]) / 2, mixed)
+    xx, xy, yy = _node_blocks(hessian)
+    half = (xx + yy) / 2
+    smallest = half - np.hypot((xx - yy) / 2, xy)
     smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only
     density = smallest / area
     typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0

@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from textures import Affine, Texture, noisy_pair
 
 from rgbmidic import NodeStatus, Region, Status, correlate
@@ -315,3 +316,39 @@ def test_one_blind_light_costs_nothing_where_the_other_sees():
     assert rms(error(found)) <= AFFINE_RMS
     assert 0.3 < found.weight_share[0] < 0.55
     assert 0.5 < found.weight_share[1] < 0.7
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.01, 0.1])
+@pytest.mark.parametrize("slope", [0.0, 0.5])
+def test_stripes_are_not_measured_along_their_direction(noise, slope):
+    line = texture(4).image((2, 600))[0]
+    rows, columns = np.mgrid[:160, :200]
+    seen = [np.interp(columns + slope * rows + shift, np.arange(600), line) for shift in (0.0, 0.3)]
+    found = correlate(*noisy_pair(seen, noise * line.std(), np.random.default_rng(1)), region=(20, 20, 180, 140))
+    assert not found.measured.any()
+    assert "texture" in found.reason
+
+
+def test_texture_longer_one_way_than_the_other_is_measured():
+    rng = np.random.default_rng(2)
+    image = 1000 + 300 * gaussian_filter(rng.standard_normal((160, 200)), (1.5, 4)) / 0.1
+    found = correlate(*noisy_pair([image, image], 20.0, rng), region=(20, 20, 180, 140))
+    assert found.measured.all()
+
+
+def test_rigid_motions_need_a_first_light_that_sees():
+    pair = np.stack([reference_image()] * 2)
+    weights = np.stack([np.zeros(SHAPE), np.ones(SHAPE)])
+    found = correlate(pair, pair, weights=weights, rigid="translation", region=REGION)
+    assert found.status is Status.FAILED
+    assert "first light" in found.reason
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
+@pytest.mark.parametrize("brightness", ["none", "local"])
+def test_uncertainty_does_not_depend_on_the_unit_of_the_grey_levels(unit, brightness):
+    pair = noisy_pair([reference_image(), reference_image()], 2.0, np.random.default_rng(3))
+    once, scaled = (correlate(*(i * u for i in pair), region=REGION, brightness=brightness) for u in (1.0, unit))
+    if unit > 1:  # at the other end the floor of double precision shows
+        np.testing.assert_allclose(scaled.displacement_std, once.displacement_std, rtol=0.02)
+    assert np.isfinite(scaled.displacement_std).all()
