@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from rgbmidic.config import FrameSettings, RegionSettings, TestSettings, WeightSettings
 from rgbmidic.correlation import Deformed, Reference, Solution, SolveOptions, Status, solve
+from rgbmidic.correlation.brightness import brightness_change
 from rgbmidic.correlation.start import coarse_start, refine_start
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError, RgbmidicError
 from rgbmidic.fields import fill
@@ -25,7 +26,8 @@ from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.mosaic import ChannelFrame, LinearChannels, LinearMosaic, Mosaic, linearise
 from rgbmidic.illumination.normalise import normalise
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.separate import frame_texture, separate
+from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.illumination.weights import light_weights
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -74,34 +76,22 @@ def measure(
     RgbmidicError
         The settings, the calibration, the region or the reference frames are not usable.
     """
-    separator = Separator.from_settings(settings)
-    first = list_frames(settings.frames.path[0], settings.base)[0]
-    frames = open_frames(with_camera(settings.frames, first, separator.calibration), settings.base)
-    images = average([separator(frames.read(index)) for index in settings.frames.reference])
-    region = read_region(settings.region, images.shape)
-    mesh = Tri3Mesh.from_region(region, settings.element_size)
-    weigher = Weigher.prepare(settings, images, region, frames, separator)
-    reference = Reference.prepare(
-        texture(images, settings),
-        region,
-        weigher.reference(images),
-        mesh=mesh,
-        prefilter=settings.solver.prefilter or "binomial",
-    )
+    test = _Prepared.from_settings(settings)
+    frames, mesh = test.frames, test.reference.mesh
     store = ResultStore.create(
         out,
         nodes=mesh.nodes,
         elements=mesh.elements,
         names=[frames.name(index) for index in range(len(frames))],
-        lights=images.names,
+        lights=test.images.names,
         settings=settings,
-        reference=images.values,
-        notes=weigher.notes,
+        reference=test.images.values,
+        notes=test.weigher.notes,
         overwrite=overwrite,
     )
     last = Start(displacement=None)
     for index in range(len(frames)):
-        record, last = _measure_frame(index, frames, separator, settings, weigher, reference, last)
+        record, last = test.measure(index, last)
         store.write_frame(index, record)
         if progress is not None:
             progress(index + 1, len(frames), _line(frames.name(index), record))
@@ -124,34 +114,87 @@ def with_camera(frames: FrameSettings, first: Path, calibration: Calibration | N
     )
 
 
-def _measure_frame(
-    index: int,
-    frames: FrameSequence,
-    separator: Separator,
-    settings: TestSettings,
-    weigher: Weigher,
-    reference: Reference,
-    last: Start,
-) -> tuple[FrameRecord, Start]:
-    """Record of one frame, and from where the next one starts."""
-    nodes, lights = len(reference.mesh.nodes), len(reference.images)
-    try:
-        images = separator(frames.read(index))
-        if images.values.shape != reference.images.shape:
-            raise FrameError(
-                f"{frames.name(index)} has the shape {images.values.shape}, the reference {reference.images.shape}"
-            )
-        weights = weigher.deformed(images, index)
-        deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
-        start = Start(displacement=np.zeros((nodes, 2))) if settings.frames.reference == (index,) else last
-        solution = track(reference, deformed, start, _options(settings), search_radius=settings.solver.search_radius)
-        kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
-        inputs = frames.hashes(index)
-    except RgbmidicError as error:
-        logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)
-        return FrameRecord.failed(str(error), nodes=nodes, lights=lights), last
-    record = FrameRecord.from_solution(kept, weights_thumbnail=_thumbnail(weights), inputs=inputs)
-    return record, last.after(solution)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Prepared:
+    """A test with everything that its frames share.
+
+    Attributes
+    ----------
+    images
+        Illumination images of the reference state, in grey levels.
+    reference
+        What the solve correlates with.
+    """
+
+    settings: TestSettings
+    frames: FrameSequence
+    separator: Separator
+    weigher: Weigher
+    images: IlluminationImages
+    reference: Reference
+
+    @classmethod
+    def from_settings(cls, settings: TestSettings) -> _Prepared:
+        """Read calibration, reference frames and region."""
+        separator = Separator.from_settings(settings)
+        first = list_frames(settings.frames.path[0], settings.base)[0]
+        frames = open_frames(with_camera(settings.frames, first, separator.calibration), settings.base)
+        separator = separator.with_texture_of(frames.read(settings.frames.reference[0]))
+        images = average([separator(frames.read(index)) for index in settings.frames.reference])
+        region = read_region(settings.region, images.shape)
+        mesh = Tri3Mesh.from_region(region, settings.element_size)
+        weigher = Weigher.prepare(settings, images, region, frames, separator)
+        reference = Reference.prepare(
+            texture(images, settings),
+            region,
+            weigher.reference(images),
+            mesh=mesh,
+            prefilter=settings.solver.prefilter or "binomial",
+        )
+        return cls(
+            settings=settings, frames=frames, separator=separator, weigher=weigher, images=images, reference=reference
+        )
+
+    def measure(self, index: int, last: Start) -> tuple[FrameRecord, Start]:
+        """Record of one frame, and from where the next one starts."""
+        settings, frames, reference = self.settings, self.frames, self.reference
+        nodes, lights = len(reference.mesh.nodes), len(reference.images)
+        try:
+            images = self.separator(frames.read(index))
+            if images.values.shape != reference.images.shape:
+                raise FrameError(
+                    f"{frames.name(index)} has the shape {images.values.shape}, the reference {reference.images.shape}"
+                )
+            weights = self.weigher.deformed(images, index)
+            deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
+            start = Start(displacement=np.zeros((nodes, 2))) if settings.frames.reference == (index,) else last
+            radius = settings.solver.search_radius
+            solution = track(reference, deformed, start, _options(settings), search_radius=radius)
+            kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
+            inputs = frames.hashes(index)
+        except RgbmidicError as error:
+            logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)
+            return FrameRecord.failed(str(error), nodes=nodes, lights=lights), last
+        brightness = brightness_change(self.images.values, images.values, reference, solution.displacement)
+        _tell_dark(frames.name(index), images.names, brightness)
+        record = FrameRecord.from_solution(
+            kept,
+            brightness=brightness,
+            weights_thumbnail=_thumbnail(weights),
+            reflection_thumbnail=None if images.reflection_index is None else _thumbnail(images.reflection_index),
+            inputs=inputs,
+        )
+        return record, last.after(solution)
+
+
+_DARK = 0.3
+"""Share of its light in the reference under which a light is told to be failing."""
+
+
+def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> None:
+    for light, gain in zip(lights, brightness[:, 0], strict=True):
+        if gain < _DARK:
+            logger.warning("%s: %s gives %.0f %% of its light in the reference", name, light, 100 * gain)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -340,16 +383,27 @@ class Separator:
         Camera noise and settings, where there is a calibration.
     settings
         The test's settings.
+    texture
+        The speckle's autocorrelation, learnt once from the reference so that all frames are separated alike; None: each
+        frame tells its own.
     """
 
     settings: TestSettings
     calibration: Calibration | None = None
+    texture: TextureModel | None = None
 
     @classmethod
     def from_settings(cls, settings: TestSettings) -> Separator:
         """Read the calibration file that the settings name, if any."""
         file = settings.calibration_file
         return cls(settings=settings, calibration=None if file is None else Calibration.read(file))
+
+    def with_texture_of(self, frames: tuple[Mosaic | ChannelFrame, ...]) -> Separator:
+        """The same, knowing the speckle that one state shows."""
+        linear = linearise(frames[0], self.calibration.noise if self.calibration else None)
+        if not isinstance(linear, LinearMosaic):
+            return self
+        return replace(self, texture=frame_texture(linear, self.settings.illumination.demosaic))
 
     def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...]) -> IlluminationImages:
         """Illumination images of one state from its frame, or its frames if lights fired in succession.
@@ -368,7 +422,7 @@ class Separator:
         crosstalk = self._crosstalk()
         (only,) = linear
         if isinstance(only, LinearMosaic):
-            images = separate(only, crosstalk, self.settings.illumination.demosaic)
+            images = separate(only, crosstalk, self.settings.illumination.demosaic, texture=self.texture)
         else:
             images = unmix(only, crosstalk)
         registration = self.calibration.registration if self.calibration else None
@@ -412,6 +466,7 @@ def average(images: list[IlluminationImages]) -> IlluminationImages:
         names=first.names,
         full_scale=first.full_scale,
         covariance=None if first.covariance is None else first.covariance / len(images),
+        reflection_index=first.reflection_index,
     )
 
 

@@ -37,6 +37,8 @@ def random_record(seed: int) -> FrameRecord:
         history=0.5 * 0.1 ** np.arange(1 + seed % 5),
         reason="did not converge: é" if seed % 2 else "",
         weights_thumbnail=random.integers(0, 256, (3, 8, 12)).astype(np.uint8) if seed % 2 == 0 else None,
+        brightness=random.uniform(0.9, 1.1, (3, 2)),
+        reflection_thumbnail=random.integers(0, 256, (3, 8, 12)).astype(np.uint8) if seed % 2 == 0 else None,
         inputs={f"/data/{seed}.dng": f"{seed:02x}"},
     )
 

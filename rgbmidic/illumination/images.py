@@ -30,6 +30,9 @@ class IlluminationImages:
     covariance : ndarray, shape (k, k), float64, or None
         Covariance of the camera noise of the k values at one pixel (DN squared), at the median grey level of the
         images; None where the camera noise is not known.
+    reflection_index : ndarray, shape (k, H, W), float32, or None
+        Share of a light that is not diffuse, from a single frame: 0 where its contrast is that of the light with the
+        most contrast there, towards 1 in its reflection; None where the separation does not tell.
     """
 
     values: npt.NDArray[np.float32]
@@ -37,6 +40,7 @@ class IlluminationImages:
     names: tuple[str, ...]
     full_scale: float
     covariance: npt.NDArray[np.float64] | None = None
+    reflection_index: npt.NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         values = np.ascontiguousarray(self.values, dtype=np.float32)

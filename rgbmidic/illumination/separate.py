@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.kriging import TILE
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors
+from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, gather_moments, learn_texture
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic import (
     BandLimitedDemosaicer,
@@ -23,13 +23,22 @@ from rgbmidic.illumination.demosaic import (
     Reconstruction,
     ReflectionAwareDemosaicer,
 )
+from rgbmidic.illumination.demosaic.base import red_position
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.mosaic import LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
 
-__all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "Separated", "Separator", "separate", "separate_reflections"]
+__all__ = [
+    "DEFAULT_METHOD",
+    "DEMOSAICERS",
+    "Separated",
+    "Separator",
+    "frame_texture",
+    "separate",
+    "separate_reflections",
+]
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -86,9 +95,11 @@ def separate_reflections(
     shape = mosaic.values.shape
     spread = _tiles(found.factors.spread, found.table.index.shape)
     error = np.moveaxis(found.table.variance[found.table.index], -1, 0) * spread**2
+    images = _lights(found, crosstalk)
+    assert images.reflection_index is not None
     return Separated(
-        images=_lights(found, crosstalk),
-        reflection_index=_enlarged(_reflection_index(found.factors, found.mean, crosstalk), BLOCK, shape),
+        images=images,
+        reflection_index=images.reflection_index,
         variance=_enlarged(np.tensordot(crosstalk.unmixing**2, error, axes=1), TILE, shape),
         texture=found.texture,
     )
@@ -119,12 +130,33 @@ def separate(
     InputError
         Unknown method, a frame too small for it, or a crosstalk matrix that is not for three camera channels.
     """
-    if method == "auto":
-        method = DEFAULT_METHOD if min(mosaic.values.shape) >= SMALLEST_FRAME else "malvar"
-    if method not in DEMOSAICERS:
-        raise InputError(f"unknown demosaicing method {method!r}; allowed are {', '.join(DEMOSAICERS)}")
+    method = _chosen(method, mosaic)
     _check_channels(crosstalk)
     return DEMOSAICERS[method](mosaic, crosstalk, texture)
+
+
+def frame_texture(mosaic: LinearMosaic, method: str = DEFAULT_METHOD) -> TextureModel | None:
+    """The speckle's autocorrelation as a frame shows it, for `separate` of all frames of a test; None if the method
+    does not use it.
+
+    Raises
+    ------
+    InputError
+        Unknown method.
+    """
+    if _chosen(method, mosaic) != "reflection-aware" or min(mosaic.values.shape) < SMALLEST_FRAME:
+        return None
+    values = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
+    return learn_texture(gather_moments(values, red_position(mosaic.cfa), mosaic.noise))
+
+
+def _chosen(method: str, mosaic: LinearMosaic) -> str:
+    """The method meant, "auto" resolved."""
+    if method == "auto":
+        return DEFAULT_METHOD if min(mosaic.values.shape) >= SMALLEST_FRAME else "malvar"
+    if method not in DEMOSAICERS:
+        raise InputError(f"unknown demosaicing method {method!r}; allowed are {', '.join(DEMOSAICERS)}")
+    return method
 
 
 def _check_channels(crosstalk: Crosstalk) -> None:
@@ -158,9 +190,9 @@ DEMOSAICERS: dict[str, Separator] = {
 
 def _lights(found: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:
     images = unmix(found.channels, crosstalk)
-    if found.noise is None:
-        return images
-    return replace(images, covariance=crosstalk.unmixing @ found.noise @ crosstalk.unmixing.T)
+    index = _enlarged(_reflection_index(found.factors, found.mean, crosstalk), BLOCK, images.shape)
+    noise = None if found.noise is None else crosstalk.unmixing @ found.noise @ crosstalk.unmixing.T
+    return replace(images, covariance=noise, reflection_index=index)
 
 
 def _reflection_index(factors: ColourFactors, mean: FloatImage, crosstalk: Crosstalk) -> npt.NDArray[np.float64]:

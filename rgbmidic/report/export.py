@@ -29,7 +29,8 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     """Write all frames of a result into one file.
 
     ``"npz"``: nodes (N, 2) and elements (E, 3); u, v, exx, eyy, exy, each also with _std, node_status and misfit (T,
-    N); light_share (T, N, k); status and iterations (T,); residual and weight_share (T, k); names and lights.
+    N); light_share (T, N, k); status and iterations (T,); residual and weight_share (T, k); brightness (T, k, 2),
+    gain and offset; names and lights.
     ``"csv"``: a header line, then one row per node and frame.
     Positions and displacements are in px, x right, y down; NaN (an empty field in csv) where not measured.
 
@@ -65,7 +66,10 @@ def _write_npz(result: Result, file: BinaryIO) -> None:
     arrays: dict[str, Any] = {name: getattr(result, name) for name in (*_ARRAYS, "status", "iterations")}
     for axis, name in enumerate(_STRAIN):
         arrays[name], arrays[f"{name}_std"] = result.strain[..., axis], result.strain_std[..., axis]
-    arrays |= {name: np.asarray(getattr(result, name)) for name in ("residual", "weight_share", "names", "lights")}
+    arrays |= {
+        name: np.asarray(getattr(result, name))
+        for name in ("residual", "weight_share", "brightness", "names", "lights")
+    }
     np.savez_compressed(file, **arrays)
 
 

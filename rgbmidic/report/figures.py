@@ -17,11 +17,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
+    "brightness_figure",
     "convergence_figure",
     "displacement_figure",
     "mask_figure",
+    "reflection_figure",
     "residual_figure",
     "save_figure",
+    "share_figure",
     "uncertainty_figure",
 ]
 
@@ -99,16 +102,44 @@ def mask_figure(images: npt.ArrayLike, weights: npt.ArrayLike, names: Sequence[s
             f"masks need k images, k weights and k names; given are shapes {images.shape}, {weights.shape} and "
             f"{len(names)} names"
         )
-    rows, columns = images.shape[1:]
+    titles = [f"{name}: {1 - weight.mean():.1%} excluded" for name, weight in zip(names, weights, strict=True)]
+    return _shaded(images, 1 - weights, titles)
+
+
+def share_figure(result: Result, frame: int, image: npt.NDArray[Any] | None = None) -> Figure:
+    """Maps of each light's share in what determines the nodes of one frame; the rest as `displacement_figure`."""
+    record = result.frame(frame)
+    seen = record.light_share.sum(axis=1) > 0
+    fields = {
+        f"share of {light}": np.where(seen, share, np.nan)
+        for light, share in zip(result.lights, record.light_share.T, strict=True)
+    }
+    return _maps(result, fields, "", "cividis", _frame_title(result, frame), image)
+
+
+def reflection_figure(result: Result, frame: int, images: npt.NDArray[Any]) -> Figure | None:
+    """Each light's reflection index in one frame, shaded over its reference image (k, H, W); None where the separation
+    did not tell it."""
+    seen = result.frame(frame).reflection_thumbnail
+    if seen is None:
+        return None
+    index = seen / 255
+    titles = [f"{light}: {(i > 0.5).mean():.1%} over 0.5" for light, i in zip(result.lights, index, strict=True)]
+    return _shaded(np.asarray(images, dtype=np.float32), index, titles, _frame_title(result, frame))
+
+
+def brightness_figure(result: Result) -> Figure:
+    """Gain and offset of every light against the reference over the frames."""
 
     def draw(figure: Figure, axes: list[Axes]) -> None:
-        for axis, image, weight, name in zip(axes, images, weights, names, strict=True):
-            _show_image(axis, image)
-            _shade(axis, 1 - weight, (rows, columns))
-            axis.set_title(f"{name}: {1 - weight.mean():.1%} excluded")
-            _finish_picture(axis, (-0.5, columns - 0.5), (-0.5, rows - 0.5), first=axis is axes[0])
+        for axis, values, label in zip(axes, result.brightness.T, ("gain", "offset (grey levels)"), strict=True):
+            for light, series in zip(result.lights, values, strict=True):
+                axis.plot(series, marker="o", markersize=2.5, linewidth=1, label=light, color=_LIGHT_COLOURS.get(light))
+            _finish_plot(axis, "frame", label)
+        axes[0].set_ylim(bottom=0)
+        axes[0].legend(loc="lower left")
 
-    return _figure(draw, count=len(images), aspect=rows / columns, colour_bars=False)
+    return _figure(draw, count=2, aspect=0.75, colour_bars=False)
 
 
 def residual_figure(result: Result) -> Figure:
@@ -184,6 +215,20 @@ def _figure(
     return figure
 
 
+def _shaded(images: npt.NDArray[np.float32], shade: npt.NDArray[Any], titles: Sequence[str], title: str = "") -> Figure:
+    """Images (k, H, W) side by side, each shaded by a reduced picture (k, h, w) from 0 to 1."""
+    rows, columns = images.shape[1:]
+
+    def draw(figure: Figure, axes: list[Axes]) -> None:
+        for axis, image, over, name in zip(axes, images, shade, titles, strict=True):
+            _show_image(axis, image)
+            _shade(axis, over, (rows, columns))
+            axis.set_title(name)
+            _finish_picture(axis, (-0.5, columns - 0.5), (-0.5, rows - 0.5), first=axis is axes[0])
+
+    return _figure(draw, count=len(images), aspect=rows / columns, colour_bars=False, title=title)
+
+
 def _maps(
     result: Result,
     fields: dict[str, npt.NDArray[np.float64]],
@@ -204,7 +249,7 @@ def _maps(
             if image is not None:
                 _show_image(axis, image)
             _show_field(figure, axis, result, values, colour_map, opaque=image is None)
-            axis.set_title(f"{name} ({unit})")
+            axis.set_title(f"{name} ({unit})" if unit else name)
             _finish_picture(axis, x, y, first=axis is axes[0])
 
     return _figure(draw, count=len(fields), aspect=(y[1] - y[0]) / (x[1] - x[0]), colour_bars=True, title=title)

@@ -8,11 +8,14 @@ import numpy as np
 
 from rgbmidic.errors import ResultError
 from rgbmidic.report.figures import (
+    brightness_figure,
     convergence_figure,
     displacement_figure,
     mask_figure,
+    reflection_figure,
     residual_figure,
     save_figure,
+    share_figure,
     uncertainty_figure,
 )
 from rgbmidic.sequence.store import Result
@@ -23,7 +26,7 @@ _FRAMES = 5
 
 
 def write_figures(result: Result, folder: Path | str, *, frames: int = _FRAMES) -> tuple[Path, ...]:
-    """Write convergence and residual of a test, the masks on its reference, and maps of a few frames.
+    """Write convergence, residual and brightness of a test, masks or reflections, and maps of a few frames.
 
     Parameters
     ----------
@@ -50,10 +53,19 @@ def write_figures(result: Result, folder: Path | str, *, frames: int = _FRAMES) 
     except OSError as error:
         raise ResultError(f"{folder} cannot be made: {error.strerror or error}") from None
     image = None if result.reference is None else result.reference[0]
-    figures = {"convergence": convergence_figure(result), "residual": residual_figure(result)}
-    weights = result.frame(_reference_index(result)).weights_thumbnail
+    figures = {
+        "convergence": convergence_figure(result),
+        "residual": residual_figure(result),
+        "brightness": brightness_figure(result),
+    }
+    first = _reference_index(result)
+    weights = result.frame(first).weights_thumbnail
     if result.reference is not None and weights is not None:
         figures["masks"] = mask_figure(result.reference, weights / 255, result.lights)
+    if result.reference is not None and (reflections := reflection_figure(result, first, result.reference)) is not None:
+        figures["reflections"] = reflections
+    if len(result.lights) > 1:
+        figures[f"shares_{len(result) - 1:06d}"] = share_figure(result, len(result) - 1, image)
     for index in _spread(len(result), frames):
         figures[f"displacement_{index:06d}"] = displacement_figure(result, index, image)
         figures[f"uncertainty_{index:06d}"] = uncertainty_figure(result, index, image)

@@ -48,10 +48,14 @@ class FrameRecord:
         Coefficients beta of the rigid functions, per light.
     history : ndarray, shape (iterations,), float64
         Largest motion of a node in each iteration, px.
+    brightness : ndarray, shape (k, 2), float64
+        Gain and offset (grey levels) of each light against the reference; NaN where not known.
     reason : str
         Why the frame failed or did not converge; empty otherwise.
     weights_thumbnail : ndarray, shape (k, h, w), uint8, or None
         Reduced picture of each light's weight, 255 for 1.
+    reflection_thumbnail : ndarray, shape (k, h, w), uint8, or None
+        Reduced picture of each light's reflection index, 255 for 1; None where the separation does not tell it.
     inputs : mapping of str to str
         Path and SHA-256 of the files that the frame was read from.
     """
@@ -68,11 +72,15 @@ class FrameRecord:
     weight_share: FloatArray
     rigid: FloatArray
     history: FloatArray
+    brightness: FloatArray | None = None
     reason: str = ""
     weights_thumbnail: npt.NDArray[np.uint8] | None = None
+    reflection_thumbnail: npt.NDArray[np.uint8] | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.brightness is None:
+            object.__setattr__(self, "brightness", np.full((len(np.atleast_1d(self.residual)), 2), np.nan))
         for name, (shape, dtype) in _arrays(len(np.atleast_1d(self.node_status)), len(np.atleast_1d(self.residual))):
             array = np.asarray(getattr(self, name), dtype=dtype)
             fits = array.ndim == len(shape) and all(size < 0 or size == array.shape[i] for i, size in enumerate(shape))
@@ -86,16 +94,20 @@ class FrameRecord:
         cls,
         solution: Solution,
         *,
+        brightness: FloatArray | None = None,
         weights_thumbnail: npt.NDArray[np.uint8] | None = None,
+        reflection_thumbnail: npt.NDArray[np.uint8] | None = None,
         inputs: Mapping[str, str] | None = None,
     ) -> FrameRecord:
         """The record of a solved frame."""
-        names = [name for name, _ in _arrays(0, 0)]
+        names = [name for name, _ in _arrays(0, 0) if name != "brightness"]
         return cls(
             **{name: getattr(solution, name) for name in names},
             status=solution.status,
             reason=solution.reason,
+            brightness=brightness,
             weights_thumbnail=weights_thumbnail,
+            reflection_thumbnail=reflection_thumbnail,
             inputs=inputs or {},
         )
 
@@ -141,6 +153,7 @@ def _arrays(nodes: int, lights: int) -> list[tuple[str, tuple[tuple[int, ...], A
         ("weight_share", ((lights,), np.float64)),
         ("rigid", ((lights, -1), np.float64)),
         ("history", ((-1,), np.float64)),
+        ("brightness", ((lights, 2), np.float64)),
     ]
 
 

@@ -30,7 +30,7 @@ from rgbmidic.sequence.record import FrameRecord, read_arrays, read_record, writ
 __all__ = ["FrameRecord", "Result", "ResultStore"]
 
 SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 _PROVENANCE, _MESH, _REFERENCE, _FRAMES = "provenance.json", "mesh.npz", "reference.npz", "solution"
 _FRAME_FILE = re.compile(r"frame_[0-9]{6,}\.npz(\.[0-9]+\.part)?")
@@ -296,6 +296,11 @@ class Result:
     def weight_share(self) -> FloatArray:
         """Mean weight of each light over the region, shape (T, k)."""
         return self._stack("weight_share")
+
+    @cached_property
+    def brightness(self) -> FloatArray:
+        """Gain and offset (grey levels) of each light against the reference, shape (T, k, 2)."""
+        return self._stack("brightness")
 
     @cached_property
     def reasons(self) -> tuple[str, ...]:

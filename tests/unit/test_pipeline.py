@@ -86,6 +86,14 @@ def test_the_result_tells_where_it_comes_from(bayer, bayer_result):
     np.testing.assert_array_equal(again.u, bayer_result.u)
 
 
+def test_each_frame_tells_brightness_and_reflections(bayer_result):
+    np.testing.assert_allclose(bayer_result.brightness[0], [[1, 0]] * 3, atol=1e-6)
+    np.testing.assert_allclose(bayer_result.brightness[..., 0], 1, atol=0.05)
+    index = bayer_result.frame(1).reflection_thumbnail
+    assert index.shape[0] == 3
+    assert index.mean() < 0.2 * 255  # a mat scene
+
+
 def test_every_frame_is_told_as_it_finishes(bayer, tmp_path):
     told = []
     measure(bayer.settings(), tmp_path / "result", progress=lambda *state: told.append(state))

@@ -82,8 +82,9 @@ def test_all_figures_can_be_written(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
     files = write_figures(result, tmp_path / "figures", frames=2)
     names = {file.name for file in files}
-    assert {"convergence.png", "residual.png", "masks.png", "displacement_000011.png"} <= names
-    assert len(names) == 3 + 2 * 2
+    told_once = {"convergence.png", "residual.png", "brightness.png", "masks.png", "reflections.png"}
+    assert told_once | {"displacement_000011.png", "shares_000011.png"} <= names
+    assert len(names) == len(told_once) + 1 + 2 * 2
     assert all(file.stat().st_size > 5000 for file in files)
 
 

@@ -143,7 +143,7 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
     assert "schema version 9" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 9}')
-    assert "is missing" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 1}')
+    assert "is missing" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 2}')
     assert "mesh.npz is missing" in damaged("mesh.npz", None)
     assert "mesh.npz is damaged" in damaged("mesh.npz", b"PK")
     assert "frame 1 (frame 1) of 2 is missing" in damaged("solution/frame_000001.npz", None)
