@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.correlation import element_moments, element_vector, interpolate_nodal
+from rgbmidic._kernels.grid import block_sums, score_sums
 from rgbmidic.correlation.problem import Reference
 from rgbmidic.correlation.system import factorise
 
@@ -31,7 +34,7 @@ _BLOCK = 13
 """Side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
 _TRUST = 0.75
 """Power of the inverse variance that makes the weight: under 1, for the variance is itself uncertain."""
-_LEAST_RATIO = np.float32(1e-2)
+_LEAST_RATIO = 1e-2
 """Least share of a residual's variance that is taken to displace."""
 _EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken."""
@@ -39,7 +42,7 @@ _SCORE_RANGE = 30.0
 """Standard deviation (px) of the window over which block sums are averaged."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Comparison:
     """Both states at the owned pixels of the reference.
 
@@ -60,7 +63,7 @@ class Comparison:
     warped: FloatImage
     weights: FloatImage
 
-    @property
+    @cached_property
     def residual(self) -> FloatImage:
         """f - g(x + u), shape (k, P); 0 where g is not known."""
         return np.asarray(np.nan_to_num(self.values - self.warped, nan=0.0), dtype=np.float32)
@@ -169,46 +172,36 @@ class Comparison:
         the median over all lights. The pixel's own factor is that of a Student distribution, so that dust or a
         fragment does not spoil a node.
         """
-        squares = self.residual**2
-        variance = np.stack([self._local_mean(*pair) for pair in zip(squares, self.weights, strict=True)])
+        variance = self._local_variance()
         seen = self.weights > 0
         typical = _typical(variance, seen)
         if typical <= 0:
             return np.ones_like(self.weights), np.ones_like(self.weights)
         texture = float(np.var(self.values[seen], dtype=np.float64))
         variance = np.maximum(variance, np.float32(max(0.1 * typical, 1e-6 * texture)))
-        ratio = squares / variance
+        ratio = self.residual**2 / variance
         robust = (_FREEDOM + 1) / (_FREEDOM + ratio)
         bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
-        variance *= np.stack([self._displacing(light, variance[light]) for light in range(len(variance))])
+        variance *= self._displacing(variance)
         factor = (_typical(variance, seen) / variance) ** _TRUST * robust
         return np.asarray(factor, dtype=np.float32), np.asarray(bend, dtype=np.float32)
 
-    def _displacing(self, light: int, variance: FloatImage) -> FloatImage:
-        """Variance of a light's scores over what white noise of that `variance` (P,) would give, at the pixels (P,)."""
-        reference, pixels = self.reference, self.reference.pixels
-        used = np.asarray(self.weights[light] > 0, dtype=np.float32)
-        weight = used / variance
-        gx, gy = reference.gradient_x[light], reference.gradient_y[light]
-        pull = weight * self.residual[light]
-        ratios = self._score_ratios(pull * gx, pull * gy, weight * (gx * gx + gy * gy), used)[0]
-        total = ratios[0] + ratios[2]
-        rows, columns = total.shape
-        fine = cv2.resize(total, (columns * _BLOCK, rows * _BLOCK), interpolation=cv2.INTER_LINEAR)
-        top, left, _, _ = pixels.bounds
-        return np.maximum(np.asarray(fine, dtype=np.float32)[pixels.rows - top, pixels.columns - left], _LEAST_RATIO)
-
-    def _local_mean(self, values: FloatImage, weight: FloatImage) -> FloatImage:
-        """Weighted Gaussian mean (P,) around each pixel, found on a coarser grid: it varies slowly."""
+    def _displacing(self, variance: FloatImage) -> FloatImage:
+        """Variance of each light's scores over what white noise of that `variance` (k, P) would give, (k, P)."""
         pixels = self.reference.pixels
-        coarse = [
-            cv2.resize(pixels.window(v), None, fx=1 / _COARSE, fy=1 / _COARSE, interpolation=cv2.INTER_AREA)
-            for v in (values * weight, weight)
-        ]
-        total, share = (_blur(np.asarray(image, dtype=np.float32), _RANGE / _COARSE) for image in coarse)
-        top, left, height, width = pixels.bounds
-        fine = cv2.resize(total / np.maximum(share, np.float32(1e-6)), (width, height), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(np.asarray(fine)[pixels.rows - top, pixels.columns - left], dtype=np.float32)
+        sums = self._score_sums(np.asarray((self.weights > 0) / variance, dtype=np.float32))
+        ratios = [self._score_ratios(*light)[0] for light in sums]
+        return np.stack([pixels.from_blocks(np.maximum(r[0] + r[2], _LEAST_RATIO), _BLOCK) for r in ratios])
+
+    def _local_variance(self) -> FloatImage:
+        """Weighted Gaussian mean (k, P) of the squared residual around each pixel, found on a coarser grid."""
+        index, shape = self.reference.pixels.blocks(_COARSE)
+        sums = np.zeros((2, len(self.weights), shape[0] * shape[1]), dtype=np.float32)
+        for total, field in zip(sums, (self.residual**2 * self.weights, self.weights), strict=True):
+            block_sums(field, index, total)
+        total, share = (np.stack([_blur(one.reshape(shape), _RANGE / _COARSE) for one in lights]) for lights in sums)
+        mean = total / np.maximum(share, np.float32(1e-6))
+        return np.stack([self.reference.pixels.from_blocks(one, _COARSE) for one in mean])
 
     def noise_hessian(self, weights: FloatImage) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of the Hessian that noise alone has: what the residual, which holds the noise of
@@ -229,50 +222,42 @@ class Comparison:
         speckle and between the lights; the variance of its sum over blocks wider than that reach holds all of it
         (the block estimator of the long-run variance). Fitting `measured` nodes has taken their share out of it.
         """
-        reference, pixels = self.reference, self.reference.pixels
-        score = np.zeros((2, pixels.rows.size), dtype=np.float32)
-        information = np.zeros(pixels.rows.size, dtype=np.float32)
-        for weight, residual, gx, gy in zip(
-            step_weights, self.residual, reference.gradient_x, reference.gradient_y, strict=True
-        ):
-            pull = weight * residual
-            score[0] += pull * gx
-            score[1] += pull * gy
-            information += weight * (gx * gx + gy * gy)
         used = np.asarray(step_weights.any(axis=0), dtype=np.float32)
-        ratios, level = self._score_ratios(score[0], score[1], information, used)
+        x, y, information, _ = self._score_sums(step_weights).sum(axis=0)
+        index, shape = self.reference.pixels.blocks(_BLOCK)
+        count = np.zeros((1, information.size), dtype=np.float32)
+        block_sums(used[None], index, count)
+        ratios, level = self._score_ratios(x, y, information, count.reshape(shape).astype(np.float64))
         fitted = min(_BLOCK**2 * measured / max(float(used.sum()), 1.0), 0.75)
-        return self._spread(level.astype(np.float64) * ratios / (1 - fitted), used)
+        return self._spread(level * ratios / (1 - fitted), used)
+
+    def _score_sums(self, weights: FloatImage) -> FloatArray:
+        """Sums (k, 4, rows, columns) over blocks of the lights' scores in x and y, their information, and pixels."""
+        reference = self.reference
+        index, shape = reference.pixels.blocks(_BLOCK)
+        sums = np.zeros((len(weights), 4, shape[0] * shape[1]))
+        score_sums(self.residual, weights, reference.gradient_x, reference.gradient_y, index, sums)
+        return sums.reshape(len(weights), 4, *shape)
 
     def _score_ratios(
-        self, x: FloatImage, y: FloatImage, information: FloatImage, used: FloatImage
-    ) -> tuple[FloatImage, FloatImage]:
-        """Covariance (xx, xy, yy) of scores (P,) over their information (P,), and the information per pixel in use,
-        on the grid of blocks.
+        self, x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Covariance (xx, xy, yy) of the scores of blocks over their information, and the information per pixel.
 
         A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
         smooth, and averaged, is its ratio to the information; xx + yy is 1 for white noise and ideal weights.
         """
-        sum_x, sum_y, known, count = (self._block_sums(values) for values in (x, y, information, used))
-        level = _blur(known, _EVEN) / np.maximum(_blur(count, _EVEN), np.float32(1e-6))
+        level = _blur(information, _EVEN) / np.maximum(_blur(count, _EVEN), 1e-6)
         scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
-        sum_x, sum_y = sum_x * scale, sum_y * scale
+        x, y = x * scale, y * scale
         around = _blur(count, _SCORE_RANGE / _BLOCK)
         # half a block's worth of the mean over the region: beside a hole few blocks speak
         prior, total = 0.5 * _BLOCK**2, max(float(count.sum()), 1.0)
         ratios = [
             (_blur(product, _SCORE_RANGE / _BLOCK) + prior * float(product.sum()) / total) / (around + prior)
-            for product in (sum_x * sum_x, sum_x * sum_y, sum_y * sum_y)
+            for product in (x * x, x * y, y * y)
         ]
-        return np.stack(ratios).astype(np.float32), np.asarray(level, dtype=np.float32)
-
-    def _block_sums(self, values: FloatImage) -> FloatImage:
-        """Sums of a pixel field (P,) over blocks of `_BLOCK` x `_BLOCK` px."""
-        image = self.reference.pixels.window(values)
-        rows, columns = (-(-size // _BLOCK) for size in image.shape)
-        padded = np.zeros((rows * _BLOCK, columns * _BLOCK), dtype=np.float32)
-        padded[: image.shape[0], : image.shape[1]] = image
-        return np.asarray(padded.reshape(rows, _BLOCK, columns, _BLOCK).sum(axis=(1, 3)), dtype=np.float32)
+        return np.stack(ratios), level
 
     def _spread(self, density: FloatArray, used: FloatImage) -> FloatArray:
         """Element blocks of a score variance per pixel (xx, xy, yy) that is constant in each element.
@@ -297,8 +282,8 @@ def _typical(variance: FloatImage, seen: npt.NDArray[np.bool_]) -> float:
     return float(np.median(variance[seen][:: max(1, int(seen.sum()) // 100_000)])) if seen.any() else 0.0
 
 
-def _blur(image: FloatImage, sigma: float) -> FloatImage:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT), dtype=np.float32)
+def _blur(image: npt.NDArray[Any], sigma: float) -> npt.NDArray[Any]:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
 
 
 def _correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.grid import block_index, grid_at_pixels
 from rgbmidic._kernels.mesh import claim_pixels, list_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
@@ -37,6 +38,8 @@ class PixelMap:
         Shape function a of element e at a local position: ``b[e, a, 0] + b[e, a, 1] x + b[e, a, 2] y``.
     shape : tuple of int
         Image size (H, W).
+    bounds : tuple of int
+        First row, first column, height and width of the smallest rectangle around the owned pixels.
     """
 
     rows: npt.NDArray[np.int32]
@@ -47,6 +50,12 @@ class PixelMap:
     local_y: npt.NDArray[np.float32]
     barycentric: npt.NDArray[np.float64]
     shape: tuple[int, int]
+    bounds: tuple[int, int, int, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        top, left = int(self.rows.min()), int(self.columns.min())
+        size = int(self.rows.max()) - top + 1, int(self.columns.max()) - left + 1
+        object.__setattr__(self, "bounds", (top, left, *size))
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
@@ -88,11 +97,21 @@ class PixelMap:
         """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
         return np.ascontiguousarray(image[..., self.rows, self.columns])
 
-    @property
-    def bounds(self) -> tuple[int, int, int, int]:
-        """First row, first column, height and width of the smallest rectangle around the owned pixels."""
-        top, left = int(self.rows.min()), int(self.columns.min())
-        return top, left, int(self.rows.max()) - top + 1, int(self.columns.max()) - left + 1
+    def blocks(self, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
+        """Number of the block of `side` px in which each owned pixel lies (P,), and the grid of blocks (rows,
+        columns) over `bounds`."""
+        top, left, height, width = self.bounds
+        grid = -(-height // side), -(-width // side)
+        index = np.empty(self.rows.size, dtype=np.int32)
+        block_index(self.rows, self.columns, top, left, side, grid[1], index)
+        return index, grid
+
+    def from_blocks(self, grid: npt.NDArray[np.float32], side: int) -> npt.NDArray[np.float32]:
+        """A grid of such blocks interpolated at the owned pixels (P,)."""
+        top, left, _, _ = self.bounds
+        out = np.empty(self.rows.size, dtype=np.float32)
+        grid_at_pixels(np.ascontiguousarray(grid, dtype=np.float32), self.rows, self.columns, top, left, side, out)
+        return out
 
     def window(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """`values` (P,) as an image of the rectangle `bounds`, 0 where no pixel is owned."""
