@@ -151,6 +151,7 @@ class _Run:
     history: list[float] = field(default_factory=list)
     sums: FloatArray = field(init=False)
     motion: FloatArray = field(init=False)
+    returned: int = 0
 
     def __post_init__(self) -> None:
         lights = len(self.reference.images)
@@ -200,7 +201,7 @@ class _Run:
 
     def _refining(self, number: int) -> bool:
         refined = self.options.statistics or self.options.brightness != "none"
-        return refined and number <= _REFINED[self.options.brightness]
+        return refined and number <= self.returned + _REFINED[self.options.brightness]
 
     def _light_displacement(self, light: int) -> FloatArray:
         return np.asarray(self.displacement + (self.functions @ self.rigid[light]).reshape(-1, 2))
@@ -238,8 +239,11 @@ class _Run:
             if len(self.history) < self.options.max_iterations:
                 lost |= self.motion > _WANDERING
             self.matched &= ~lost[self.reference.mesh.elements].any(axis=1)
-        # where elements have come back, what was learnt from their wrong match must be learnt anew
-        if number >= _REFINED[self.options.brightness] and (before | ~self.matched).all():
+        # where elements have come back, what was learnt from their wrong match must be learnt anew, and once more: in
+        # the pass that brings them back the residual is still that of a wrong match
+        if (self.matched & ~before).any():
+            self.returned = number + 1
+        if number >= self.returned + _REFINED[self.options.brightness]:
             return
         if self.options.brightness != "none":
             self.values = comparison.brightness(self.options.brightness)

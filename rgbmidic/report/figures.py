@@ -146,7 +146,7 @@ def residual_figure(result: Result) -> Figure:
     """Weighted rms residual and mean weight of every light over the frames."""
 
     def draw(figure: Figure, axes: list[Axes]) -> None:
-        labels = ("residual (grey levels)", "mean weight")
+        labels = ("residual", "mean weight")
         for axis, values, label in zip(axes, (result.residual, result.weight_share), labels, strict=True):
             for light, series in zip(result.lights, values.T, strict=True):
                 axis.plot(series, marker="o", markersize=2.5, linewidth=1, label=light, color=_LIGHT_COLOURS.get(light))

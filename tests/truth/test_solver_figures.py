@@ -352,3 +352,15 @@ def test_uncertainty_does_not_depend_on_the_unit_of_the_grey_levels(unit, bright
     if unit > 1:  # at the other end the floor of double precision shows
         np.testing.assert_allclose(scaled.displacement_std, once.displacement_std, rtol=0.02)
     assert np.isfinite(scaled.displacement_std).all()
+
+
+@pytest.mark.parametrize("degrees", [2.0, 3.0])
+def test_elements_that_come_back_are_as_certain_as_if_they_had_never_been_lost(degrees):
+    motion = Affine.strain_and_rotation(0.0, degrees)
+    pair = noisy_pair([texture(5).image(SHAPE), texture(5).image(SHAPE, motion)], 2.0, np.random.default_rng(0))
+    once = correlate(*pair, region=REGION, initial=(0, 0))  # the corners are off by more than a speckle
+    start = motion.displacement(once.nodes, SHAPE)
+    assert np.abs(start).max() > 2
+    wanted = correlate(*pair, region=REGION, initial=start)
+    assert once.measured.all()
+    np.testing.assert_allclose(once.displacement_std, wanted.displacement_std, rtol=0.2)
