@@ -151,6 +151,11 @@ class _Prepared:
             mesh=mesh,
             prefilter=settings.solver.prefilter or "binomial",
         )
+        if not reference.pixel_weights.any():
+            names = ", ".join(frames.name(index) for index in settings.frames.reference)
+            raise FrameError(
+                f"no light sees the region in the reference ({names}): it is saturated, dark or excluded by the weights"
+            )
         return cls(
             settings=settings, frames=frames, separator=separator, weigher=weigher, images=images, reference=reference
         )
@@ -175,6 +180,8 @@ class _Prepared:
         except RgbmidicError as error:
             logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)
             return FrameRecord.failed(str(error), nodes=nodes, lights=lights), last
+        if solution.status is Status.FAILED:
+            logger.warning("frame %d (%s) cannot be measured: %s", index, frames.name(index), solution.reason)
         brightness = brightness_change(self.images.values, images.values, reference, solution.displacement)
         _tell_dark(frames.name(index), images.names, brightness)
         record = FrameRecord.from_solution(

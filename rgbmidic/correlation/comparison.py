@@ -38,6 +38,10 @@ _LEAST_RATIO = 1e-2
 """Least share of a residual's variance that is taken to displace."""
 _EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken."""
+_MOSTLY_FITTED = 0.4
+"""Unknowns per block from which the sums of blocks are checked against `_least_ratio`."""
+_REACH = 3
+"""Farthest move (px) of the autocorrelations in it."""
 _SCORE_RANGE = 30.0
 """Standard deviation (px) of the window over which block sums are averaged."""
 
@@ -228,8 +232,34 @@ class Comparison:
         count = np.zeros((1, information.size), dtype=np.float32)
         block_sums(used[None], index, count)
         ratios, level = self._score_ratios(x, y, information, count.reshape(shape).astype(np.float64))
-        fitted = min(_BLOCK**2 * measured / max(float(used.sum()), 1.0), 0.75)
-        return self._spread(level * ratios / (1 - fitted), used)
+        share = _BLOCK**2 * measured / max(float(used.sum()), 1.0)
+        ratios = ratios / (1 - min(share, 0.75))
+        if share > _MOSTLY_FITTED:  # small elements or a small region: the fit leaves little of a block's sum
+            mean = float((ratios[0] + ratios[2]).mean())
+            ratios *= max(1.0, self._least_ratio(step_weights, measured) / max(mean, 1e-30))
+        return self._spread(level * ratios, used)
+
+    def _least_ratio(self, weights: FloatImage, measured: int) -> float:
+        """Least variance of the scores over their information, from residual and gradient at short distances apart.
+
+        ``sum_d R_r(d) R_g(d) / R_g(0)`` with the autocorrelations of ``sqrt(w) r`` and of ``sqrt(w) grad f``: what
+        noise that no fit has touched, correlated by filters and demosaicing, would give.
+        """
+        pixels, reference = self.reference.pixels, self.reference
+        total = information = independent = 0.0
+        for light, weight in enumerate(weights):
+            number = float((weight > 0).sum())
+            if not number:
+                continue
+            root = np.sqrt(weight)
+            parts = self.residual[light], reference.gradient_x[light], reference.gradient_y[light]
+            noise, *slopes = (_autocorrelation(pixels.window(root * part)) for part in parts)
+            gradient = slopes[0] + slopes[1]
+            total += float((noise * gradient).sum()) / number
+            information += float(gradient[0])
+            independent += number * float(noise[0] ** 2 / max((noise**2).sum(), 1e-300))
+        freedom = 1 - 2 * measured / max(independent, 1e-30)
+        return total / max(information, 1e-300) / max(freedom, 0.1)
 
     def _score_sums(self, weights: FloatImage) -> FloatArray:
         """Sums (k, 4, rows, columns) over blocks of the lights' scores in x and y, their information, and pixels."""
@@ -275,6 +305,20 @@ class Comparison:
         area = np.bincount(owner, weights=used, minlength=len(mesh.elements))
         mass = area[:, None, None] * (np.ones((3, 3)) + np.eye(3)) / 12
         return np.asarray(mass[..., None] * density[:, row, column].T[:, None, None, :])
+
+
+def _autocorrelation(image: FloatImage) -> FloatArray:
+    """Sums of products of an image with itself moved by up to `_REACH` rows and columns, the one not moved first."""
+    rows, columns = image.shape
+    sums = [float(np.vdot(image, image))]
+    for i in range(_REACH + 1):
+        for j in range(-_REACH if i else 1, _REACH + 1):
+            if i >= rows or abs(j) >= columns:
+                continue
+            first = image[i:, max(j, 0) : columns + min(j, 0)]
+            second = image[: rows - i, max(-j, 0) : columns - max(j, 0)]
+            sums += [float(np.vdot(first, second))] * 2  # and the opposite move
+    return np.array(sums)
 
 
 def _typical(variance: FloatImage, seen: npt.NDArray[np.bool_]) -> float:

@@ -114,7 +114,7 @@ def share_figure(result: Result, frame: int, image: npt.NDArray[Any] | None = No
         f"share of {light}": np.where(seen, share, np.nan)
         for light, share in zip(result.lights, record.light_share.T, strict=True)
     }
-    return _maps(result, fields, "", "cividis", _frame_title(result, frame), image)
+    return _maps(result, fields, "", "cividis", _frame_title(result, frame), image, limits=(0, 1))
 
 
 def reflection_figure(result: Result, frame: int, images: npt.NDArray[Any]) -> Figure | None:
@@ -123,9 +123,14 @@ def reflection_figure(result: Result, frame: int, images: npt.NDArray[Any]) -> F
     seen = result.frame(frame).reflection_thumbnail
     if seen is None:
         return None
+    from rgbmidic.inspection.results import REFLECTING
+
     index = seen / 255
-    titles = [f"{light}: {(i > 0.5).mean():.1%} over 0.5" for light, i in zip(result.lights, index, strict=True)]
-    return _shaded(np.asarray(images, dtype=np.float32), index, titles, _frame_title(result, frame))
+    titles = [
+        f"{light}: reflects on {(i > REFLECTING).mean():.1%}" for light, i in zip(result.lights, index, strict=True)
+    ]
+    title = f"reflection index, {_frame_title(result, frame)}"
+    return _shaded(np.asarray(images, dtype=np.float32), index, titles, title)
 
 
 def brightness_figure(result: Result) -> Figure:
@@ -136,7 +141,8 @@ def brightness_figure(result: Result) -> Figure:
             for light, series in zip(result.lights, values, strict=True):
                 axis.plot(series, marker="o", markersize=2.5, linewidth=1, label=light, color=_LIGHT_COLOURS.get(light))
             _finish_plot(axis, "frame", label)
-        axes[0].set_ylim(bottom=0)
+        top = np.nanmax(result.brightness[..., 0], initial=1.0)
+        axes[0].set_ylim(0, 1.1 * float(top))
         axes[0].legend(loc="lower left")
 
     return _figure(draw, count=2, aspect=0.75, colour_bars=False)
@@ -159,8 +165,6 @@ def residual_figure(result: Result) -> Figure:
 
 def convergence_figure(result: Result) -> Figure:
     """Largest motion of a node in each iteration, one line per frame, with the tolerance where it is known."""
-    from matplotlib.ticker import MaxNLocator
-
     records = [result.frame(index) for index in range(len(result))]
     tolerance = result.provenance.get("settings", {}).get("solver", {}).get("tolerance")
 
@@ -173,7 +177,6 @@ def convergence_figure(result: Result) -> Figure:
         if tolerance is not None:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
         axis.set_yscale("log")
-        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         _finish_plot(axis, "iteration", "largest motion of a node (px)")
         if len(records) <= _MANY_FRAMES:
             figure.legend(loc="outside right upper")
@@ -236,6 +239,7 @@ def _maps(
     colour_map: str,
     title: str,
     image: npt.NDArray[Any] | None,
+    limits: tuple[float, float] | None = None,
 ) -> Figure:
     """One map per nodal field, over the image where there is one."""
     low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
@@ -248,7 +252,7 @@ def _maps(
         for axis, (name, values) in zip(axes, fields.items(), strict=True):
             if image is not None:
                 _show_image(axis, image)
-            _show_field(figure, axis, result, values, colour_map, opaque=image is None)
+            _show_field(figure, axis, result, values, colour_map, limits, opaque=image is None)
             axis.set_title(f"{name} ({unit})" if unit else name)
             _finish_picture(axis, x, y, first=axis is axes[0])
 
@@ -261,6 +265,7 @@ def _show_field(
     result: Result,
     values: npt.NDArray[np.float64],
     colour_map: str,
+    limits: tuple[float, float] | None,
     *,
     opaque: bool,
 ) -> None:
@@ -270,9 +275,10 @@ def _show_field(
 
     known = values[np.isfinite(values)]
     if not known.size:
-        axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center")
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+        axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
         return
-    low, high = _limits(known)
+    low, high = limits or _limits(known)
     extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[known.min() < low, known.max() > high]
     norm = Normalize(low, high)
     picture, extent = _raster(result, values)
@@ -335,8 +341,11 @@ def _finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], 
 
 
 def _finish_plot(axis: Axes, x: str, y: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     axis.set_xlabel(x)
     axis.set_ylabel(y)
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)
 

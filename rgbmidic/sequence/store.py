@@ -319,7 +319,8 @@ def _frame_path(path: Path, index: int) -> Path:
 
 def _pictures(images: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     """Images in 8 bit, each stretched between its own extreme percent; 0 where unknown."""
-    low, high = np.nanpercentile(images, [1, 99], axis=(1, 2), keepdims=True)
+    known = np.isfinite(images).any(axis=(1, 2), keepdims=True)
+    low, high = np.nanpercentile(np.where(known, images, 0), [1, 99], axis=(1, 2), keepdims=True)
     scaled = 255 * (images - low) / np.maximum(high - low, 1e-6)
     pictures: npt.NDArray[np.uint8] = np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8)
     return pictures
@@ -331,7 +332,7 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
     if (path / _PROVENANCE).exists():
         _read_provenance(path)  # refuses foreign files of this name
         if not overwrite:
-            raise ResultError(f"{path} already holds a result; give another folder or allow overwriting it (--overwrite)")
+            raise ResultError(f"{path} already holds a result; give another folder or --overwrite it")
     elif foreign := [name for name in (_MESH, _REFERENCE, _FRAMES) if (path / name).exists()]:
         raise ResultError(f"{path} holds a {foreign[0]} that is not of a result; give another folder")
     try:

@@ -262,3 +262,18 @@ def test_gaps_are_filled_only_when_asked_for_with_a_growing_uncertainty() -> Non
     assert np.array_equal(new, ~solution.measured)
     assert (error[new] < 3 * filled.displacement_std[new]).all()
     assert filled.displacement_std[new].min() > np.nanmedian(solution.displacement_std)
+
+
+@pytest.mark.parametrize(("width", "element"), [(16, 25.0), (25, 25.0), (80, 12.0)])
+def test_small_regions_and_elements_do_not_claim_too_much(width: int, element: float) -> None:
+    paint, motion = Texture.random(5, speckle=4.0), Affine.strain_and_rotation(0.002, 0.2, (0.3, 0.2))
+    clean = [paint.image((160, 160)), paint.image((160, 160), motion)]
+    ratios = []
+    for seed in range(8):
+        random = np.random.default_rng(seed)
+        pair = [np.stack([image + 10 * random.standard_normal(image.shape) for _ in range(3)]) for image in clean]
+        region = (40, 40, 40 + width, 40 + width)
+        found = correlate(*pair, region=region, element_size=element, initial=(0.3, 0.2))
+        error = found.displacement - motion.displacement(found.nodes, (160, 160))
+        ratios.append((error / found.displacement_std)[found.measured].ravel())
+    assert 0.6 < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 1.6

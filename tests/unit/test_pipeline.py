@@ -322,3 +322,11 @@ def test_a_mask_of_another_size_is_refused_by_name(tmp_path):
     tifffile.imwrite(tmp_path / "mask.tif", np.ones((20, 30), dtype=np.uint8))
     with pytest.raises(RegionError, match=r"mask\.tif.*30, 20.*144, 144"):
         measure(settings_of(tmp_path, f'path = "grey"\n{STATED}', region={"mask": "mask.tif"}), tmp_path / "result")
+
+
+def test_a_reference_that_no_light_sees_is_one_error(bayer, tmp_path):
+    settings = bayer.settings()
+    blind = {**settings.to_mapping(), "weights": {"method": "threshold", "threshold": 1e-6}}
+    with pytest.raises(FrameError, match="no light sees the region in the reference"):
+        measure(type(settings).from_mapping(blind, settings.base), tmp_path / "result")
+    assert not (tmp_path / "result").exists()
