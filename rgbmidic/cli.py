@@ -261,8 +261,8 @@ def paper(
     from rgbmidic.study import ANGLES, run_paper_study
 
     started = time.perf_counter()
-    check_folder(out, overwrite=overwrite)
     wanted = _numbers(angles, "--angles") if angles else ANGLES
+    check_folder(out, overwrite=overwrite)
     with _progress("study") as progress:
         results = run_paper_study(
             wanted, size=size, causes=size >= 1024 if causes is None else causes, progress=progress

@@ -27,6 +27,8 @@ __all__ = [
     "SolverSettings",
     "TestSettings",
     "WeightSettings",
+    "check_names",
+    "convert_value",
     "read_test",
 ]
 
@@ -287,13 +289,13 @@ class TestSettings:
         """
         base = Path(base).resolve()
         sections = _sections(cls)
-        _check_names(document, sections, "section", "the file")
+        check_names(document, sections, "section", "the file")
         values: dict[str, Any] = {"base": base}
         for name, content in document.items():
             if not isinstance(content, Mapping):
                 raise ConfigurationError(f"[{name}] must be a section with keys, not {content!r}")
-            _check_names(content, sections[name], "key", f"[{name}]")
-            given = {key: _convert(content[key], sections[name][key], f"{name}.{key}", base) for key in content}
+            check_names(content, sections[name], "key", f"[{name}]")
+            given = {key: convert_value(content[key], sections[name][key], f"{name}.{key}", base) for key in content}
             values |= _placed(cls, name, given)
         missing = [entry.name for entry in fields(cls) if _is_required(entry) and entry.name not in values]
         if missing:
@@ -373,7 +375,8 @@ def _placed(settings: type[TestSettings], section: str, given: dict[str, Any]) -
     return {section: hints[section](**given)}
 
 
-def _check_names(given: Iterable[str], allowed: Iterable[str], what: str, where: str) -> None:
+def check_names(given: Iterable[str], allowed: Iterable[str], what: str, where: str) -> None:
+    """Refuse a name that is not allowed, with the closest one as a hint."""
     allowed = list(allowed)
     for name in given:
         if name not in allowed:
@@ -391,7 +394,7 @@ _WORDS = {
 }
 
 
-def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
+def convert_value(value: Any, hint: Any, where: str, base: Path) -> Any:
     """A value of the file as the type that the field states; what does not fit is an error that names the key."""
     origin, kinds = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):  # X | None: a file states no None; a number | a word
@@ -401,7 +404,7 @@ def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
         if words and isinstance(value, str):
             known = ", ".join(map(_quoted, words))
             raise ConfigurationError(f"{where} must be {_WORDS[kinds[0]]} or {known}, not {_quoted(value)}")
-        return _convert(value, kinds[0], where, base)
+        return convert_value(value, kinds[0], where, base)
     if origin is tuple:
         return _convert_list(value, kinds, where, base)
     if origin is Literal:
@@ -418,10 +421,10 @@ def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
 def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path) -> tuple[Any, ...]:
     if len(kinds) == 2 and kinds[1] is Ellipsis:
         entries = value if isinstance(value, list | tuple) else [value]  # a single one needs no brackets
-        return tuple(_convert(entry, kinds[0], where, base) for entry in entries)
+        return tuple(convert_value(entry, kinds[0], where, base) for entry in entries)
     if not isinstance(value, list | tuple) or len(value) != len(kinds):
         raise ConfigurationError(f"{where} must be {len(kinds)} values in brackets, not {_quoted(value)}")
-    return tuple(_convert(entry, kind, where, base) for entry, kind in zip(value, kinds, strict=True))
+    return tuple(convert_value(entry, kind, where, base) for entry, kind in zip(value, kinds, strict=True))
 
 
 def _quoted(value: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_type_hints
 
 import numpy as np
 
-from rgbmidic.config import _check_names, _convert  # the one strict reader of TOML values
+from rgbmidic.config import check_names, convert_value  # the one strict reader of TOML values
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.virtual.camera import Camera
 from rgbmidic.virtual.capture import Target
@@ -102,7 +102,7 @@ def read_scene(path: Path | str) -> Experiment:
 
 def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
     sections = ("body", "surface", "lights", "camera", "states", "output")
-    _check_names(document, sections, "section", "the file")
+    check_names(document, sections, "section", "the file")
     body = _body(_table(document, "body"), base)
     lights = _tables(document, "lights")
     scene = Scene(
@@ -135,8 +135,8 @@ def _tables(document: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
 def _build(kind: Any, table: Mapping[str, Any], where: str, base: Path, **ready: Any) -> Any:
     """An object of a settings class from a table of plain values; `ready` holds fields that are objects already."""
     hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in ready}
-    _check_names(table, hints, "key", f"[{where}]")
-    given = {key: _convert(value, hints[key], f"{where}.{key}", base) for key, value in table.items()}
+    check_names(table, hints, "key", f"[{where}]")
+    given = {key: convert_value(value, hints[key], f"{where}.{key}", base) for key, value in table.items()}
     for entry in fields(kind):
         required = entry.default is MISSING and entry.default_factory is MISSING
         if required and entry.name not in given and entry.name not in ready:
@@ -145,7 +145,7 @@ def _build(kind: Any, table: Mapping[str, Any], where: str, base: Path, **ready:
 
 
 def _body(table: dict[str, Any], base: Path) -> Body:
-    kind = _convert(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
+    kind = convert_value(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
     body: Body = _build(BODIES[kind], table, "body", base)
     return body
 
@@ -171,17 +171,17 @@ def _light(table: dict[str, Any], body: Body, base: Path) -> Light:
 def _camera(table: dict[str, Any], body: Body, base: Path) -> Camera:
     ready: dict[str, Any] = {"crosstalk": None, "sensitivities": None}
     if "crosstalk" in table:
-        rows = _convert(table.pop("crosstalk"), tuple[tuple[float, ...], ...], "camera.crosstalk", base)
+        rows = convert_value(table.pop("crosstalk"), tuple[tuple[float, ...], ...], "camera.crosstalk", base)
         if len({len(row) for row in rows}) != 1:
             raise ConfigurationError("camera.crosstalk must be rows of the same length")
         ready["crosstalk"] = np.array(rows)
     if "sensitivities" in table:
         ready["sensitivities"] = Sensitivities.read(
-            _convert(table.pop("sensitivities"), Path, "camera.sensitivities", base)
+            convert_value(table.pop("sensitivities"), Path, "camera.sensitivities", base)
         )
     if "model" in table:
-        ready["sensitivities"] = Sensitivities.from_colour(_convert(table.pop("model"), str, "camera.model", base))
-    pixel = _convert(table.pop("mm_per_pixel", PIXEL), float, "camera.mm_per_pixel", base)
+        ready["sensitivities"] = Sensitivities.from_colour(convert_value(table.pop("model"), str, "camera.model", base))
+    pixel = convert_value(table.pop("mm_per_pixel", PIXEL), float, "camera.mm_per_pixel", base)
     table.setdefault("shape", list(_SIZE))
     table.setdefault("focal_px", body.front[2] / pixel)
     camera: Camera = _build(Camera, table, "camera", base, **ready)
@@ -204,10 +204,12 @@ def _field(given: Mapping[str, Any], body: Body, base: Path) -> InPlaneField | N
     if "displacement_file" not in given:
         types = {"gradient": tuple[tuple[float, float], tuple[float, float]], "offset": tuple[float, float]}
         values = {key.removeprefix("displacement_"): value for key, value in given.items()}
-        return AffineField(**{k: _convert(v, types[k], f"states.displacement_{k}", base) for k, v in values.items()})
+        return AffineField(
+            **{k: convert_value(v, types[k], f"states.displacement_{k}", base) for k, v in values.items()}
+        )
     if len(given) > 1:
         raise ConfigurationError("states.displacement_file excludes displacement_gradient and displacement_offset")
-    return _mesh_field(_convert(given["displacement_file"], Path, "states.displacement_file", base))
+    return _mesh_field(convert_value(given["displacement_file"], Path, "states.displacement_file", base))
 
 
 def _mesh_field(path: Path) -> MeshField:
