@@ -290,21 +290,16 @@ class Comparison:
         return np.stack(ratios), level
 
     def _spread(self, density: FloatArray, used: FloatImage) -> FloatArray:
-        """Element blocks of a score variance per pixel (xx, xy, yy) that is constant in each element.
-
-        ``integral phi_a phi_b`` over a triangle is its area times (1 + delta_ab) / 12; the area is that of the pixels
-        in use.
-        """
-        mesh, offsets = self.reference.mesh, self.reference.pixels.offsets
-        top, left, _, _ = self.reference.pixels.bounds
+        """Element blocks of a score variance per pixel (xx, xy, yy) that is constant in each element."""
+        mesh, reference = self.reference.mesh, self.reference
+        top, left, _, _ = reference.pixels.bounds
         place = mesh.nodes[mesh.elements].mean(axis=1) - (left, top)
         centre = np.round(place / _BLOCK - 0.5).astype(int)
         column = np.clip(centre[:, 0], 0, density.shape[2] - 1)
         row = np.clip(centre[:, 1], 0, density.shape[1] - 1)
-        owner = np.repeat(np.arange(len(mesh.elements)), np.diff(offsets))
-        area = np.bincount(owner, weights=used, minlength=len(mesh.elements))
-        mass = area[:, None, None] * (np.ones((3, 3)) + np.eye(3)) / 12
-        return np.asarray(mass[..., None] * density[:, row, column].T[:, None, None, :])
+        # summed over the pixels in use: at an edge they do not cover the element evenly
+        mass = reference.blocks(used, np.ones_like(used), np.zeros_like(used))[..., :1]
+        return np.asarray(mass * density[:, row, column].T[:, None, None, :])
 
 
 def _autocorrelation(image: FloatImage) -> FloatArray:

@@ -22,7 +22,7 @@ REFLECTING = 0.2
 """Reflection index from which a light counts as reflecting."""
 BLIND = 0.5
 """Share of the usual contrast that no light reaches where the specimen cannot be seen."""
-TOO_FINE = 0.94
+TOO_FINE = 0.75
 """Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs/inspect.md)."""
 COARSE = 3.0
 """Speckles along the side of an element that it needs at least."""
@@ -223,8 +223,8 @@ def _of_set_up(seen: Inspection) -> Iterator[Finding]:
     if not seen.noise_known:
         yield Finding(
             code="noise unknown",
-            text="no noise calibration: noise and the uncertainty from it are estimated from the frame, some times too "
-            "high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
+            text="no noise calibration: noise and the uncertainty from it are estimated from the frame, up to a few "
+            "times too high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
         )
     for light in seen.lights:
         if light.negative > NEGATIVE:
@@ -263,8 +263,8 @@ def _of_speckle(seen: Inspection) -> Iterator[Finding]:
         yield Finding(
             code="fine speckle",
             text=f"the speckle is too fine for the colour lattice: neighbouring colours agree to "
-            f"{texture.correlation:.2f}, {TOO_FINE} is needed (speckles of about 2.6 px); displacements will be pulled "
-            "towards whole pixels by 0.01 px and more: coarser speckle, a nearer camera or a softer lens",
+            f"{texture.correlation:.2f}, {TOO_FINE} is needed (speckles of about 2.0 px); displacements will be pulled "
+            "towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
         )
     if np.isnan(size):
         yield Finding(code="no texture", text="no speckle is seen: its autocorrelation has no width")

@@ -319,7 +319,8 @@ class Instrument:
         white = surface.white.albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance)
         channels = _channels(channel_mixing(self.scene), zones.irradiance * white)
         full = channels > _SATURATED * self.scene.camera.full_scale
-        needed = np.abs(np.linalg.pinv(channel_mixing(self.scene))) > NEGLIGIBLE
+        unmixing = np.abs(np.linalg.pinv(channel_mixing(self.scene)))
+        needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
         return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)
 
     def _sample_variance(self, zones: Zones) -> Array:
