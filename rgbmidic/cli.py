@@ -297,8 +297,9 @@ def _print_summary(result: Result, seconds: float) -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("frames", f"{len(result)}, {int((result.status == _CONVERGED).sum())} converged")
     table.add_row("nodes", f"{len(result.nodes)}, {measured:.1%} measured")
-    for light, share in zip(result.lights, result.weight_share[result.status != _FAILED].T, strict=True):
-        table.add_row(light, f"{share.mean():.0%} of the weight" if share.size else "-")
+    for light, share in zip(result.lights, result.mean_share[result.status != _FAILED].T, strict=True):
+        known = share[share == share]
+        table.add_row(light, f"{known.mean():.0%} of what determines the nodes" if known.size else "-")
     table.add_row("time", f"{seconds:.1f} s")
     Console().print(table)
     print(f"result        {result.path}")  # rich would cut a long path

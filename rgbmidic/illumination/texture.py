@@ -32,13 +32,9 @@ OFFSET_PENALTY = 0.05
 """Least-squares error (of products) that an offset of 1 costs; the true one is -0.02 to -0.15."""
 INDISTINCT = 0.02
 """Share of its own in a colour's variance under which products do not tell whether it is coarse."""
-USUAL_AGREEMENT = 0.985
-"""Agreement of neighbouring planes for a speckle of about 4 px."""
 WIDTHS: Floats = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
 COLOURED = 0.5
 """Below this mean correlation of any two colours they do not show the same texture."""
-AGREEING = 0.93
-"""Colours that agree less than this nowhere show the texture alone."""
 
 _BINOMIAL = np.array([1, 5, 10, 10, 5, 1]) / 16
 _OFFSETS = np.array([-2, -1, 0, 1, 2, 3])
@@ -176,7 +172,8 @@ def fit_texture(sums: Floats, counts: Floats, correlations: Floats, agreement: f
     # products come in units of the band's energy, which the same unknown weights make up
     unit = np.concatenate([np.tile(energies[:, 1], (odd.sum(), 1)), np.tile(energies[:, 2], (even.sum(), 1))])
     # what a lattice cannot see is hardly in the products: the fit would extrapolate it to distance 0
-    ratio = agreement if agreement > AGREEING else USUAL_AGREEMENT
+    finest, coarsest = (energies[:, 1] / energies[:, 0])[[0, -1]]
+    ratio = float(np.clip(agreement, finest, coarsest))
     fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
     model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, unit=unit, fine=fine)
     return replace(model, private=_private_share(model, sums, counts, correlations))

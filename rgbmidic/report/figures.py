@@ -149,11 +149,11 @@ def brightness_figure(result: Result) -> Figure:
 
 
 def residual_figure(result: Result) -> Figure:
-    """Weighted rms residual and mean weight of every light over the frames."""
+    """Weighted rms residual of every light, and its share in what determines the nodes, over the frames."""
 
     def draw(figure: Figure, axes: list[Axes]) -> None:
-        labels = ("residual", "mean weight")
-        for axis, values, label in zip(axes, (result.residual, result.weight_share), labels, strict=True):
+        labels = ("residual", "mean share in the nodes")
+        for axis, values, label in zip(axes, (result.residual, result.mean_share), labels, strict=True):
             for light, series in zip(result.lights, values.T, strict=True):
                 axis.plot(series, marker="o", markersize=2.5, linewidth=1, label=light, color=_LIGHT_COLOURS.get(light))
             axis.set_ylim(bottom=0)

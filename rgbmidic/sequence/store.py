@@ -268,6 +268,14 @@ class Result:
         return self._stack("light_share")
 
     @cached_property
+    def mean_share(self) -> FloatArray:
+        """Mean of `light_share` over the measured nodes, shape (T, k); NaN where none is measured."""
+        measured = (self.node_status == 0)[..., None]
+        count = measured.sum(axis=1)
+        total = np.where(measured, self.light_share, 0).sum(axis=1)
+        return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
+
+    @cached_property
     def misfit(self) -> FloatArray:
         """Residual around each node over its median, shape (T, N); well above 1 is suspicious."""
         return self._stack("misfit")

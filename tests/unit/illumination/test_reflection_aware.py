@@ -60,6 +60,19 @@ def test_texture_is_the_same_with_and_without_reflection(mat, glaring):
     np.testing.assert_allclose(within(distance), without(distance), atol=0.03)
 
 
+@pytest.mark.parametrize("size", [2.2, 2.6])
+def test_fine_speckle_is_learnt_and_filled_in_without_a_step(size):
+    """What neighbouring colours agree less in is believed: no usual speckle is put in its place."""
+    field = scenes.speckle(SHAPE, size=size)
+    lights = np.stack([1500 * field, 2000 * field, 1100 * field])
+    found = separate_reflections(scenes.mosaic_of(lights), scenes.CROSSTALK)
+    for distance in (1, 2):
+        assert found.texture(distance) == pytest.approx(autocorrelation(field, distance), abs=0.05)
+    assert found.texture.private < 0.2
+    usual = scenes.error(separate(scenes.mosaic_of(lights), scenes.CROSSTALK, "malvar"), lights)
+    assert (scenes.error(found.images, lights) < 0.6 * usual).all()
+
+
 def test_texture_checks_its_parameters():
     assert TextureModel.of_speckle(4.0).diameter == pytest.approx(4, rel=0.1)
     with pytest.raises(InputError, match="sum to 1"):
