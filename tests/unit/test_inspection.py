@@ -200,6 +200,10 @@ def _coloured():
     return np.stack([1500 * speckle(SHAPE, seed=20 + n) for n in range(3)]).astype(np.float32)
 
 
+def _fine():
+    return np.stack([1500 * speckle(SHAPE, diameter=1.3, blur=0.3)] * 3).astype(np.float32)
+
+
 def _blind():
     lights = mat_lights().copy()
     lights[:, 60:120, 60:120] = 700
@@ -209,7 +213,7 @@ def _blind():
 @pytest.mark.parametrize(
     ("lights", "code"),
     [
-        (lambda: mat_lights(1.3), "fine speckle"),
+        (_fine, "fine speckle"),
         (lambda: mat_lights(11.0), "coarse speckle"),
         (lambda: mat_lights(level=5200.0), "saturated"),
         (lambda: mat_lights(level=300.0), "dark"),

@@ -60,10 +60,10 @@ def test_texture_is_the_same_with_and_without_reflection(mat, glaring):
     np.testing.assert_allclose(within(distance), without(distance), atol=0.03)
 
 
-@pytest.mark.parametrize("size", [2.2, 2.6])
-def test_fine_speckle_is_learnt_and_filled_in_without_a_step(size):
+@pytest.mark.parametrize("diameter", [1.0, 1.6])
+def test_fine_speckle_is_learnt_and_filled_in_without_a_step(diameter):
     """What neighbouring colours agree less in is believed: no usual speckle is put in its place."""
-    field = scenes.speckle(SHAPE, size=size)
+    field = scenes.speckle(SHAPE, diameter=diameter)
     lights = np.stack([1500 * field, 2000 * field, 1100 * field])
     found = separate_reflections(scenes.mosaic_of(lights), scenes.CROSSTALK)
     for distance in (1, 2):
