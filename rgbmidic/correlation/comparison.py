@@ -38,8 +38,10 @@ _LEAST_RATIO = 1e-2
 """Least share of a residual's variance that is taken to displace."""
 _EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken."""
-_MOSTLY_FITTED = 0.4
-"""Unknowns per block from which the sums of blocks are checked against `_least_ratio`."""
+_MOSTLY_FITTED = 2.0
+"""Nodes per block from which (elements under 9 px) the sums of blocks are checked against `_least_ratio`..."""
+_FEW_BLOCKS = 9
+"""...and blocks in the region up to which they are."""
 _REACH = 3
 """Farthest move (px) of the autocorrelations in it."""
 _SCORE_RANGE = 30.0
@@ -234,7 +236,7 @@ class Comparison:
         ratios, level = self._score_ratios(x, y, information, count.reshape(shape).astype(np.float64))
         share = _BLOCK**2 * measured / max(float(used.sum()), 1.0)
         ratios = ratios / (1 - min(share, 0.75))
-        if share > _MOSTLY_FITTED:  # small elements or a small region: the fit leaves little of a block's sum
+        if share > _MOSTLY_FITTED or used.sum() < _FEW_BLOCKS * _BLOCK**2:  # the fit leaves little of a block's sum
             mean = float((ratios[0] + ratios[2]).mean())
             ratios *= max(1.0, self._least_ratio(step_weights, measured) / max(mean, 1e-30))
         return self._spread(level * ratios, used)
