@@ -94,11 +94,12 @@ def run(
 
     started = time.perf_counter()
     settings = read_test(test)
+    from rgbmidic.report.gallery import remove_figures, write_figures
+
     with _progress("measuring") as progress:
         result = measure(settings, out, overwrite=overwrite, progress=progress)
+    remove_figures(out / "figures")
     if figures:
-        from rgbmidic.report.gallery import write_figures
-
         write_figures(result, out / "figures")
     _print_summary(result, time.perf_counter() - started)
     if (result.status == _FAILED).all():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,12 @@ from rgbmidic.report.figures import (
 )
 from rgbmidic.sequence.store import Result
 
-__all__ = ["write_figures"]
+__all__ = ["remove_figures", "write_figures"]
 
 _FRAMES = 5
+_NAMES = re.compile(
+    r"(convergence|residual|brightness|masks|reflections|(displacement|uncertainty|shares)_[0-9]{6,})\.png"
+)
 
 
 def write_figures(result: Result, folder: Path | str, *, frames: int = _FRAMES) -> tuple[Path, ...]:
@@ -72,6 +76,22 @@ def write_figures(result: Result, folder: Path | str, *, frames: int = _FRAMES) 
     for name, figure in figures.items():
         save_figure(figure, folder / f"{name}.png")
     return tuple(folder / f"{name}.png" for name in figures)
+
+
+def remove_figures(folder: Path | str) -> None:
+    """Remove the pictures that an earlier run left, which would show another result; nothing else is touched.
+
+    Raises
+    ------
+    ResultError
+        A picture cannot be removed.
+    """
+    for file in Path(folder).glob("*.png"):
+        if _NAMES.fullmatch(file.name):
+            try:
+                file.unlink()
+            except OSError as error:
+                raise ResultError(f"{file} cannot be removed: {error.strerror or error}") from None
 
 
 def _reference_index(result: Result) -> int:

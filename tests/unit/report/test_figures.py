@@ -12,7 +12,7 @@ from results import LIGHTS, MESH, NODES, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.report import figures
-from rgbmidic.report.gallery import write_figures
+from rgbmidic.report.gallery import remove_figures, write_figures
 from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
@@ -86,6 +86,17 @@ def test_all_figures_can_be_written(tmp_path: Path) -> None:
     assert told_once | {"displacement_000011.png", "shares_000011.png"} <= names
     assert len(names) == len(told_once) + 1 + 2 * 2
     assert all(file.stat().st_size > 5000 for file in files)
+
+
+def test_pictures_of_an_earlier_run_are_removed_and_no_others(tmp_path: Path) -> None:
+    result = make_result(tmp_path / "out", frames=3, reference=np.stack([IMAGE] * 3))
+    files = write_figures(result, tmp_path / "figures")
+    mine = tmp_path / "figures" / "my_displacement.png"
+    mine.write_bytes(b"kept")
+    remove_figures(tmp_path / "figures")
+    assert not any(file.exists() for file in files)
+    assert mine.read_bytes() == b"kept"
+    remove_figures(tmp_path / "nowhere")
 
 
 def test_frame_where_nothing_is_measured_still_has_a_figure(tmp_path: Path) -> None:
