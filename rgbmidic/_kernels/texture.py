@@ -55,6 +55,17 @@ def expand_row(grid, row, block, line, out):
         out[j] = line[last]
 
 
+@njit(cache=True, nogil=True)
+def _expand_own(grid, i, block, red_row, red_column, line, other, out):
+    """Row i of a grid (3, h, w) of blocks, at each pixel that of the pixel's own channel, into `out` (W,)."""
+    own = 0 if i % 2 == red_row else 2
+    expand_row(grid[own], i, block, line, other)
+    expand_row(grid[1], i, block, line, out)
+    start = red_column if own == 0 else 1 - red_column
+    for j in range(start, out.size, 2):
+        out[j] = other[j]
+
+
 @njit(cache=True, parallel=True, nogil=True)
 def subtract_mean(values, mean, red_row, red_column, block, out):
     """``out = values - local mean of the pixel's channel``; `mean` (3, h, w) float32."""
@@ -62,12 +73,7 @@ def subtract_mean(values, mean, red_row, red_column, block, out):
     for i in prange(rows):
         line = np.empty(mean.shape[2], dtype=np.float32)
         other, green = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
-        own = 0 if i % 2 == red_row else 2
-        expand_row(mean[own], i, block, line, other)
-        expand_row(mean[1], i, block, line, green)
-        start = red_column if own == 0 else 1 - red_column
-        for j in range(start, columns, 2):
-            green[j] = other[j]
+        _expand_own(mean, i, block, red_row, red_column, line, other, green)
         for j in range(columns):
             out[i, j] = values[i, j] - green[j]
 
@@ -85,12 +91,7 @@ def scaled_contrast(contrast, scale, red_row, red_column, block, pad, out):
         i = min(i, 2 * (rows - 1) - i)
         line = np.empty(scale.shape[2], dtype=np.float32)
         other, green = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
-        own = 0 if i % 2 == red_row else 2
-        expand_row(scale[own], i, block, line, other)
-        expand_row(scale[1], i, block, line, green)
-        start = red_column if own == 0 else 1 - red_column
-        for j in range(start, columns, 2):
-            green[j] = other[j]
+        _expand_own(scale, i, block, red_row, red_column, line, other, green)
         target = out[p]
         for j in range(columns):
             target[j + pad] = contrast[i, j] * green[j]

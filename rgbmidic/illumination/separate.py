@@ -56,9 +56,6 @@ class Separated:
     ----------
     images : IlluminationImages
         What the solve should correlate, each light divided by its local mean.
-    reflection_index : (k, H, W) float32
-        0 where a light's contrast is that of the light with the most contrast there, towards 1 where a reflection lies
-        over it: the share of its light that is not diffuse.
     variance : (k, H, W) float32
         Variance of the error of the values that comes from what a pixel did not sample, and from noise (DN²).
     texture : TextureModel
@@ -66,9 +63,14 @@ class Separated:
     """
 
     images: IlluminationImages
-    reflection_index: FloatImage
     variance: FloatImage
     texture: TextureModel
+
+    @property
+    def reflection_index(self) -> FloatImage:
+        """That of the images, which this method always tells."""
+        assert self.images.reflection_index is not None
+        return self.images.reflection_index
 
 
 def separate_reflections(
@@ -95,11 +97,8 @@ def separate_reflections(
     shape = mosaic.values.shape
     spread = _tiles(found.factors.spread, found.table.index.shape)
     error = np.moveaxis(found.table.variance[found.table.index], -1, 0) * spread**2
-    images = _lights(found, crosstalk)
-    assert images.reflection_index is not None
     return Separated(
-        images=images,
-        reflection_index=images.reflection_index,
+        images=_lights(found, crosstalk),
         variance=_enlarged(np.tensordot(crosstalk.unmixing**2, error, axes=1), TILE, shape),
         texture=found.texture,
     )

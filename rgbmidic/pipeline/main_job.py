@@ -19,18 +19,14 @@ from rgbmidic.config import FrameSettings, RegionSettings, TestSettings, WeightS
 from rgbmidic.correlation import Deformed, Reference, Solution, SolveOptions, Status, solve
 from rgbmidic.correlation.brightness import brightness_change
 from rgbmidic.correlation.start import coarse_start, refine_start
-from rgbmidic.errors import ConfigurationError, FrameError, RegionError, RgbmidicError
+from rgbmidic.errors import FrameError, RegionError, RgbmidicError
 from rgbmidic.fields import fill
-from rgbmidic.illumination.align import align
-from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.mosaic import ChannelFrame, LinearChannels, LinearMosaic, Mosaic, linearise
 from rgbmidic.illumination.normalise import normalise
-from rgbmidic.illumination.separate import frame_texture, separate
-from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmix import unmix
 from rgbmidic.illumination.weights import light_weights
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.separator import Separator, average
 from rgbmidic.sequence.frames import FrameSequence, list_frames, open_frames
 from rgbmidic.sequence.readers import read_frame, tells_camera
 from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
@@ -38,7 +34,7 @@ from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
 if TYPE_CHECKING:
     from rgbmidic.virtual.prediction import GeometryWeights
 
-__all__ = ["Separator", "Start", "Weigher", "average", "measure", "read_region", "texture", "track", "with_camera"]
+__all__ = ["Start", "Weigher", "measure", "read_region", "texture", "track", "with_camera"]
 
 logger = logging.getLogger(__name__)
 
@@ -139,8 +135,9 @@ class _Prepared:
         separator = Separator.from_settings(settings)
         first = list_frames(settings.frames.path[0], settings.base)[0]
         frames = open_frames(with_camera(settings.frames, first, separator.calibration), settings.base)
-        separator = separator.with_texture_of(frames.read(settings.frames.reference[0]))
-        images = average([separator(frames.read(index)) for index in settings.frames.reference])
+        states = [frames.read(index) for index in settings.frames.reference]
+        separator = separator.with_texture_of(states[0])
+        images = average([separator(state) for state in states])
         region = read_region(settings.region, images.shape)
         mesh = Tri3Mesh.from_region(region, settings.element_size)
         weigher = Weigher.prepare(settings, images, region, frames, separator)
@@ -376,105 +373,6 @@ def _find_threshold(
         frames.name(index),
     )
     return found.value
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Separator:
-    """From what the camera recorded of one state to one image per light.
-
-    Attributes
-    ----------
-    crosstalk
-        None for monochrome frames.
-    calibration
-        Camera noise and settings, where there is a calibration.
-    settings
-        The test's settings.
-    texture
-        The speckle's autocorrelation, learnt once from the reference so that all frames are separated alike; None: each
-        frame tells its own.
-    """
-
-    settings: TestSettings
-    calibration: Calibration | None = None
-    texture: TextureModel | None = None
-
-    @classmethod
-    def from_settings(cls, settings: TestSettings) -> Separator:
-        """Read the calibration file that the settings name, if any."""
-        file = settings.calibration_file
-        return cls(settings=settings, calibration=None if file is None else Calibration.read(file))
-
-    def with_texture_of(self, frames: tuple[Mosaic | ChannelFrame, ...]) -> Separator:
-        """The same, knowing the speckle that one state shows."""
-        linear = linearise(frames[0], self.calibration.noise if self.calibration else None)
-        if not isinstance(linear, LinearMosaic):
-            return self
-        return replace(self, texture=frame_texture(linear, self.settings.illumination.demosaic))
-
-    def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...]) -> IlluminationImages:
-        """Illumination images of one state from its frame, or its frames if lights fired in succession.
-
-        Raises
-        ------
-        ConfigurationError
-            Colour frames without a calibrated crosstalk, or settings that contradict the calibration.
-        """
-        noise = self.calibration.noise if self.calibration else None
-        linear = [linearise(frame, noise) for frame in frames]
-        if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
-            return _stack_monochrome([one for one in linear if isinstance(one, LinearChannels)])
-        if len(linear) > 1:
-            raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
-        crosstalk = self._crosstalk()
-        (only,) = linear
-        if isinstance(only, LinearMosaic):
-            images = separate(only, crosstalk, self.settings.illumination.demosaic, texture=self.texture)
-        else:
-            images = unmix(only, crosstalk)
-        registration = self.calibration.registration if self.calibration else None
-        return images if registration is None else align(images, registration)
-
-    def _crosstalk(self) -> Crosstalk:
-        if self.calibration is None or self.calibration.crosstalk is None:
-            what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
-            raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
-        return self.calibration.crosstalk
-
-
-def _stack_monochrome(series: list[LinearChannels]) -> IlluminationImages:
-    names = ("light",) if len(series) == 1 else tuple(f"light {i + 1}" for i in range(len(series)))
-    return IlluminationImages(
-        values=np.concatenate([one.values for one in series]),
-        valid=np.concatenate([one.valid for one in series]),
-        names=names,
-        full_scale=series[0].full_scale,
-    )
-
-
-def average(images: list[IlluminationImages]) -> IlluminationImages:
-    """Mean of several images of one state; a pixel is valid where it is valid in all of them.
-
-    Raises
-    ------
-    FrameError
-        The images have different shapes.
-    """
-    first = images[0]
-    if len(images) == 1:
-        return first
-    shapes = {one.values.shape for one in images}
-    if len(shapes) > 1:
-        raise FrameError(f"the reference frames have different shapes: {sorted(shapes)}")
-    values = np.asarray(np.mean([one.values for one in images], axis=0, dtype=np.float64))
-    return IlluminationImages(
-        values=np.asarray(values, dtype=np.float32),
-        valid=np.logical_and.reduce([one.valid for one in images]),
-        names=first.names,
-        full_scale=first.full_scale,
-        covariance=None if first.covariance is None else first.covariance / len(images),
-        reflection_index=first.reflection_index,
-    )
 
 
 def texture(images: IlluminationImages, settings: TestSettings) -> FloatImage:
