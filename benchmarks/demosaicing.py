@@ -5,10 +5,10 @@
     python benchmarks/demosaicing.py --speckles 3 4.2 6 8 --plates-only --figure docs/figures/demosaicing.png
     python benchmarks/demosaicing.py --study speed
 
-Scenes of `rgbmidic.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, crosstalk 10 to 16 % between neighbours, specular
-peak 1.5 times an ideal white. Three lights are solved together with the true crosstalk, TRI3 of 25 px started within
-half a pixel of the truth; errors over the field without its border element. "sparkling" paint has facets twice as
-large, traced with 3 x 3 rays per pixel, so that a reflection changes erratically from state to state.
+Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, crosstalk 10 to 16 % between neighbours,
+specular peak 1.5 times an ideal white. Three lights are solved together with the true crosstalk, TRI3 of 25 px started
+within half a pixel of the truth; errors over the field without its border element. "sparkling" paint has facets twice
+as large, traced with 3 x 3 rays per pixel, so that a reflection changes erratically from state to state.
 
 The 3-CCD camera is the ideal: all three colours at every pixel, the same solve. One sample instead of three costs a
 factor of sqrt(3) in noise; what is above that is the demosaicing's doing. The studies vary one thing at a time: the
@@ -27,22 +27,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
 from rgbmidic.correlation import correlate
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, linearise
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.illumination.separate import separate, separate_reflections
 from rgbmidic.illumination.unmix import unmix
-from rgbmidic.illumination.weights import threshold_weights
+from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
-from rgbmidic.virtual.scenes import PIXEL
+from rgbmidic.scene.camera import PIXEL
+from rgbmidic.typing import FloatArray
+from rgbmidic.weights.threshold import threshold_weights
 
-Array = npt.NDArray[np.float64]
 TILT = (float(-np.degrees(0.15)), 0.0)
 """The plate leans towards green's lamp."""
 MASKED_ABOVE = 0.4
@@ -175,7 +174,7 @@ def seen_in_colours(scene: Scene, state: State | None, share: float) -> Any:
 
 
 @cache
-def rendered(study: str, index: int, paint: str, seed: int, speckle: float) -> tuple[Scene, Any, Any, Array]:
+def rendered(study: str, index: int, paint: str, seed: int, speckle: float) -> tuple[Scene, Any, Any, FloatArray]:
     """Scene, lights in both states without noise, and truth (2, H, W); rendered once for all contenders."""
     case = STUDIES[study][index]
     scene = painted(case.scene(size=case.size, seed=seed, droplet=speckle * PIXEL, **case.options), paint)
@@ -227,7 +226,9 @@ def measured(study: str, index: int, contender: Contender, *, paint: str, seed: 
     return replace(error, image=float(np.sqrt(np.nanmean(image**2))))
 
 
-def field_error(nodes: Array, elements: Any, displacement: Array, exact: Array, inside: tuple[int, int]) -> Error:
+def field_error(
+    nodes: FloatArray, elements: Any, displacement: FloatArray, exact: FloatArray, inside: tuple[int, int]
+) -> Error:
     """Error at ten points of every element that lies inside the square."""
     corners = nodes[elements]
     kept = ((corners >= inside[0] - 1e-6) & (corners <= inside[1] + 1e-6)).all(axis=(1, 2))

@@ -26,19 +26,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from rgbmidic.typing import FloatArray
+
 MARGIN, STEP = 30, 25
 CONTENDERS = ("rgbmidic", "pyvale", "pyxel-dic")
 
 
-def star(x: Array, y: Array, size: int) -> Array:
+def star(x: FloatArray, y: FloatArray, size: int) -> FloatArray:
     """v in px at points of the reference image."""
     return np.asarray(0.5 * np.cos(2 * np.pi * (y - size / 2) / (100 + 200 * x / size)))
 
 
-def speckle(x: Array, y: Array, waves: int = 150) -> Array:
+def speckle(x: FloatArray, y: FloatArray, waves: int = 150) -> FloatArray:
     """Grey levels 0 to 255 of a texture with spots of 4 px."""
     random = np.random.default_rng(0)
     image = np.full(x.shape, 128.0)
@@ -47,7 +47,7 @@ def speckle(x: Array, y: Array, waves: int = 150) -> Array:
     return image
 
 
-def star_pair(size: int) -> tuple[Array, Array]:
+def star_pair(size: int) -> tuple[FloatArray, FloatArray]:
     """Reference and deformed image without noise."""
     y, x = np.mgrid[:size, :size].astype(float)
     material = y.copy()
@@ -67,14 +67,14 @@ def best_time(work: Callable[[], Any], repeats: int) -> tuple[float, Any]:
     return min(times), result
 
 
-def rms_error(points: Array, v: Array, size: int) -> float:
+def rms_error(points: FloatArray, v: FloatArray, size: int) -> float:
     """rms error of v in px over the points away from the image's edge."""
     inner = ((points > 2 * MARGIN) & (points < size - 2 * MARGIN)).all(axis=1) & np.isfinite(v)
     error = v - star(points[:, 0], points[:, 1], size)
     return float(np.sqrt(np.mean(error[inner] ** 2)))
 
 
-def run_rgbmidic(f: Array, g: Array, threads: int, repeats: int) -> tuple[float, int, float]:
+def run_rgbmidic(f: FloatArray, g: FloatArray, threads: int, repeats: int) -> tuple[float, int, float]:
     from rgbmidic import correlate
 
     size = len(f)
@@ -83,7 +83,7 @@ def run_rgbmidic(f: Array, g: Array, threads: int, repeats: int) -> tuple[float,
     return seconds, len(found.nodes), rms_error(found.nodes, found.displacement[:, 1], size)
 
 
-def run_pyvale(f: Array, g: Array, threads: int, repeats: int) -> tuple[float, int, float]:
+def run_pyvale(f: FloatArray, g: FloatArray, threads: int, repeats: int) -> tuple[float, int, float]:
     from pyvale import dic  # type: ignore[import-untyped]
 
     size = len(f)
@@ -104,12 +104,12 @@ def run_pyvale(f: Array, g: Array, threads: int, repeats: int) -> tuple[float, i
     return seconds, len(x), rms_error(np.stack([x, y], axis=1), v, size)
 
 
-def run_pyxel(f: Array, g: Array, threads: int, repeats: int) -> tuple[float, int, float]:
+def run_pyxel(f: FloatArray, g: FloatArray, threads: int, repeats: int) -> tuple[float, int, float]:
     import pyxel  # type: ignore[import-untyped]
 
     size = len(f)
 
-    def image(pixels: Array) -> Any:
+    def image(pixels: FloatArray) -> Any:
         made = pyxel.Image("array")
         made.pix = pixels.copy()
         return made
@@ -126,12 +126,12 @@ def run_pyxel(f: Array, g: Array, threads: int, repeats: int) -> tuple[float, in
     return seconds, len(points), rms_error(points, -np.asarray(found)[mesh.conn[:, 1]], size)
 
 
-def write_raw_test(folder: Path, f: Array, g: Array) -> None:
+def write_raw_test(folder: Path, f: FloatArray, g: FloatArray) -> None:
     """Two raw Bayer frames of the pair under three lights, with calibration and TEST.toml."""
     from rgbmidic import Calibration
-    from rgbmidic.illumination.mosaic import Mosaic
-    from rgbmidic.sequence.writers import write_dng
-    from rgbmidic.virtual import plate_scene, record
+    from rgbmidic.frames.data import Mosaic
+    from rgbmidic.frames.writers import write_dng
+    from rgbmidic.lab.virtual import plate_scene, record
 
     scene = plate_scene(size=len(f))
     for number, image in enumerate((f, g)):
@@ -152,9 +152,9 @@ def run_file(folder: Path, repeats: int) -> dict[str, Any]:
     """From a raw frame's file to its displacement, step by step; the reference is prepared once before."""
     from rgbmidic import Tri3Mesh, read_test
     from rgbmidic.correlation import Deformed, Reference, SolveOptions
-    from rgbmidic.illumination.weights import light_weights
+    from rgbmidic.frames.series import open_frames
     from rgbmidic.pipeline import Separator, Start, read_region, texture, track
-    from rgbmidic.sequence.frames import open_frames
+    from rgbmidic.weights.threshold import light_weights
 
     imports = peak_memory()
     settings = read_test(folder / "TEST.toml")

@@ -2,7 +2,7 @@
 
     python benchmarks/uncertainty.py [sphere areas scenes noise spoiled curvature texture] [--quick] [--cache FOLDER]
 
-Scenes of `rgbmidic.virtual` with exact truth, seen by a raw Bayer camera (reflection-aware separation) and by an ideal
+Scenes of `rgbmidic.lab.virtual` with exact truth, seen by a raw Bayer camera (reflection-aware) and by an ideal
 3-CCD one; every setting is the default of `rgbmidic.correlation.correlate` with images divided by their local mean
 (sigma 10 px). The opponent is the paper's binary mask with the threshold that gives the smallest true error, sought
 anew for every scene and state, everything else equal: a choice nobody can make in a laboratory.
@@ -23,7 +23,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from demosaicing import field_error
 from uncertainty_scenes import (
     CACHE,
@@ -40,16 +39,14 @@ from uncertainty_scenes import (
 )
 
 from rgbmidic.correlation import Solution, correlate
-from rgbmidic.fields import at_nodes, at_pixels
+from rgbmidic.fields import at_nodes, at_pixels, high_pass
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.weights import threshold_weights
+from rgbmidic.lab.study.bench import Bench
+from rgbmidic.lab.study.perturbation import area_stds
+from rgbmidic.lab.virtual import strained_plate, truth
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.study.bench import Bench
-from rgbmidic.study.perturbation import area_stds, high_pass
-from rgbmidic.virtual import strained_plate, truth
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.weights.threshold import threshold_weights
 
 KINDS: dict[Kind, str] = {"rgb": "3-CCD", "bayer": "Bayer"}
 ZONES = ("mat", "reflection", "edge")
@@ -88,9 +85,9 @@ class Verdict:
     """What a solution is worth against the truth."""
 
     rms: float
-    error: Array
-    ratio: Array
-    strain_ratio: Array
+    error: FloatArray
+    ratio: FloatArray
+    strain_ratio: FloatArray
     unmeasured: float
 
     @classmethod
@@ -109,13 +106,13 @@ class Verdict:
         )
 
 
-def true_strain(pair: Pair, nodes: Array) -> Array:
+def true_strain(pair: Pair, nodes: FloatArray) -> FloatArray:
     """Strains exx, eyy, exy (N, 3) of the continuous field at the nodes."""
     dy, dx = (np.asarray(np.gradient(pair.exact, axis=axis)) for axis in (1, 2))
     return at_nodes(np.stack([dx[0], dy[1], (dy[0] + dx[1]) / 2]), nodes)
 
 
-def zones_of(pair: Pair, solution: Solution) -> dict[str, Flags]:
+def zones_of(pair: Pair, solution: Solution) -> dict[str, BoolArray]:
     """Which nodes lie in which zone."""
     mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
     there = at_pixels(mesh, at_nodes(pair.exact, solution.nodes), (pair.size, pair.size))
@@ -133,13 +130,13 @@ def zones_of(pair: Pair, solution: Solution) -> dict[str, Flags]:
     return {"mat": ~inside & ~at_edge, "reflection": inside & ~at_edge, "edge": at_edge}
 
 
-def rms(values: Array) -> float:
+def rms(values: FloatArray) -> float:
     """Root mean square of what is finite."""
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
-def covered(ratio: Array) -> float:
+def covered(ratio: FloatArray) -> float:
     """Share of errors within 1.96 standard uncertainties."""
     known = ratio[np.isfinite(ratio)]
     return float((np.abs(known) < 1.96).mean()) if known.size else float("nan")
@@ -221,7 +218,7 @@ def areas(quick: bool) -> None:
         row(f"{angle:g}°", p[0], *(f"{v:.2f}" for v in p[1:] / p[0]), tuned, q[0], *(f"{v:.2f}" for v in q[1:] / q[0]))
 
 
-def _perturbations(bench: Bench, angle: float, seed: int) -> tuple[Array, Array, float]:
+def _perturbations(bench: Bench, angle: float, seed: int) -> tuple[FloatArray, FloatArray, float]:
     """P (2, 5) of the error's two components by statistics and by the threshold with the smallest P overall."""
     scene, state = bench.scene, bench.state(angle)
     exact = truth(scene, state)
@@ -232,7 +229,7 @@ def _perturbations(bench: Bench, angle: float, seed: int) -> tuple[Array, Array,
     mesh = Tri3Mesh.from_region(bench.region, 25)
     start = at_nodes(exact, mesh.nodes) + 0.2
 
-    def p(threshold: float | None) -> Array:
+    def p(threshold: float | None) -> FloatArray:
         options: dict[str, Any] = {}
         if threshold is not None:
             first, second = (threshold_weights(image, threshold=threshold) for image in images)
@@ -375,7 +372,7 @@ def spoiled(quick: bool) -> None:
             )  # fmt: skip
 
 
-def _largest(values: Array) -> float:
+def _largest(values: FloatArray) -> float:
     return float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else float("nan")
 
 
@@ -411,7 +408,7 @@ def curvature(quick: bool) -> None:
                     )  # fmt: skip
 
 
-def rings(solution: Solution) -> dict[str, Flags]:
+def rings(solution: Solution) -> dict[str, BoolArray]:
     """Nodes on the mesh's border, those beside them, and the others."""
     mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
     border = mesh.on_boundary

@@ -15,19 +15,17 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from demosaicing import TILT, painted
 
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.mosaic import ChannelFrame, LinearChannels, LinearMosaic, Mosaic, linearise
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.unmix import unmix
-from rgbmidic.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
-from rgbmidic.virtual.scenes import PIXEL
+from rgbmidic.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
+from rgbmidic.scene.camera import PIXEL
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-Array = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 Kind = Literal["rgb", "bayer"]
 
 CACHE = {"folder": Path(tempfile.gettempdir()) / "rgbmidic-uncertainty"}
@@ -71,7 +69,7 @@ class Pair:
     scene: Scene
     lights: tuple[FloatImage, FloatImage]
     glare: tuple[FloatImage, FloatImage]
-    exact: Array
+    exact: FloatArray
 
     def cut(self, top: int, left: int, size: int) -> Pair:
         """A square part, from an even row and column so that the colour filters stay in place."""
@@ -141,7 +139,7 @@ def _nothing(*_: Any) -> None:
     return None
 
 
-def _nowhere(x: Array, y: Array) -> Flags:
+def _nowhere(x: FloatArray, y: FloatArray) -> BoolArray:
     return np.zeros(x.shape, dtype=bool)
 
 
@@ -150,9 +148,9 @@ class Spoil:
     """What spoils a frame: the zone it covers, what it does to the lights and to the samples of state 0 or 1."""
 
     name: str
-    zone: Callable[[Any, Any], Flags] = _nowhere
-    light: Callable[[Any, Flags, int], None] = _nothing
-    sensor: Callable[[Any, Flags, int], None] = _nothing
+    zone: Callable[[Any, Any], BoolArray] = _nowhere
+    light: Callable[[Any, BoolArray, int], None] = _nothing
+    sensor: Callable[[Any, BoolArray, int], None] = _nothing
     overlapping: bool = False
 
     def pair(self) -> Pair:
@@ -175,34 +173,34 @@ def overlapping_reflections() -> Pair:
     return Pair(scene, (first, second), (first * 0, second * 0), truth(scene, turn(1.0)))
 
 
-def _off(lights: Any, zone: Flags, state: int) -> None:
+def _off(lights: Any, zone: BoolArray, state: int) -> None:
     lights[0] *= 1 - state
 
 
-def _flicker(lights: Any, zone: Flags, state: int) -> None:
+def _flicker(lights: Any, zone: BoolArray, state: int) -> None:
     if state:
         lights *= np.array([1.2, 0.8, 1.2], dtype=np.float32)[:, None, None]
 
 
-def _fragment(lights: Any, zone: Flags, state: int) -> None:
+def _fragment(lights: Any, zone: BoolArray, state: int) -> None:
     if state:
         lights[:, zone] = 150 + 100 * np.random.default_rng(1).random(int(zone.sum()))
 
 
-def _rough_fragment(lights: Any, zone: Flags, state: int) -> None:
+def _rough_fragment(lights: Any, zone: BoolArray, state: int) -> None:
     if state:
         pattern = cv2.GaussianBlur(np.random.default_rng(1).normal(size=zone.shape), (0, 0), 1.5)
         lights[:, zone] = np.maximum(1000 + 500 * pattern / pattern.std(), 0)[zone]
 
 
-def _dead(values: Any, zone: Flags, state: int) -> None:
+def _dead(values: Any, zone: BoolArray, state: int) -> None:
     random = np.random.default_rng(5).random(values.shape)
     values[random < 0.005] = 0
     values[random > 0.995] = 4095
 
 
-def _saturated(channel: int) -> Callable[[Any, Flags, int], None]:
-    def spoil(values: Any, zone: Flags, state: int) -> None:
+def _saturated(channel: int) -> Callable[[Any, BoolArray, int], None]:
+    def spoil(values: Any, zone: BoolArray, state: int) -> None:
         if values.ndim == 3:
             values[channel][zone] = 4095
             return
@@ -214,15 +212,15 @@ def _saturated(channel: int) -> Callable[[Any, Flags, int], None]:
     return spoil
 
 
-def _left_third(x: Any, y: Any) -> Flags:
+def _left_third(x: Any, y: Any) -> BoolArray:
     return np.asarray(x < 448 // 3)
 
 
-def _box(x: Any, y: Any) -> Flags:
+def _box(x: Any, y: Any) -> BoolArray:
     return np.asarray((abs(x - 264) < 40) & (abs(y - 210) < 35))
 
 
-def _lamp_spot(x: Any, y: Any) -> Flags:
+def _lamp_spot(x: Any, y: Any) -> BoolArray:
     """Where the overlapping reflections saturate: over a third of the local mean is not diffuse."""
     pair = overlapping_reflections()
     bright = blurred(pair.lights[0])[0]

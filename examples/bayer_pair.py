@@ -11,9 +11,9 @@ import numpy as np
 
 from rgbmidic import Calibration, measure, read_test
 from rgbmidic.fields import at_nodes
-from rgbmidic.illumination.mosaic import Mosaic
-from rgbmidic.sequence.writers import write_dng
-from rgbmidic.virtual import State, plate_scene, record, render, strained_plate, truth
+from rgbmidic.frames.data import Mosaic
+from rgbmidic.frames.writers import write_dng
+from rgbmidic.lab.virtual import State, plate_scene, record, render, strained_plate, truth
 
 SETTINGS = """
 [frames]

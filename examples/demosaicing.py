@@ -11,9 +11,9 @@ import numpy as np
 
 from rgbmidic import correlate
 from rgbmidic.fields import at_nodes
-from rgbmidic.illumination.mosaic import LinearMosaic, linearise
+from rgbmidic.illumination.linearise import LinearMosaic, linearise
 from rgbmidic.illumination.separate import separate, separate_reflections
-from rgbmidic.virtual import plate_scene, record, render, strained_plate, truth
+from rgbmidic.lab.virtual import plate_scene, record, render, strained_plate, truth
 
 scene = plate_scene(size=288, seed=5, gloss=1.5, glare="green", tilt_deg=(-8.6, 0.0))
 # wrinkles twice as wide, sampled by few rays: a rough reflection

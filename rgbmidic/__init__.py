@@ -10,15 +10,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rgbmidic.config import TestSettings, read_test
     from rgbmidic.correlation import NodeStatus, Solution, Status, correlate
     from rgbmidic.errors import RgbmidicError
+    from rgbmidic.frames.readers import read_frame
     from rgbmidic.illumination.calibration import Calibration
-    from rgbmidic.inspection import Inspection, inspect_frame
+    from rgbmidic.lab.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import Region, Tri3Mesh
     from rgbmidic.pipeline import measure
-    from rgbmidic.sequence.readers import read_frame
-    from rgbmidic.sequence.store import Result
+    from rgbmidic.results.store import Result
+    from rgbmidic.settings import TestSettings, read_test
 
 __version__ = "0.1.0"
 
@@ -43,20 +43,20 @@ __all__ = [
 
 _HOMES = {
     "Calibration": "rgbmidic.illumination.calibration",
-    "Inspection": "rgbmidic.inspection",
+    "Inspection": "rgbmidic.lab.inspection",
     "NodeStatus": "rgbmidic.correlation",
     "Region": "rgbmidic.mesh",
-    "Result": "rgbmidic.sequence.store",
+    "Result": "rgbmidic.results.store",
     "RgbmidicError": "rgbmidic.errors",
     "Solution": "rgbmidic.correlation",
     "Status": "rgbmidic.correlation",
-    "TestSettings": "rgbmidic.config",
+    "TestSettings": "rgbmidic.settings",
     "Tri3Mesh": "rgbmidic.mesh",
     "correlate": "rgbmidic.correlation",
-    "inspect_frame": "rgbmidic.inspection",
+    "inspect_frame": "rgbmidic.lab.inspection",
     "measure": "rgbmidic.pipeline",
-    "read_frame": "rgbmidic.sequence.readers",
-    "read_test": "rgbmidic.config",
+    "read_frame": "rgbmidic.frames.readers",
+    "read_test": "rgbmidic.settings",
 }
 
 

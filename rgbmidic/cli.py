@@ -19,8 +19,8 @@ from rich.table import Table
 
 from rgbmidic import __version__
 from rgbmidic.errors import InputError, RgbmidicError
-from rgbmidic.report.export import EXPORT_FORMATS, export_result
-from rgbmidic.sequence.store import Result
+from rgbmidic.results.export import EXPORT_FORMATS, export_result
+from rgbmidic.results.store import Result
 
 __all__ = ["app", "main"]
 
@@ -89,8 +89,8 @@ def run(
     figures: Annotated[bool, typer.Option(help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
-    from rgbmidic.config import read_test
     from rgbmidic.pipeline import measure
+    from rgbmidic.settings import read_test
 
     started = time.perf_counter()
     settings = read_test(test)
@@ -125,7 +125,7 @@ def demo(
     ),
 ) -> None:
     """Make a small virtual test, calibrate, measure it, and compare with the known truth."""
-    from rgbmidic.demo import run_demo
+    from rgbmidic.lab.demo import run_demo
     from rgbmidic.report.gallery import write_figures
 
     started = time.perf_counter()
@@ -149,7 +149,7 @@ def virtual(
     out: Out,
 ) -> None:
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
-    from rgbmidic.virtual.dataset import write_dataset
+    from rgbmidic.lab.virtual.dataset import write_dataset
 
     with _progress("rendering") as progress:
         write_dataset(scene, out, progress)
@@ -162,10 +162,10 @@ def plan(
     overwrite: Overwrite = False,
 ) -> None:
     """Where each lamp will reflect, what uncertainty to expect, and where the lamps would stand better."""
-    from rgbmidic.report import planning
-    from rgbmidic.virtual.lamps import propose_colours, propose_lamps
-    from rgbmidic.virtual.planning import make_plan
-    from rgbmidic.virtual.scenefile import read_scene
+    from rgbmidic.lab.planning import report as planning
+    from rgbmidic.lab.planning.lamps import propose_colours, propose_lamps
+    from rgbmidic.lab.planning.plan import make_plan
+    from rgbmidic.scene.scenefile import read_scene
 
     planning.check_folder(out, overwrite=overwrite)
     made = make_plan(read_scene(scene))
@@ -199,9 +199,9 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
-    from rgbmidic.config import read_test
-    from rgbmidic.inspection import inspect_files, state_frames
-    from rgbmidic.report import inspection
+    from rgbmidic.lab.inspection import inspect_files, state_frames
+    from rgbmidic.lab.inspection import report as inspection
+    from rgbmidic.settings import read_test
 
     if out is not None:
         inspection.check_folder(out, overwrite=overwrite)
@@ -258,8 +258,8 @@ def paper(
     overwrite: Overwrite = False,
 ) -> None:
     """The paper's experiment on the virtual bench, its statements beside what is measured (docs/study.md)."""
-    from rgbmidic.report.study import check_folder, write_study
-    from rgbmidic.study import ANGLES, run_paper_study
+    from rgbmidic.lab.study import ANGLES, run_paper_study
+    from rgbmidic.lab.study.report import check_folder, write_study
 
     started = time.perf_counter()
     wanted = _numbers(angles, "--angles") if angles else ANGLES

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 
 GAIN, READ, BLACK, WHITE = 4.0, 3.0, 64.0, 4095.0
 

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.mosaic import LinearMosaic, NoiseModel, cfa_channels
+from rgbmidic.illumination.linearise import LinearMosaic, NoiseModel
 
 A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 CROSSTALK = Crosstalk(matrix=A, lights=("red", "green", "blue"))

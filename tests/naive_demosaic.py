@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rgbmidic.illumination.mosaic import cfa_channels
+from rgbmidic.frames.data import cfa_channels
 
 
 def site_channels(shape, cfa):

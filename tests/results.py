@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
+from rgbmidic.results.store import FrameRecord, Result, ResultStore
 
 __all__ = ["LIGHTS", "MESH", "NODES", "make_result", "random_record"]
 

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from textures import Affine, Texture
 
-from rgbmidic.config import TestSettings, read_test
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic
-from rgbmidic.sequence.writers import write_dng, write_tiff
-from rgbmidic.virtual import Scene, plate_scene, record, render, strained_plate, truth
+from rgbmidic.lab.virtual import Scene, plate_scene, record, render, strained_plate, truth
+from rgbmidic.settings import TestSettings, read_test
 
 __all__ = ["REGION", "SHAPE", "SmallTest", "colour_test", "grey_frame", "toml"]
 

@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["BlockMeans", "block_centres", "block_means", "plane_origins", "planes_of", "saturation_pile"]
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,9 +44,9 @@ class BlockMeans:
         Grey level (DN) below the white level at which samples pile up as they do at saturation; None: nowhere.
     """
 
-    planes: Floats
+    planes: FloatArray
     names: tuple[str, ...]
-    saturated: npt.NDArray[np.bool_]
+    saturated: BoolArray
     full_scale: float
     shape: tuple[int, int]
     block: int
@@ -55,14 +54,14 @@ class BlockMeans:
     piled_at: float | None = None
 
     @property
-    def channels(self) -> Floats:
+    def channels(self) -> FloatArray:
         """Block averages of the channels R, G, B, shape (3, R, S): the two greens of a mosaic averaged."""
         if len(self.names) == 3:
             return self.planes
         return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
 
 
-def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.NDArray[np.uint16]], Floats]:
+def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.NDArray[np.uint16]], FloatArray]:
     """Colour planes of a frame: their names, their samples and their black levels.
 
     Parameters
@@ -136,7 +135,7 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
     )
 
 
-def block_centres(shape: tuple[int, int], block: int) -> Floats:
+def block_centres(shape: tuple[int, int], block: int) -> FloatArray:
     """Centres (x, y) in px of the blocks of a frame, shape (R, S, 2)."""
     rows, columns = (_starts(side, block) + (block - 1) / 2 for side in shape)
     return np.stack(np.meshgrid(columns, rows), axis=-1)
@@ -147,7 +146,7 @@ def _starts(side: int, block: int) -> npt.NDArray[np.intp]:
     return np.arange(2, side - side % 2 - block - 1, block)
 
 
-def _window(side: int, length: int, block: int, step: int, offset: int) -> Floats:
+def _window(side: int, length: int, block: int, step: int, offset: int) -> FloatArray:
     """Weights (blocks, samples) that average the samples at offset + step * n with the window of the module."""
     position = offset + step * np.arange(length)
     distance = position[None, :] - _starts(side, block)[:, None]
@@ -156,7 +155,7 @@ def _window(side: int, length: int, block: int, step: int, offset: int) -> Float
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float64)
 
 
-def _saturated(frame: Mosaic | ChannelFrame, block: int) -> npt.NDArray[np.bool_]:
+def _saturated(frame: Mosaic | ChannelFrame, block: int) -> BoolArray:
     clipped = np.atleast_3d(frame.white_level <= frame.values.T).any(axis=2).T
     rows, columns = (_starts(side, block) for side in clipped.shape)
     # Summed-area table over each block with its rim of one pixel.

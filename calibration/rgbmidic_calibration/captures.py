@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import rgbmidic
-from rgbmidic.config import FrameSettings
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
-from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic
-from rgbmidic.sequence.frames import FrameSequence, FrameSource, file_hash, open_frames
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.series import FrameSequence, FrameSource, file_hash, open_frames
+from rgbmidic.settings import FrameSettings
 
 __all__ = ["CaptureFiles", "check_output", "named_patterns", "provenance"]
 

@@ -11,17 +11,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
+from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.blocks import BlockMeans, block_centres
 from rgbmidic_calibration.plausibility import CHECKS, check_captures, check_matrix
 from rgbmidic_calibration.ratio import ColumnFit, Variation, capture_scatter, fit_column, offsets_left, variation
 
 __all__ = ["CHANNELS", "CrosstalkEstimate", "LightFit", "estimate_crosstalk"]
 
-Floats = npt.NDArray[np.float64]
 
 CHANNELS = ("R", "G", "B")
 
@@ -64,15 +63,15 @@ class LightFit:
 
     name: str
     reference: int
-    column: Floats
+    column: FloatArray
     signal: float
     used: float
     saturated: float
     rejected: float
     intensity_drift: float
     colour_drift: float
-    offset: Floats
-    offset_std: Floats
+    offset: FloatArray
+    offset_std: FloatArray
     variation: Variation
     captures: int
 
@@ -92,24 +91,24 @@ class CrosstalkEstimate:
 
     crosstalk: Crosstalk
     lights: tuple[LightFit, ...]
-    dark: Floats
-    dark_std: Floats
+    dark: FloatArray
+    dark_std: FloatArray
     warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class _Dark:
-    level: Floats  # (C, R, S) mean dark signal above the stated black level
-    mean_covariance: Floats  # (C, C) of the error of that mean, common to all blocks
-    frame_covariance: Floats  # (C, C) of one frame's own offset
+    level: FloatArray  # (C, R, S) mean dark signal above the stated black level
+    mean_covariance: FloatArray  # (C, C) of the error of that mean, common to all blocks
+    frame_covariance: FloatArray  # (C, C) of one frame's own offset
 
 
 @dataclass(frozen=True, slots=True)
 class _Light:
     name: str
     captures: Sequence[BlockMeans]
-    signal: Floats
-    valid: npt.NDArray[np.bool_]
+    signal: FloatArray
+    valid: BoolArray
     reference: int
 
 
@@ -208,7 +207,7 @@ def _variation(light: _Light, like: BlockMeans) -> tuple[int, Variation]:
     return needed, overall
 
 
-def _summary(light: _Light, fit: ColumnFit, found: Variation, design: Floats) -> LightFit:
+def _summary(light: _Light, fit: ColumnFit, found: Variation, design: FloatArray) -> LightFit:
     count = fit.weights.sum(axis=(1, 2))
     strength = fit.mass / np.maximum(count, 1)
     offset, offset_std = offsets_left(light.signal, fit.weights, light.reference, design)
@@ -244,7 +243,7 @@ def _assemble(
     )
 
 
-def _covariance(columns: Sequence[ColumnFit], dark: _Dark) -> Floats:
+def _covariance(columns: Sequence[ColumnFit], dark: _Dark) -> FloatArray:
     """Covariance (T, C, k, T, C, k) of all coefficients: the error of the dark mean is common to all lights."""
     terms, channels = columns[0].coefficients.shape
     full = np.zeros((terms, channels, len(columns), terms, channels, len(columns)))

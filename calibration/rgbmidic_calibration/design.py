@@ -14,18 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.virtual.spectra import Led, Sensitivities
+from rgbmidic.illumination.spectra import Led, Sensitivities
+from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["Design", "Lamp", "MeasuredLamp", "best_sets", "design", "draw_design", "read_camera", "read_lamp"]
-
-Floats = npt.NDArray[np.float64]
 
 
 UNSEEN = 1e-3
@@ -35,7 +33,7 @@ UNSEEN = 1e-3
 class Lamp(Protocol):
     """Anything with a spectrum."""
 
-    def power(self, wavelengths: Floats) -> Floats:
+    def power(self, wavelengths: FloatArray) -> FloatArray:
         """Spectral power at equally spaced wavelengths (nm), of unit sum."""
         ...
 
@@ -52,8 +50,8 @@ class MeasuredLamp:
         Power per nm, any unit.
     """
 
-    wavelengths: Floats
-    values: Floats
+    wavelengths: FloatArray
+    values: FloatArray
 
     def __post_init__(self) -> None:
         wavelengths = np.asarray(self.wavelengths, dtype=np.float64)
@@ -64,7 +62,7 @@ class MeasuredLamp:
         object.__setattr__(self, "wavelengths", wavelengths)
         object.__setattr__(self, "values", values)
 
-    def power(self, wavelengths: Floats) -> Floats:
+    def power(self, wavelengths: FloatArray) -> FloatArray:
         """Spectral power at equally spaced wavelengths (nm), of unit sum; zero outside the measured range."""
         values = np.interp(wavelengths, self.wavelengths, self.values, left=0.0, right=0.0)
         if not values.sum() > 0:
@@ -90,8 +88,8 @@ class Design:
     """
 
     crosstalk: Crosstalk
-    response: Floats
-    power: Floats
+    response: FloatArray
+    power: FloatArray
     headroom: float
 
     @property
@@ -189,7 +187,7 @@ def _lamp_of_colour(name: str) -> MeasuredLamp:
     return MeasuredLamp(wavelengths=known[name].wavelengths, values=known[name].values)
 
 
-def _read_table(text: str, endings: Sequence[str] = ("",)) -> tuple[Floats, Floats]:
+def _read_table(text: str, endings: Sequence[str] = ("",)) -> tuple[FloatArray, FloatArray]:
     """Wavelengths and the columns that a text FILE.csv#NAME means, shape (columns, n)."""
     file, _, column = text.partition("#")
     try:

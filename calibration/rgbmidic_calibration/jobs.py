@@ -6,10 +6,10 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-from rgbmidic.config import FrameSettings
 from rgbmidic.errors import ConfigurationError
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic
+from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration.blocks import BlockMeans, block_means
 from rgbmidic_calibration.captures import CaptureFiles, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk

@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.camera_noise import CameraNoise, Quantity
+from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.pattern import fixed_pattern
 from rgbmidic_calibration.stacks import TemporalStack, same_camera
 
 __all__ = ["NoiseEstimate", "TransferCurve", "photon_transfer"]
 
-Floats = npt.NDArray[np.float64]
 
 BLOCK = 16
 """Side of the blocks, in samples of a plane."""
@@ -53,8 +53,8 @@ class TransferCurve:
         Largest relative departure of an exposure's mean variance from the line, beyond its noise.
     """
 
-    mean: Floats
-    variance: Floats
+    mean: FloatArray
+    variance: FloatArray
     scatter: float
     bend: float
 
@@ -73,7 +73,7 @@ class NoiseEstimate:
 class _Line:
     read_variance: float
     slope: float
-    covariance: Floats  # (2, 2)
+    covariance: FloatArray  # (2, 2)
     curve: TransferCurve
 
 
@@ -147,7 +147,7 @@ def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
         raise CalibrationError("the dark frames are not darker than half of the brightest flat frames: was a lamp on?")
 
 
-def _blocks(values: npt.NDArray[np.generic]) -> Floats:
+def _blocks(values: npt.NDArray[np.generic]) -> FloatArray:
     """Means over blocks of BLOCK x BLOCK samples, flattened; a border that does not fill a block is left out."""
     size = min(BLOCK, *values.shape)
     rows, columns = (side // size for side in values.shape)
@@ -180,7 +180,7 @@ def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -
     return _weighted_line(mean[used], variance[used], freedom[used], exposure[used])
 
 
-def _weighted_line(mean: Floats, variance: Floats, freedom: Floats, exposure: Floats) -> _Line:
+def _weighted_line(mean: FloatArray, variance: FloatArray, freedom: FloatArray, exposure: FloatArray) -> _Line:
     design = np.stack([np.ones_like(mean), mean], axis=1)
     fitted = np.maximum(variance.mean(), 1e-6) * np.ones_like(mean)
     for _ in range(8):
@@ -249,7 +249,7 @@ def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line:
     return lowest
 
 
-def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: Floats) -> Quantity:
+def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: FloatArray) -> Quantity:
     """EMVA 1288 LE: mean relative deviation in % from the line through mean against exposure time, 5 to 95 %."""
     planes = len(dark.names)
     known = [flat for flat in flats if flat.exposure is not None]

@@ -10,11 +10,11 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from rgbmidic.illumination.camera_noise import Quantity
+from rgbmidic.typing import BoolArray
 from rgbmidic_calibration.stacks import TemporalStack
 
 __all__ = ["FixedPattern", "fixed_pattern"]
 
-Floats = npt.NDArray[np.float64]
 
 WINDOW = 7
 """Side (samples of a plane) of the neighbourhood whose mean is taken out: shading and dirt are wider than this."""
@@ -76,7 +76,7 @@ def _texture_warning(planes: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def _hot(dark: TemporalStack, plane: int) -> npt.NDArray[np.bool_]:
+def _hot(dark: TemporalStack, plane: int) -> BoolArray:
     excess = dark.mean[plane] - ndimage.median_filter(dark.mean[plane], 5)
     spread = float(np.median(np.abs(excess))) / 0.6745
     floor = HOT_SHARE * (dark.white - float(dark.black[plane]))
@@ -84,8 +84,8 @@ def _hot(dark: TemporalStack, plane: int) -> npt.NDArray[np.bool_]:
 
 
 def _response(
-    dark: TemporalStack, flat: TemporalStack, plane: int, hot: npt.NDArray[np.bool_]
-) -> tuple[tuple[float, float] | None, npt.NDArray[np.bool_]]:
+    dark: TemporalStack, flat: TemporalStack, plane: int, hot: BoolArray
+) -> tuple[tuple[float, float] | None, BoolArray]:
     """Relative spread of the response with its uncertainty, None where it cannot be told; dead pixels."""
     signal = flat.mean[plane] - dark.mean[plane]
     around = ndimage.median_filter(signal, 5)
@@ -100,7 +100,7 @@ def _response(
 
 
 def _spread(
-    mean: npt.NDArray[np.floating], temporal: npt.NDArray[np.floating], usable: npt.NDArray[np.bool_]
+    mean: npt.NDArray[np.floating], temporal: npt.NDArray[np.floating], usable: BoolArray
 ) -> tuple[float, float]:
     """Spatial standard deviation about the neighbourhood's mean, temporal noise taken out, and its uncertainty."""
     filled = np.where(usable, mean, np.median(mean[usable]))
@@ -116,6 +116,6 @@ def _spread(
     return float(value), float(error / (2 * value)) if variance > error else float(np.sqrt(error))
 
 
-def _places(stack: TemporalStack, plane: int, marked: npt.NDArray[np.bool_], kind: str) -> list[tuple[int, int, str]]:
+def _places(stack: TemporalStack, plane: int, marked: BoolArray, kind: str) -> list[tuple[int, int, str]]:
     row, column = stack.origins[plane]
     return [(int(r) * stack.step + row, int(c) * stack.step + column, kind) for r, c in np.argwhere(marked)]

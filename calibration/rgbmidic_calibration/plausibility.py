@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["CHECKS", "check_captures", "check_matrix"]
 
-Floats = npt.NDArray[np.float64]
 Labels = Mapping[str, Sequence[str]]
 
 CHECKS = {

@@ -15,12 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["ColumnFit", "Variation", "capture_scatter", "fit_column", "offsets_left", "variation"]
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 OUTLIER = 5.0
 """Robust standard deviations beyond which a block is left out: a fluorescent spot, a label, a hot cluster."""
@@ -48,15 +47,15 @@ class ColumnFit:
         Sum of the reference channel over the blocks used, per capture.
     """
 
-    coefficients: Floats
-    covariance: Floats
-    leverage: Floats
-    weights: Floats
-    residual: Floats
-    mass: Floats
+    coefficients: FloatArray
+    covariance: FloatArray
+    leverage: FloatArray
+    weights: FloatArray
+    residual: FloatArray
+    mass: FloatArray
 
 
-def fit_column(signal: Floats, valid: Bools, reference: int, design: Floats) -> ColumnFit:
+def fit_column(signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray) -> ColumnFit:
     """Fit one light's column.
 
     Parameters
@@ -91,20 +90,22 @@ def fit_column(signal: Floats, valid: Bools, reference: int, design: Floats) -> 
     )
 
 
-def _moment(weights: Floats, design: Floats) -> Floats:
+def _moment(weights: FloatArray, design: FloatArray) -> FloatArray:
     flat = design.reshape(-1, design.shape[-1])
     return np.asarray((flat * weights.sum(axis=0).reshape(-1, 1)).T @ flat)
 
 
-def _total(weights: Floats, design: Floats) -> Floats:
+def _total(weights: FloatArray, design: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nrs,rst->t", weights, design))
 
 
-def _residual(signal: Floats, base: Floats, design: Floats, coefficients: Floats) -> Floats:
+def _residual(signal: FloatArray, base: FloatArray, design: FloatArray, coefficients: FloatArray) -> FloatArray:
     return np.asarray(signal - np.einsum("rst,tc->crs", design, coefficients) * base[:, None])
 
 
-def _without_outliers(signal: Floats, valid: Bools, reference: int, design: Floats) -> tuple[Floats, Floats]:
+def _without_outliers(
+    signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Weights and coefficients, iterated from the median of the blocks' ratios.
 
     Every channel's residual is compared with its median spread times the square root of x (shot noise). Weights
@@ -131,7 +132,7 @@ def _without_outliers(signal: Floats, valid: Bools, reference: int, design: Floa
     return weights, coefficients
 
 
-def _cluster_sums(values: Floats) -> Floats:
+def _cluster_sums(values: FloatArray) -> FloatArray:
     """Sums (clusters, Q) of (Q, R, S) over 2 x 2 blocks: what spills over a block's border stays within a cluster."""
     rows, columns = values.shape[1:]
     step = 2 if rows * columns >= 64 else 1
@@ -155,7 +156,7 @@ class Variation:
     rms: float
 
 
-def variation(signal: Floats, valid: Bools, reference: int, design: Floats, known: int) -> Variation:
+def variation(signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray, known: int) -> Variation:
     """Test whether the Legendre products after the first `known` ones are needed in any channel.
 
     A score test with random signs: the model of the first terms is fitted, its residuals are correlated with the other
@@ -190,7 +191,7 @@ def variation(signal: Floats, valid: Bools, reference: int, design: Floats, know
     )
 
 
-def capture_scatter(fit: ColumnFit) -> Floats:
+def capture_scatter(fit: ColumnFit) -> FloatArray:
     """Variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
 
     The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
@@ -208,7 +209,9 @@ def capture_scatter(fit: ColumnFit) -> Floats:
     return np.where(scatter > limit * noise, scatter - noise, 0.0)
 
 
-def offsets_left(signal: Floats, weights: Floats, reference: int, design: Floats) -> tuple[Floats, Floats]:
+def offsets_left(
+    signal: FloatArray, weights: FloatArray, reference: int, design: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
 
     ``y = x a + o`` with the other captures' x as instrument for the slope: their noise is independent. NaN for fewer

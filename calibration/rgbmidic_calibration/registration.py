@@ -19,12 +19,11 @@ from rgbmidic.correlation.correlate import correlate
 from rgbmidic.correlation.solution import NodeStatus, Solution
 from rgbmidic.errors import CalibrationError, RgbmidicError
 from rgbmidic.illumination.registration import PARAMETERS, Registration, frame_geometry, registration_basis
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.stacks import TemporalStack, same_camera
 
 __all__ = ["ELEMENT", "LightMatch", "RegistrationEstimate", "estimate_registration", "jitter", "light_picture"]
 
-Floats = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
 
 LOCAL = 8.0
 """Standard deviation (px) of the neighbourhood whose mean a plane is divided by: several speckles."""
@@ -62,10 +61,10 @@ class LightMatch:
     """
 
     name: str
-    nodes: Floats
-    displacement: Floats
-    residual: Floats
-    used: npt.NDArray[np.bool_]
+    nodes: FloatArray
+    displacement: FloatArray
+    residual: FloatArray
+    used: BoolArray
 
     @property
     def rms(self) -> float:
@@ -82,7 +81,7 @@ class RegistrationEstimate:
     warnings: tuple[str, ...] = ()
 
 
-def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Image:
+def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> FloatImage:
     """The picture of the one light that is on, relative to its local mean, at every pixel.
 
     Parameters
@@ -139,7 +138,7 @@ def _clear(stack: TemporalStack, dark: TemporalStack | None, plane: int, level: 
     return level > CLEAR * float(np.sqrt(noise))
 
 
-def _relative(signal: npt.NDArray[np.floating], clipped: npt.NDArray[np.bool_], sigma: float) -> Image:
+def _relative(signal: npt.NDArray[np.floating], clipped: BoolArray, sigma: float) -> FloatImage:
     """Signal over its local mean; NaN where clipped."""
     weight = (~clipped).astype(np.float32)
     total = ndimage.gaussian_filter(signal * weight, sigma)
@@ -148,7 +147,7 @@ def _relative(signal: npt.NDArray[np.floating], clipped: npt.NDArray[np.bool_], 
     return np.where(clipped, np.nan, signal / np.maximum(mean, floor)).astype(np.float32)
 
 
-def _filled(picture: Image, used: Image) -> Image:
+def _filled(picture: FloatImage, used: FloatImage) -> FloatImage:
     """Pixels of planes not used: the mean of their neighbours, symmetric so that nothing shifts."""
     if used.all():
         return picture
@@ -214,7 +213,7 @@ def estimate_registration(
 def _warnings(
     lights: Mapping[str, TemporalStack],
     dark: TemporalStack | None,
-    motion: Mapping[str, Floats],
+    motion: Mapping[str, FloatArray],
     matches: Sequence[LightMatch],
 ) -> list[str]:
     warnings = [] if dark else ["no dark frames: the sensor's own pattern stays in the pictures"]
@@ -227,7 +226,7 @@ def _warnings(
     return warnings + _misfits(matches)
 
 
-def _picture(name: str, stack: TemporalStack, dark: TemporalStack | None) -> Image:
+def _picture(name: str, stack: TemporalStack, dark: TemporalStack | None) -> FloatImage:
     try:
         picture = light_picture(stack, dark)
     except CalibrationError as error:
@@ -238,7 +237,11 @@ def _picture(name: str, stack: TemporalStack, dark: TemporalStack | None) -> Ima
 
 
 def _match(
-    reference: Image, other: Image, region: Sequence[float] | None, element_size: float, names: tuple[str, str]
+    reference: FloatImage,
+    other: FloatImage,
+    region: Sequence[float] | None,
+    element_size: float,
+    names: tuple[str, str],
 ) -> Solution:
     height, width = reference.shape
     inside = region if region is not None else (BORDER, BORDER, width - 1 - BORDER, height - 1 - BORDER)
@@ -260,7 +263,7 @@ def _match(
 
 def _fit(
     name: str, solution: Solution, centre: tuple[float, float], radius: float, element_size: float
-) -> tuple[Floats, Floats, LightMatch]:
+) -> tuple[FloatArray, FloatArray, LightMatch]:
     """Parameters (5,), covariance (5, 5) and residuals: weighted least squares without outliers, cluster sandwich."""
     value = solution.displacement
     basis = registration_basis(solution.nodes, centre, radius)
@@ -286,7 +289,9 @@ def _fit(
     return parameters, covariance, match
 
 
-def _least_squares(basis: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]:
+def _least_squares(
+    basis: FloatArray, value: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Parameters, inverse of the normal matrix and residuals; values of weight 0 may be NaN."""
     scaled = basis * weight[..., None]
     inverse = np.linalg.inv(np.einsum("ndp,ndq->pq", scaled, basis))
@@ -294,7 +299,7 @@ def _least_squares(basis: Floats, value: Floats, weight: Floats) -> tuple[Floats
     return parameters, inverse, value - basis @ parameters
 
 
-def _cell_sums(values: Floats, nodes: Floats, side: float) -> Floats:
+def _cell_sums(values: FloatArray, nodes: FloatArray, side: float) -> FloatArray:
     """Sums (cells, Q) of values (N, Q) over square cells: neighbouring nodes share pixels and errors."""
     _, cell = np.unique(np.floor(nodes / side).astype(int), axis=0, return_inverse=True)
     return np.stack([np.bincount(cell.ravel(), weights=column) for column in values.T], axis=1)
@@ -316,7 +321,7 @@ def _misfits(matches: Sequence[LightMatch]) -> list[str]:
     return warnings
 
 
-def jitter(stack: TemporalStack, picture: Image) -> Floats:
+def jitter(stack: TemporalStack, picture: FloatImage) -> FloatArray:
     """How much the picture moved from frame to frame: standard deviation (2,) in x and y, px; NaN for a single frame.
 
     The temporal variance of a sample that moves by d is ``r^2 + K mu + (d . gradient)^2``; the coefficients of the

@@ -6,16 +6,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.blocks import plane_origins, planes_of, saturation_pile
 
 __all__ = ["TemporalStack", "same_camera", "stack_frames"]
 
-Floats = npt.NDArray[np.float64]
-Images = tuple[npt.NDArray[np.float32], ...]
+Images = tuple[FloatImage, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,9 +53,9 @@ class TemporalStack:
     names: tuple[str, ...]
     mean: Images
     variance: Images
-    clipped: tuple[npt.NDArray[np.bool_], ...]
-    strength: Floats
-    black: Floats
+    clipped: tuple[BoolArray, ...]
+    strength: FloatArray
+    black: FloatArray
     white: float
     zeros: float
     piled_at: float | None
@@ -112,7 +111,7 @@ class _Running:
         self.mean = [np.zeros(plane.shape, dtype=np.float32) for plane in planes]
         self.squares = [np.zeros(plane.shape, dtype=np.float32) for plane in planes]
         self.clipped = [np.zeros(plane.shape, dtype=bool) for plane in planes]
-        self.strength: list[Floats] = []
+        self.strength: list[FloatArray] = []
         self.zeros = 0.0
         self.piled_at: float | None = None
 
@@ -158,7 +157,7 @@ class _Running:
         )
 
 
-def _ratio(levels: Floats, by: Floats) -> Floats:
+def _ratio(levels: FloatArray, by: FloatArray) -> FloatArray:
     """Ratio of strengths; 1 where there is hardly any light to drift."""
     return np.where((levels > 1) & (by > 1), levels / np.where(by > 1, by, 1.0), 1.0)
 

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from rgbmidic.config import FrameSettings
 from rgbmidic.errors import CalibrationError, ConfigurationError
+from rgbmidic.frames.readers import tells_camera
+from rgbmidic.frames.series import file_hash
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.sequence.frames import file_hash
-from rgbmidic.sequence.readers import tells_camera
+from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration.blocks import block_means
 from rgbmidic_calibration.captures import CaptureFiles
 from rgbmidic_calibration.stacks import TemporalStack, stack_frames

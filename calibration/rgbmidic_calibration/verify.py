@@ -11,8 +11,9 @@ import numpy.typing as npt
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.camera_noise import QUANTISATION
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.mosaic import NoiseModel
+from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.registration import Registration
+from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.blocks import BlockMeans, block_centres
 from rgbmidic_calibration.registration import estimate_registration
 from rgbmidic_calibration.stacks import TemporalStack, same_camera
@@ -28,7 +29,6 @@ __all__ = [
     "registration_left",
 ]
 
-Floats = npt.NDArray[np.float64]
 
 BLOCK = 16
 
@@ -96,9 +96,9 @@ class Leakage:
 
     lights: tuple[str, ...]
     alone: tuple[str, ...]
-    mean: Floats
-    std: Floats
-    local: Floats
+    mean: FloatArray
+    std: FloatArray
+    local: FloatArray
 
     def items(self, limit: float) -> list[CheckItem]:
         """One line per pair of lights."""
@@ -147,7 +147,7 @@ def leakage(
 
 def _unmixed(
     crosstalk: Crosstalk, name: str, captures: Sequence[BlockMeans], level: npt.NDArray[np.floating] | np.float64
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Ratios (k,) of every light's sum to that of light `name`, their uncertainty and their local spread."""
     first = captures[0]
     clear = ~np.any([frame.saturated for frame in captures], axis=0)
@@ -198,8 +198,8 @@ class Additivity:
     spread: float
     noise: float
     offset: float
-    change: Floats
-    change_std: Floats
+    change: FloatArray
+    change_std: FloatArray
     left: float
     signal: float
 
@@ -279,7 +279,7 @@ def _difference(
     dark: TemporalStack | None,
     plane: int,
     noise: NoiseModel | None,
-) -> Floats:
+) -> FloatArray:
     """Difference, its noise variance, and every light's image, (2 + k, h, w) with NaN where saturated, of one plane."""
     level = dark.mean[plane] if dark else 0.0
     lights = [stack.mean[plane] - level for stack in singles.values()]
@@ -301,7 +301,7 @@ def _variance(stack: TemporalStack, plane: int, noise: NoiseModel | None) -> npt
     return np.full(stack.mean[plane].shape, QUANTISATION)
 
 
-def _blocks(rows: Floats) -> Floats:
+def _blocks(rows: FloatArray) -> FloatArray:
     """Means over blocks without saturated samples, (2 + k, blocks); the variance row becomes that of the mean."""
     count, height, width = rows.shape
     size = min(BLOCK, height, width)

@@ -6,11 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.correlation.problem import Reference
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["brightness_change"]
 
-FloatArray = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 
 _EVERY = 4
 """Only every so many pixels are looked at."""
@@ -57,7 +56,7 @@ def brightness_change(
 
 
 def _gain_and_offset(
-    f: FloatImage, g: FloatImage, inside: npt.NDArray[np.bool_], owner: npt.NDArray[np.int64], elements: int
+    f: FloatImage, g: FloatImage, inside: BoolArray, owner: npt.NDArray[np.int64], elements: int
 ) -> tuple[float, float]:
     known = inside & np.isfinite(f) & np.isfinite(g)
     owner = owner[known]

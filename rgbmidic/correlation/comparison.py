@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.correlation import element_moments, element_vector, interpolate_nodal
 from rgbmidic._kernels.grid import block_sums, score_sums
 from rgbmidic.correlation.problem import Reference
 from rgbmidic.correlation.system import factorise
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 __all__ = ["Comparison"]
 
-FloatArray = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 
 _MATCHED = (0.4, 0.6)
 """Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
@@ -79,7 +76,7 @@ class Comparison:
         x, y = self.reference.gradient_x * deviation[0], self.reference.gradient_y * deviation[1]
         return replace(self, values=self.values - x - y)
 
-    def matched(self, least: float | None = None) -> npt.NDArray[np.bool_]:
+    def matched(self, least: float | None = None) -> BoolArray:
         """Elements (E,) whose images match: zero-mean correlation coefficient of all lights together.
 
         Elements without weight or texture in the reference say nothing and count as matched. `least` is the
@@ -105,7 +102,7 @@ class Comparison:
             least = float(np.clip(1 - _WORSE * (1 - typical), *_MATCHED))
         return np.asarray(coefficient >= least)
 
-    def misfit(self, weights: FloatImage, measured: npt.NDArray[np.bool_]) -> FloatArray:
+    def misfit(self, weights: FloatImage, measured: BoolArray) -> FloatArray:
         """Weighted rms residual around each node (N,), over its median: 1 is ordinary, 3 is suspicious.
 
         `weights` (k, P) are those of the solve, in units of the inverse variance of the residual.
@@ -318,12 +315,12 @@ def _autocorrelation(image: FloatImage) -> FloatArray:
     return np.array(sums)
 
 
-def _typical(variance: FloatImage, seen: npt.NDArray[np.bool_]) -> float:
+def _typical(variance: FloatImage, seen: BoolArray) -> float:
     """Median where `seen`, from about 100 000 values."""
     return float(np.median(variance[seen][:: max(1, int(seen.sum()) // 100_000)])) if seen.any() else 0.0
 
 
-def _blur(image: npt.NDArray[Any], sigma: float) -> npt.NDArray[Any]:
+def _blur(image: AnyArray, sigma: float) -> AnyArray:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
 
 

@@ -15,10 +15,9 @@ from rgbmidic.correlation.start import coarse_start
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.normalise import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["as_weights", "correlate", "initial_displacement"]
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def correlate(
@@ -103,7 +102,7 @@ def correlate(
     return solve(first, second, start, options)
 
 
-def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str) -> npt.NDArray[np.float32] | None:
+def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str) -> FloatImage | None:
     """Weights (H, W) or (k, H, W) as a float32 stack of `shape` (k, H, W).
 
     Raises

@@ -12,17 +12,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import curvature_deviation, element_vector, interpolate_nodal
 from rgbmidic.correlation.problem import Reference
 from rgbmidic.correlation.step import Step
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["Bent", "curvature_correction"]
 
-FloatArray = npt.NDArray[np.float64]
 
 _FARTHEST = 3.5
 """Sides of an element over which a curvature is carried to nodes that do not know it."""
@@ -48,7 +47,7 @@ class Bent:
     displacement: FloatArray
     one_sided: FloatArray
     strain: FloatArray
-    deviation: npt.NDArray[np.float32]
+    deviation: FloatImage
 
 
 def curvature_correction(reference: Reference, step: Step, displacement: FloatArray) -> Bent:
@@ -79,7 +78,7 @@ def curvature_correction(reference: Reference, step: Step, displacement: FloatAr
     )
 
 
-def _offset(reference: Reference, step: Step, deviation: npt.NDArray[np.float32]) -> FloatArray:
+def _offset(reference: Reference, step: Step, deviation: FloatImage) -> FloatArray:
     """Offset (N, 2) of the nodes: the `deviation` (2, P) projected as a residual is."""
     mesh, pixels = reference.mesh, reference.pixels
     total = np.zeros(reference.equations.size)
@@ -109,7 +108,7 @@ def _one_sided(mesh: Tri3Mesh, curvature: FloatArray) -> FloatArray:
     return np.stack([gradient[:, 0, 0], gradient[:, 1, 1], shear], axis=1)
 
 
-def _curvature(reference: Reference, displacement: FloatArray, measured: npt.NDArray[np.bool_]) -> FloatArray:
+def _curvature(reference: Reference, displacement: FloatArray, measured: BoolArray) -> FloatArray:
     """Second derivatives (N, 2, 3) of u and v: the gradient recovered at the nodes, and once more."""
     mesh = reference.mesh
     slopes = mesh.nodal_gradient(displacement)
@@ -124,7 +123,7 @@ def _curvature(reference: Reference, displacement: FloatArray, measured: npt.NDA
     return np.where(near[:, None, None], symmetric[deep][nearest], 0)
 
 
-def _deep(reference: Reference, measured: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def _deep(reference: Reference, measured: BoolArray) -> BoolArray:
     """Nodes whose neighbours, and theirs, are all measured and inside the mesh: only there is a curvature known."""
     mesh = reference.mesh
     i, j = mesh.neighbours.T

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients
 from rgbmidic.errors import InputError
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = [
     "PREFILTERS",
@@ -19,10 +20,9 @@ __all__ = [
     "usable_pixels",
 ]
 
-FloatImage = npt.NDArray[np.float32]
 
 _GAUSSIAN = np.exp(-(np.arange(-3, 4) ** 2) / 2)
-PREFILTERS: dict[str, npt.NDArray[np.float64]] = {
+PREFILTERS: dict[str, FloatArray] = {
     "none": np.ones(1),
     # zeros at the carriers (pi, 0), (0, pi), (pi, pi) of the Bayer mosaic
     "binomial": np.array([0.25, 0.5, 0.25]),
@@ -48,7 +48,7 @@ def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
     return np.ascontiguousarray(stack, dtype=np.float32)
 
 
-def fill_holes(image: FloatImage, valid: npt.NDArray[np.bool_], sigma: float = 3.0) -> FloatImage:
+def fill_holes(image: FloatImage, valid: BoolArray, sigma: float = 3.0) -> FloatImage:
     """Replace invalid pixels by the Gaussian mean of the valid ones around, and by the overall mean farther away.
 
     The values carry no weight in the solve; they only keep the spline's recursion finite and quiet.
@@ -78,7 +78,7 @@ def apply_prefilter(image: FloatImage, prefilter: str) -> FloatImage:
     return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
 
 
-def usable_pixels(valid: npt.NDArray[np.bool_], prefilter: str) -> npt.NDArray[np.bool_]:
+def usable_pixels(valid: BoolArray, prefilter: str) -> BoolArray:
     """Pixels whose filtered value and spline neighbourhood use valid pixels inside the image only."""
     reach = len(PREFILTERS[prefilter]) // 2 + 1
     element = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
@@ -92,7 +92,7 @@ def spline_coefficients(image: FloatImage) -> FloatImage:
     return out
 
 
-def noise_energy(prefilter: str, displacement: npt.NDArray[np.float64]) -> float:
+def noise_energy(prefilter: str, displacement: FloatArray) -> float:
     """Variance of an image filtered and interpolated at displaced pixels, for white noise of variance 1.
 
     Interpolation smooths most half-way between pixels, so the mean is taken over the fractions of the displacements
@@ -108,7 +108,7 @@ def noise_energy(prefilter: str, displacement: npt.NDArray[np.float64]) -> float
     return float(np.interp(wrapped, fractions, energy).prod(axis=1).mean())
 
 
-def _bspline(t: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _bspline(t: FloatArray) -> FloatArray:
     """Centred cubic B-spline."""
     a = np.abs(t)
     inner = 2 / 3 - a**2 + a**3 / 2

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
@@ -16,12 +14,9 @@ from rgbmidic.correlation.system import NormalEquations
 from rgbmidic.correlation.uncertainty import Probing, displacement_functionals, strain_functionals
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 __all__ = ["Deformed", "Reference"]
-
-_Array = npt.NDArray[Any]
-FloatArray = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,7 +162,7 @@ class Reference:
         )
         return self.equations.vector(parts), np.asarray(sums.sum(axis=0))
 
-    def _geometry(self) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array]:
+    def _geometry(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray, AnyArray, AnyArray]:
         pixels = self.pixels
         return (
             pixels.local_x,

@@ -8,9 +8,9 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["NodeStatus", "Solution", "Status"]
+from rgbmidic.typing import BoolArray, FloatArray
 
-FloatArray = npt.NDArray[np.float64]
+__all__ = ["NodeStatus", "Solution", "Status"]
 
 
 class Status(IntEnum):
@@ -94,7 +94,7 @@ class Solution:
         return len(self.history)
 
     @property
-    def measured(self) -> npt.NDArray[np.bool_]:
+    def measured(self) -> BoolArray:
         """True for each measured node, shape (N,)."""
         return np.asarray(self.node_status == NodeStatus.MEASURED)
 

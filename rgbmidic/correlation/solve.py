@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.correlation.comparison import Comparison
 from rgbmidic.correlation.curvature import curvature_correction
@@ -21,11 +20,10 @@ from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.step import Step, rigid_functions
 from rgbmidic.correlation.uncertainty import exact_std, functional_std
 from rgbmidic.errors import InputError
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["BRIGHTNESS", "SolveOptions", "solve"]
 
-FloatArray = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 
 BRIGHTNESS = ("none", "global", "local")
 """Choices of grey-level correction."""
@@ -146,7 +144,7 @@ class _Run:
     values: FloatImage = field(init=False)
     factor: FloatImage | None = None
     bend: FloatImage | None = None
-    matched: npt.NDArray[np.bool_] = field(init=False)
+    matched: BoolArray = field(init=False)
     seen: Comparison = field(init=False)
     history: list[float] = field(default_factory=list)
     sums: FloatArray = field(init=False)
@@ -349,7 +347,7 @@ class _Run:
         total = float(step.weights.sum(dtype=np.float64))
         return total / max(float((step.weights * self.bend).sum(dtype=np.float64)), 0.1 * total)
 
-    def _beside(self, nodes: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    def _beside(self, nodes: BoolArray) -> BoolArray:
         """Nodes that share an element with one of `nodes`, shape (N,)."""
         elements = self.reference.mesh.elements
         beside = np.zeros(len(nodes), dtype=bool)

@@ -12,16 +12,14 @@ import logging
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["coarse_start", "refine_start"]
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 
 _NORMALISE = 10.0
 """Standard deviation (px) of the local mean and contrast."""

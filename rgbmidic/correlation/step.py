@@ -6,17 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.correlation.problem import Reference
 from rgbmidic.correlation.system import NormalEquations, factorise
 from rgbmidic.errors import InputError
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["RIGID", "Step", "rigid_functions"]
 
-FloatArray = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 
 RIGID = ("none", "translation", "translation+rotation")
 """Choices of rigid functions."""
@@ -81,7 +79,7 @@ class Step:
     border: FloatArray
     border_solved: FloatArray
     schur: FloatArray
-    measured: npt.NDArray[np.bool_]
+    measured: BoolArray
     light_share: FloatArray
     equations: NormalEquations
 
@@ -119,7 +117,7 @@ class Step:
             equations=equations,
         )
 
-    def blind(self, noise: Callable[[FloatImage], FloatArray]) -> npt.NDArray[np.bool_]:
+    def blind(self, noise: Callable[[FloatImage], FloatArray]) -> BoolArray:
         """Nodes (N,) whose texture runs in one direction only: along the other, the gradient is that of the noise.
 
         `noise` gives the element blocks of the noise's Hessian; it is asked only where a texture is that one-sided.
@@ -172,7 +170,7 @@ def _node_blocks(matrix: sp.csc_matrix) -> tuple[FloatArray, FloatArray, FloatAr
     return diagonal[:, 0], np.asarray(matrix[2 * nodes, 2 * nodes + 1]).ravel(), diagonal[:, 1]
 
 
-def _observability(hessian: sp.csc_matrix, area: FloatArray, least: float) -> tuple[npt.NDArray[np.bool_], float]:
+def _observability(hessian: sp.csc_matrix, area: FloatArray, least: float) -> tuple[BoolArray, float]:
     """Which nodes see at least that share of the median texture, and the typical diagonal entry of the Hessian.
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.

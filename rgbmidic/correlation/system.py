@@ -11,10 +11,9 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import FloatArray
 
 __all__ = ["NormalEquations", "factorise"]
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,10 +15,10 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["Probing", "displacement_functionals", "exact_std", "functional_std", "strain_functionals"]
 
-FloatArray = npt.NDArray[np.float64]
 
 _CHUNK = 256
 """Columns solved for at once."""
@@ -75,7 +75,7 @@ def functional_std(
     right_side_covariance: sp.csc_matrix,
     probing: Probing,
     functionals: Sequence[sp.csr_matrix],
-    measured: npt.NDArray[np.bool_],
+    measured: BoolArray,
 ) -> FloatArray:
     """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
 

@@ -2,5 +2,6 @@
 
 from rgbmidic.fields.evaluate import at_nodes, at_pixels, field_rms
 from rgbmidic.fields.fill import fill
+from rgbmidic.fields.high_pass import SIGMA, high_pass
 
-__all__ = ["at_nodes", "at_pixels", "field_rms", "fill"]
+__all__ = ["SIGMA", "at_nodes", "at_pixels", "field_rms", "fill", "high_pass"]

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.correlation import interpolate_nodal
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["at_nodes", "at_pixels", "field_rms"]
 
-FloatArray = npt.NDArray[np.float64]
 
-
-def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
+def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> FloatImage:
     """A nodal field (N, 2) at the pixels of an image of `shape` (H, W) by the linear shape functions.
 
     Returns

@@ -11,15 +11,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.correlation import NodeStatus, Solution
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["fill"]
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
@@ -49,9 +47,7 @@ def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
     )
 
 
-def _quadratic_trend(
-    nodes: FloatArray, displacement: FloatArray, measured: npt.NDArray[np.bool_]
-) -> tuple[FloatArray, FloatArray]:
+def _quadratic_trend(nodes: FloatArray, displacement: FloatArray, measured: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Quadratic least-squares fit at all nodes (N, 2), and what the measured ones leave (0 elsewhere)."""
     scaled = (nodes - nodes.mean(axis=0)) / np.ptp(nodes, axis=0).max()
     x, y = scaled.T
@@ -60,14 +56,14 @@ def _quadratic_trend(
     return trend, np.where(measured[:, None], displacement - trend, 0.0)
 
 
-def _step_between_neighbours(mesh: Tri3Mesh, rest: FloatArray, measured: npt.NDArray[np.bool_]) -> FloatArray:
+def _step_between_neighbours(mesh: Tri3Mesh, rest: FloatArray, measured: BoolArray) -> FloatArray:
     """Rms difference (2,) of neighbouring measured nodes."""
     i, j = mesh.neighbours.T
     both = measured[i] & measured[j]
     return np.asarray(np.sqrt(np.mean((rest[i[both]] - rest[j[both]]) ** 2, axis=0)) if both.any() else np.zeros(2))
 
 
-def _smooth(mesh: Tri3Mesh, rest: FloatArray, measured: npt.NDArray[np.bool_]) -> FloatArray:
+def _smooth(mesh: Tri3Mesh, rest: FloatArray, measured: BoolArray) -> FloatArray:
     """`rest` (N, 2) at the measured nodes, and the field of least squared Laplacian through them elsewhere."""
     from scipy.sparse.linalg import spsolve
 

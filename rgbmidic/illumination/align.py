@@ -10,17 +10,16 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.normalise import local_mean
 from rgbmidic.illumination.registration import Registration
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["align"]
 
-FloatImage = npt.NDArray[np.float32]
 
 _NEGLIGIBLE = 0.002
 """A light that is nowhere farther than this (px) from the first is left as it is."""
@@ -51,7 +50,7 @@ def align(images: IlluminationImages, registration: Registration) -> Illuminatio
     return replace(images, values=values, valid=np.isfinite(values))
 
 
-def _sample(image: FloatImage, x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> FloatImage:
+def _sample(image: FloatImage, x: FloatArray, y: FloatArray) -> FloatImage:
     """Image (H, W) at points (x, y), flat; NaN outside and where the interpolation would touch a NaN."""
     height, width = image.shape
     valid = np.isfinite(image)

@@ -14,14 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from rgbmidic.errors import CalibrationError
+from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.camera_noise import CameraNoise
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
-from rgbmidic.illumination.mosaic import BAYER_PATTERNS, NoiseModel
+from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.registration import Registration
+from rgbmidic.typing import FloatArray
 
 __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk"]
 
@@ -215,7 +214,7 @@ def _registration_document(registration: Registration) -> dict[str, Any]:
     }
 
 
-def _listed(values: npt.NDArray[np.float64] | None) -> Any:
+def _listed(values: FloatArray | None) -> Any:
     return None if values is None else values.tolist()
 
 

@@ -9,14 +9,13 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.mosaic import NoiseModel
+from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.typing import FloatArray
 
 __all__ = ["QUANTISATION", "CameraNoise", "Quantity"]
 
-Floats = npt.NDArray[np.float64]
 
 QUANTISATION = 1 / 12
 """Variance (DN squared) of rounding to whole grey levels."""
@@ -28,8 +27,8 @@ DEFECTS = ("hot", "dead")
 class Quantity:
     """A figure per colour plane and its standard uncertainty, both (P,); NaN where it was not measured."""
 
-    value: Floats
-    std: Floats
+    value: FloatArray
+    std: FloatArray
 
     def __post_init__(self) -> None:
         value = np.array(self.value, dtype=np.float64, ndmin=1)
@@ -115,7 +114,7 @@ class CameraNoise:
         return _product(self.saturation.value, self.gain, self.saturation.std / self.saturation.value)
 
     @property
-    def dynamic_range(self) -> Floats:
+    def dynamic_range(self) -> FloatArray:
         """Saturation capacity over dark noise, in dB."""
         return np.asarray(20 * np.log10(self.full_well.value / np.maximum(self.dark_noise.value, 1e-9)))
 
@@ -140,12 +139,12 @@ class CameraNoise:
         return cls(planes=tuple(document["planes"]), defects=defects, **quantities)
 
 
-def _product(value: Floats, gain: Quantity, relative: Floats) -> Quantity:
+def _product(value: FloatArray, gain: Quantity, relative: FloatArray) -> Quantity:
     result = value * gain.value
     return Quantity(result, result * np.hypot(relative, gain.std / gain.value))
 
 
-def _listed(values: Floats) -> list[float | None]:
+def _listed(values: FloatArray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 

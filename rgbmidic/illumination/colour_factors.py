@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels import texture as kernels
-from rgbmidic.illumination.mosaic import NoiseModel
+from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.texture import LAGS, WHITE_ENERGY, BandEnergy, TextureModel, fit_texture
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = [
     "BLOCK",
@@ -31,8 +31,6 @@ __all__ = [
     "scaled",
 ]
 
-Floats = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 
 MEAN_BLOCK, BLOCK = 4, 8
 """Side of the blocks (px) of the local means and of the moments."""
@@ -72,10 +70,10 @@ class Moments:
 
     mean: FloatImage
     contrast: FloatImage
-    own: Floats
-    shared: Floats
-    greens: Floats
-    noise: Floats
+    own: FloatArray
+    shared: FloatArray
+    greens: FloatArray
+    noise: FloatArray
     red: tuple[int, int]
 
 
@@ -93,17 +91,17 @@ class ColourFactors:
         Variance of the camera noise, relative to alpha_c².
     """
 
-    slope: Floats
-    private: Floats
-    noise: Floats
+    slope: FloatArray
+    private: FloatArray
+    noise: FloatArray
 
     @property
-    def spread(self) -> Floats:
+    def spread(self) -> FloatArray:
         """Standard deviation (3, h, w) of each channel's contrast without camera noise, DN."""
         return np.asarray(self.slope * np.sqrt(1 + self.private))
 
     @property
-    def share(self) -> Floats:
+    def share(self) -> FloatArray:
         """Share (3, h, w) of the common texture in each channel's variance, 0 to 1."""
         return np.asarray(1 / (1 + self.private))
 
@@ -144,10 +142,10 @@ def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
     return _smooth(sums, counts, MEAN_WIDTH / MEAN_BLOCK).astype(np.float32)
 
 
-def _smooth(sums: Floats, counts: Floats, sigma: float) -> Floats:
+def _smooth(sums: FloatArray, counts: FloatArray, sigma: float) -> FloatArray:
     """Mean (n, h, w) in a Gaussian window (blocks) of sums over `counts` entries; the overall mean where none are."""
 
-    def blurred(grid: Floats) -> Floats:
+    def blurred(grid: FloatArray) -> FloatArray:
         return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
 
     counts = np.broadcast_to(counts, sums.shape)
@@ -185,7 +183,9 @@ def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None =
     return out
 
 
-def colour_factors(moments: Moments, band: BandEnergy, crosstalk: Floats, *, coloured: float = 0.0) -> ColourFactors:
+def colour_factors(
+    moments: Moments, band: BandEnergy, crosstalk: FloatArray, *, coloured: float = 0.0
+) -> ColourFactors:
     """Slopes of the channels on the common texture and what is private to each.
 
     Parameters
@@ -220,7 +220,7 @@ def colour_factors(moments: Moments, band: BandEnergy, crosstalk: Floats, *, col
     return ColourFactors(slope=np.sqrt(square), private=variance, noise=moments.noise / square)
 
 
-def _crossed(crosstalk: Floats, sparkle: Floats, a: int, b: int) -> Floats:
+def _crossed(crosstalk: FloatArray, sparkle: FloatArray, a: int, b: int) -> FloatArray:
     """Moment of channels a and b that comes from the sparkle of lights, given each channel's own."""
     lights = np.maximum(np.tensordot(np.linalg.pinv(crosstalk**2), sparkle, axes=1), 0)
     return np.asarray(np.tensordot(crosstalk[a] * crosstalk[b], lights, axes=1))

@@ -13,13 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.typing import FloatArray
 
 __all__ = ["Crosstalk", "CrosstalkField", "legendre_products"]
 
-Floats = npt.NDArray[np.float64]
 
-
-def legendre_products(points: npt.ArrayLike, shape: tuple[int, int], order: int) -> Floats:
+def legendre_products(points: npt.ArrayLike, shape: tuple[int, int], order: int) -> FloatArray:
     """Products of Legendre polynomials in x and y up to a total degree, on the field scaled to [-1, 1].
 
     Parameters
@@ -63,9 +62,9 @@ class CrosstalkField:
     """
 
     order: int
-    coefficients: Floats
+    coefficients: FloatArray
     shape: tuple[int, int]
-    std: Floats | None = None
+    std: FloatArray | None = None
 
     def __post_init__(self) -> None:
         values = np.asarray(self.coefficients, dtype=np.float64)
@@ -79,7 +78,7 @@ class CrosstalkField:
         if self.std is not None:
             object.__setattr__(self, "std", np.asarray(self.std, dtype=np.float64).reshape(values.shape))
 
-    def departure(self, points: npt.ArrayLike) -> Floats:
+    def departure(self, points: npt.ArrayLike) -> FloatArray:
         """A(x, y) minus its mean at points (x, y), shape (..., C, k)."""
         terms = legendre_products(points, self.shape, self.order)[..., 1:]
         return np.asarray(np.tensordot(terms, self.coefficients, axes=1))
@@ -102,10 +101,10 @@ class Crosstalk:
         How A varies over the field; None: it is the same everywhere.
     """
 
-    matrix: Floats
+    matrix: FloatArray
     lights: tuple[str, ...]
-    std: Floats | None = None
-    covariance: Floats | None = None
+    std: FloatArray | None = None
+    covariance: FloatArray | None = None
     field: CrosstalkField | None = None
 
     def __post_init__(self) -> None:
@@ -150,7 +149,7 @@ class Crosstalk:
         """No crosstalk: every light is seen by its own channel alone."""
         return cls(matrix=np.eye(len(lights)), lights=lights)
 
-    def at(self, points: npt.ArrayLike) -> Floats:
+    def at(self, points: npt.ArrayLike) -> FloatArray:
         """A at points (x, y) in px of shape (..., 2): shape (..., C, k)."""
         place = np.asarray(points, dtype=np.float64)
         if self.field is None:
@@ -158,11 +157,11 @@ class Crosstalk:
         return np.asarray(self.matrix + self.field.departure(place))
 
     @property
-    def unmixing(self) -> Floats:
+    def unmixing(self) -> FloatArray:
         """The matrix (k, C) that turns channels into lights: the (pseudo-)inverse of A."""
         return np.asarray(np.linalg.pinv(self.matrix), dtype=np.float64)
 
-    def unmixing_at(self, points: npt.ArrayLike) -> Floats:
+    def unmixing_at(self, points: npt.ArrayLike) -> FloatArray:
         """The (pseudo-)inverse of A at points (x, y) in px of shape (..., 2): shape (..., k, C)."""
         return np.asarray(np.linalg.pinv(self.at(points)), dtype=np.float64)
 
@@ -172,12 +171,12 @@ class Crosstalk:
         return float(np.linalg.cond(self.matrix))
 
     @property
-    def noise_amplification(self) -> Floats:
+    def noise_amplification(self) -> FloatArray:
         """Noise of each light's image over the noise of one camera channel, shape (k,)."""
         return np.asarray(np.sqrt((self.unmixing**2).sum(axis=1)))
 
     @property
-    def leakage_std(self) -> Floats | None:
+    def leakage_std(self) -> FloatArray | None:
         """Standard uncertainty (k, k) of what light j (column) leaves in the image of light i (row) after unmixing.
 
         An error dA leaves ``-A^-1 dA`` there.

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["IlluminationImages"]
+__all__ = ["REFLECTING", "IlluminationImages"]
+
+REFLECTING = 0.2
+"""Reflection index from which a light counts as reflecting."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,12 +38,12 @@ class IlluminationImages:
         most contrast there, towards 1 in its reflection; None where the separation does not tell.
     """
 
-    values: npt.NDArray[np.float32]
-    valid: npt.NDArray[np.bool_]
+    values: FloatImage
+    valid: BoolArray
     names: tuple[str, ...]
     full_scale: float
-    covariance: npt.NDArray[np.float64] | None = None
-    reflection_index: npt.NDArray[np.float32] | None = None
+    covariance: FloatArray | None = None
+    reflection_index: FloatImage | None = None
 
     def __post_init__(self) -> None:
         values = np.ascontiguousarray(self.values, dtype=np.float32)

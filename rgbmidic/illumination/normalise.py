@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
+from rgbmidic.typing import FloatImage
 
 __all__ = ["DARK", "local_mean", "normalise"]
 
-FloatImage = npt.NDArray[np.float32]
 
 DARK = 0.01
 """A light whose local mean is below this share of the full scale does not see the surface there."""

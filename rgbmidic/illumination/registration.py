@@ -14,16 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError, InputError
+from rgbmidic.typing import FloatArray
 
 __all__ = ["PARAMETERS", "Registration", "frame_geometry", "registration_basis"]
 
-Floats = npt.NDArray[np.float64]
 
 PARAMETERS = ("shift_x", "shift_y", "rotation", "scale", "radial")
 """Parameters of a light: px, px, rad (x towards y), relative magnification, relative magnification more at radius R."""
 
 
-def registration_basis(points: npt.ArrayLike, centre: tuple[float, float], radius: float) -> Floats:
+def registration_basis(points: npt.ArrayLike, centre: tuple[float, float], radius: float) -> FloatArray:
     """Displacement (M, 2, 5) at points (x, y) of shape (M, 2) per unit of each of the `PARAMETERS`."""
     arm = np.asarray(points, dtype=np.float64) - np.asarray(centre)
     x, y = arm.T
@@ -52,10 +52,10 @@ class Registration:
     """
 
     lights: tuple[str, ...]
-    parameters: Floats
+    parameters: FloatArray
     centre: tuple[float, float]
     radius: float
-    covariance: Floats | None = None
+    covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
         count, terms = len(self.lights), len(PARAMETERS)
@@ -84,7 +84,7 @@ class Registration:
         centre, radius = frame_geometry(shape)
         return cls(lights=lights, parameters=np.zeros((len(lights), 5)), centre=centre, radius=radius)
 
-    def displacement(self, points: npt.ArrayLike) -> Floats:
+    def displacement(self, points: npt.ArrayLike) -> FloatArray:
         """rho_j: what light 1 sees at point x is seen by light j at x + rho_j(x).
 
         Parameters
@@ -100,14 +100,14 @@ class Registration:
         basis = self._basis(points)
         return np.asarray(np.einsum("mdp,kp->kmd", basis, self.parameters))
 
-    def displacement_std(self, points: npt.ArrayLike) -> Floats | None:
+    def displacement_std(self, points: npt.ArrayLike) -> FloatArray | None:
         """Standard uncertainty (k, M, 2) in px of `displacement`; None where the covariance is not known."""
         if self.covariance is None:
             return None
         basis = self._basis(points)
         return np.asarray(np.sqrt(np.einsum("mdp,kpq,mdq->kmd", basis, self.covariance, basis)))
 
-    def _basis(self, points: npt.ArrayLike) -> Floats:
+    def _basis(self, points: npt.ArrayLike) -> FloatArray:
         place = np.asarray(points, dtype=np.float64)
         if place.ndim != 2 or place.shape[1] != 2:
             raise InputError(f"points have shape (M, 2), not {place.shape}")

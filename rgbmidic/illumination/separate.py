@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.kriging import TILE
 from rgbmidic.errors import InputError
@@ -26,9 +25,10 @@ from rgbmidic.illumination.demosaic import (
 from rgbmidic.illumination.demosaic.base import red_position
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.mosaic import LinearMosaic
+from rgbmidic.illumination.linearise import LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = [
     "DEFAULT_METHOD",
@@ -40,7 +40,6 @@ __all__ = [
     "separate_reflections",
 ]
 
-FloatImage = npt.NDArray[np.float32]
 
 Separator = Callable[[LinearMosaic, Crosstalk, TextureModel | None], IlluminationImages]
 """A method that gives the lights from the mosaic; one that does not model the texture ignores it."""
@@ -194,7 +193,7 @@ def _lights(found: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:
     return replace(images, covariance=noise, reflection_index=index)
 
 
-def _reflection_index(factors: ColourFactors, mean: FloatImage, crosstalk: Crosstalk) -> npt.NDArray[np.float64]:
+def _reflection_index(factors: ColourFactors, mean: FloatImage, crosstalk: Crosstalk) -> FloatArray:
     """Index (k, h, w) on the blocks' grid: how much less contrast a light has than the best one."""
     height, width = factors.slope.shape[1:]
     level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in mean])
@@ -206,12 +205,12 @@ def _reflection_index(factors: ColourFactors, mean: FloatImage, crosstalk: Cross
     return np.asarray(1 - np.clip(share, 0, 1))
 
 
-def _tiles(grid: npt.NDArray[np.float64], shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
+def _tiles(grid: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     size = (shape[1], shape[0])
     return np.stack([cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in grid])
 
 
-def _enlarged(grid: npt.NDArray[np.float64], block: int, shape: tuple[int, ...]) -> FloatImage:
+def _enlarged(grid: FloatArray, block: int, shape: tuple[int, ...]) -> FloatImage:
     """A grid of blocks (n, h, w) interpolated to the pixels of a frame of `shape`."""
     size = (grid.shape[2] * block, grid.shape[1] * block)
     whole = [cv2.resize(one.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) for one in grid]

@@ -15,10 +15,10 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from rgbmidic.errors import InputError
+from rgbmidic.typing import FloatArray
 
 __all__ = ["LAGS", "WHITE_ENERGY", "BandEnergy", "TextureModel", "fit_texture"]
 
-Floats = npt.NDArray[np.float64]
 
 FARTHEST = 4.3
 """Products farther apart (px) do not enter: they tell of the spacing of the speckles, not of their edges."""
@@ -32,7 +32,7 @@ OFFSET_PENALTY = 0.05
 """Least-squares error (of products) that an offset of 1 costs; the true one is -0.02 to -0.15."""
 INDISTINCT = 0.02
 """Share of its own in a colour's variance under which products do not tell whether it is coarse."""
-WIDTHS: Floats = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
+WIDTHS: FloatArray = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
 COLOURED = 0.5
 """Below this mean correlation of any two colours they do not show the same texture."""
 
@@ -102,7 +102,7 @@ class TextureModel:
         widths = np.maximum(np.array([0.26, 0.36, 0.51]) * diameter, NARROWEST)
         return cls(weights=(0.1, 0.3, 0.6), widths=tuple(widths.tolist()))
 
-    def __call__(self, distance: npt.ArrayLike) -> Floats:
+    def __call__(self, distance: npt.ArrayLike) -> FloatArray:
         """C at distances in px."""
         r = np.asarray(distance, dtype=np.float64)[..., None]
         gaussians = np.exp(-0.5 * (r / np.asarray(self.widths)) ** 2)
@@ -123,11 +123,11 @@ class TextureModel:
 
 
 @lru_cache(maxsize=64)
-def _band_energies(widths: tuple[float, ...]) -> Floats:
+def _band_energies(widths: tuple[float, ...]) -> FloatArray:
     """Moments (M, 3) own, adjacent and diagonal of the low-passed planes for Gaussian autocorrelations."""
     taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
 
-    def line(p: int, q: int) -> Floats:
+    def line(p: int, q: int) -> FloatArray:
         """Along one axis, planes of parity p and q: Gaussians factorise."""
         apart = taps[p][1][:, None] - taps[q][1][None]
         gaussians = np.exp(-0.5 * (apart[None] / np.asarray(widths)[:, None, None]) ** 2)
@@ -137,7 +137,7 @@ def _band_energies(widths: tuple[float, ...]) -> Floats:
     return np.stack([same * same, same * other, other * other], axis=1)
 
 
-def fit_texture(sums: Floats, counts: Floats, correlations: Floats, agreement: float) -> TextureModel:
+def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, agreement: float) -> TextureModel:
     """Texture from the products of samples at `LAGS`.
 
     Parameters
@@ -180,13 +180,13 @@ def fit_texture(sums: Floats, counts: Floats, correlations: Floats, agreement: f
 
 
 def _mixture(
-    r: Floats,
-    product: Floats,
+    r: FloatArray,
+    product: FloatArray,
     correlation: float,
     *,
-    widths: Floats = WIDTHS,
-    unit: Floats | None = None,
-    fine: Floats | None = None,
+    widths: FloatArray = WIDTHS,
+    unit: FloatArray | None = None,
+    fine: FloatArray | None = None,
     private: float = 0.0,
 ) -> TextureModel:
     """Weights w >= 0 and offset c <= 0 of a texture, by least squares.
@@ -221,7 +221,7 @@ def _mixture(
     )
 
 
-def _private_share(model: TextureModel, sums: Floats, counts: Floats, correlations: Floats) -> float:
+def _private_share(model: TextureModel, sums: FloatArray, counts: FloatArray, correlations: FloatArray) -> float:
     """How much of what the colours show of their own is as coarse as the speckle, from products two pixels apart."""
     apart = np.abs(LAGS)
     two = (apart.max(axis=1) == 2) & (apart.min(axis=1) == 0) & (counts[:, :3] > 0).all(axis=1)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.unmix import unmix as unmix_kernel
 from rgbmidic._kernels.unmix_field import unmix_field as unmix_field_kernel
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.mosaic import LinearChannels
+from rgbmidic.illumination.linearise import LinearChannels
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["NEGLIGIBLE", "unmix"]
 
@@ -84,7 +84,7 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
     )
 
 
-def _unmixing_grid(crosstalk: Crosstalk, shape: tuple[int, ...], step: int) -> npt.NDArray[np.float32]:
+def _unmixing_grid(crosstalk: Crosstalk, shape: tuple[int, ...], step: int) -> FloatImage:
     """A^-1 at every `step`-th pixel and beyond the last ones, (GY, GX, k, C)."""
     if crosstalk.field is not None and crosstalk.field.shape != tuple(shape):
         calibrated = crosstalk.field.shape
@@ -96,7 +96,7 @@ def _unmixing_grid(crosstalk: Crosstalk, shape: tuple[int, ...], step: int) -> n
     return crosstalk.unmixing_at(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
 
 
-def _covariance(channels: LinearChannels, matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:
+def _covariance(channels: LinearChannels, matrix: FloatArray) -> FloatArray | None:
     if channels.noise is None:
         return None
     # A coarse grid is plenty for a median and spares a full sort of every frame.

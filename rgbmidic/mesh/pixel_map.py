@@ -13,6 +13,7 @@ from rgbmidic._kernels.mesh import claim_pixels, list_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["PixelMap"]
 
@@ -46,9 +47,9 @@ class PixelMap:
     columns: npt.NDArray[np.int32]
     offsets: npt.NDArray[np.int64]
     origin: npt.NDArray[np.int64]
-    local_x: npt.NDArray[np.float32]
-    local_y: npt.NDArray[np.float32]
-    barycentric: npt.NDArray[np.float64]
+    local_x: FloatImage
+    local_y: FloatImage
+    barycentric: FloatArray
     shape: tuple[int, int]
     bounds: tuple[int, int, int, int] = field(init=False)
 
@@ -93,7 +94,7 @@ class PixelMap:
             shape=region.mask.shape,
         )
 
-    def gather(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def gather(self, image: FloatImage) -> FloatImage:
         """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
         return np.ascontiguousarray(image[..., self.rows, self.columns])
 
@@ -106,21 +107,21 @@ class PixelMap:
         block_index(self.rows, self.columns, top, left, side, grid[1], index)
         return index, grid
 
-    def from_blocks(self, grid: npt.NDArray[np.float32], side: int) -> npt.NDArray[np.float32]:
+    def from_blocks(self, grid: FloatImage, side: int) -> FloatImage:
         """A grid of such blocks interpolated at the owned pixels (P,)."""
         top, left, _, _ = self.bounds
         out = np.empty(self.rows.size, dtype=np.float32)
         grid_at_pixels(np.ascontiguousarray(grid, dtype=np.float32), self.rows, self.columns, top, left, side, out)
         return out
 
-    def window(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def window(self, values: FloatImage) -> FloatImage:
         """`values` (P,) as an image of the rectangle `bounds`, 0 where no pixel is owned."""
         top, left, height, width = self.bounds
         image = np.zeros((height, width), dtype=np.float32)
         image[self.rows - top, self.columns - left] = values
         return image
 
-    def scatter(self, values: npt.NDArray[np.float32], fill: float = 0.0) -> npt.NDArray[np.float32]:
+    def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
         """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""
         image = np.full(self.shape, fill, dtype=np.float32)
         image[self.rows, self.columns] = values
@@ -139,7 +140,7 @@ def _claim_rim(owner: npt.NDArray[np.int32], counts: npt.NDArray[np.int64]) -> n
     return np.bincount(owner[owner >= 0], minlength=len(counts)).astype(np.int64)
 
 
-def _shape_functions(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _shape_functions(corners: FloatArray) -> FloatArray:
     """Coefficients of the linear shape functions of triangles (E, 3, 2): 1 at their own corner, 0 at the others."""
     system = np.concatenate([np.ones((len(corners), 3, 1)), corners], axis=2)
     return np.ascontiguousarray(np.linalg.inv(system).transpose(0, 2, 1))

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import RegionError
+from rgbmidic.typing import BoolArray
 
 __all__ = ["Region"]
 
@@ -28,7 +29,7 @@ class Region:
         Set where the region is a rectangle with sides along the axes; the pixels whose centres lie on it belong to it.
     """
 
-    mask: npt.NDArray[np.bool_]
+    mask: BoolArray
     rectangle: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:

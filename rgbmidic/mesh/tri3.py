@@ -11,10 +11,9 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.region import Region
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["Tri3Mesh"]
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +101,7 @@ class Tri3Mesh:
         return np.asarray((sums / self.to_nodes(self.areas)[:, None]).reshape(-1, *gradient.shape[1:]))
 
     @property
-    def on_boundary(self) -> npt.NDArray[np.bool_]:
+    def on_boundary(self) -> BoolArray:
         """True for nodes on an edge that belongs to one element only, shape (N,)."""
         edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
         pairs, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
@@ -146,7 +145,7 @@ def _rectangle_mesh(rectangle: tuple[float, float, float, float], size: float) -
     return {"nodes": np.stack([x.ravel(), y.ravel()], 1), "elements": elements}
 
 
-def _outline_mesh(mask: npt.NDArray[np.bool_], size: float) -> _Parts:
+def _outline_mesh(mask: BoolArray, size: float) -> _Parts:
     from scipy.spatial import Delaunay, QhullError
 
     outline = _outline_points(mask, size)
@@ -178,7 +177,7 @@ def _lattice_points(shape: tuple[int, int], size: float) -> FloatArray:
     return np.concatenate(points) if points else np.empty((0, 2))
 
 
-def _outline_points(mask: npt.NDArray[np.bool_], size: float) -> FloatArray:
+def _outline_points(mask: BoolArray, size: float) -> FloatArray:
     """Points about `size` px apart along the region's outline and holes; corners are kept."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     points = []

@@ -6,15 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rgbmidic.config import TestSettings
 from rgbmidic.errors import ConfigurationError, FrameError
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.mosaic import ChannelFrame, LinearChannels, LinearMosaic, Mosaic, linearise
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separate import frame_texture, separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
+from rgbmidic.settings import TestSettings
 
 __all__ = ["Separator", "average"]
 

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.sequence.store import Result
+from rgbmidic.results.store import Result
+from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +49,7 @@ _LIGHT_COLOURS = {"red": "#c8102e", "green": "#1a7f37", "blue": "#1f5fbf"}
 _MANY_FRAMES = 8
 
 
-def displacement_figure(result: Result, frame: int, image: npt.NDArray[Any] | None = None) -> Figure:
+def displacement_figure(result: Result, frame: int, image: AnyArray | None = None) -> Figure:
     """Maps of u and v of one frame, in px, over the reference image; blank where not measured.
 
     Parameters
@@ -72,7 +73,7 @@ def displacement_figure(result: Result, frame: int, image: npt.NDArray[Any] | No
     return _maps(result, fields, "px", "viridis", _frame_title(result, frame), image)
 
 
-def uncertainty_figure(result: Result, frame: int, image: npt.NDArray[Any] | None = None) -> Figure:
+def uncertainty_figure(result: Result, frame: int, image: AnyArray | None = None) -> Figure:
     """Maps of the standard uncertainty of u and v of one frame, in px; the rest as `displacement_figure`."""
     record = result.frame(frame)
     fields = {"std of u": record.displacement_std[:, 0], "std of v": record.displacement_std[:, 1]}
@@ -106,7 +107,7 @@ def mask_figure(images: npt.ArrayLike, weights: npt.ArrayLike, names: Sequence[s
     return _shaded(images, 1 - weights, titles)
 
 
-def share_figure(result: Result, frame: int, image: npt.NDArray[Any] | None = None) -> Figure:
+def share_figure(result: Result, frame: int, image: AnyArray | None = None) -> Figure:
     """Maps of each light's share in what determines the nodes of one frame; the rest as `displacement_figure`."""
     record = result.frame(frame)
     seen = record.light_share.sum(axis=1) > 0
@@ -117,13 +118,13 @@ def share_figure(result: Result, frame: int, image: npt.NDArray[Any] | None = No
     return _maps(result, fields, "", "cividis", _frame_title(result, frame), image, limits=(0, 1))
 
 
-def reflection_figure(result: Result, frame: int, images: npt.NDArray[Any]) -> Figure | None:
+def reflection_figure(result: Result, frame: int, images: AnyArray) -> Figure | None:
     """Each light's reflection index in one frame, shaded over its reference image (k, H, W); None where the separation
     did not tell it."""
     seen = result.frame(frame).reflection_thumbnail
     if seen is None:
         return None
-    from rgbmidic.inspection.results import REFLECTING
+    from rgbmidic.illumination.images import REFLECTING
 
     index = seen / 255
     titles = [
@@ -218,7 +219,7 @@ def _figure(
     return figure
 
 
-def _shaded(images: npt.NDArray[np.float32], shade: npt.NDArray[Any], titles: Sequence[str], title: str = "") -> Figure:
+def _shaded(images: FloatImage, shade: AnyArray, titles: Sequence[str], title: str = "") -> Figure:
     """Images (k, H, W) side by side, each shaded by a reduced picture (k, h, w) from 0 to 1."""
     rows, columns = images.shape[1:]
 
@@ -234,11 +235,11 @@ def _shaded(images: npt.NDArray[np.float32], shade: npt.NDArray[Any], titles: Se
 
 def _maps(
     result: Result,
-    fields: dict[str, npt.NDArray[np.float64]],
+    fields: dict[str, FloatArray],
     unit: str,
     colour_map: str,
     title: str,
-    image: npt.NDArray[Any] | None,
+    image: AnyArray | None,
     limits: tuple[float, float] | None = None,
 ) -> Figure:
     """One map per nodal field, over the image where there is one."""
@@ -263,7 +264,7 @@ def _show_field(
     figure: Figure,
     axis: Axes,
     result: Result,
-    values: npt.NDArray[np.float64],
+    values: FloatArray,
     colour_map: str,
     limits: tuple[float, float] | None,
     *,
@@ -289,7 +290,7 @@ def _show_field(
     bar.outline.set_linewidth(0.6)
 
 
-def _limits(known: npt.NDArray[np.float64]) -> tuple[float, float]:
+def _limits(known: FloatArray) -> tuple[float, float]:
     """Ends of the colour bar: all values, but for a few wild ones that would hide the field."""
     core = np.percentile(known, [_CLIPPED, 100 - _CLIPPED])
     reach = _WILD * np.ptp(core)
@@ -298,7 +299,7 @@ def _limits(known: npt.NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _raster(
-    result: Result, values: npt.NDArray[np.float64]
+    result: Result, values: FloatArray
 ) -> tuple[np.ma.MaskedArray[Any, Any], tuple[float, float, float, float]]:
     """A nodal field on a fine grid, linear inside each element as in the solve, with its extent for `imshow`."""
     from matplotlib.tri import LinearTriInterpolator, Triangulation
@@ -312,14 +313,14 @@ def _raster(
     return picture, (low[0], low[0] + step * len(x), low[1] + step * len(y), low[1])
 
 
-def _show_image(axis: Axes, image: npt.NDArray[Any]) -> None:
+def _show_image(axis: Axes, image: AnyArray) -> None:
     """An image in grey, with the extreme percent at either end clipped."""
     finite = image[np.isfinite(image)]
     low, high = np.percentile(finite, [1, 99]) if finite.size else (0, 1)
     axis.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), interpolation="antialiased")
 
 
-def _shade(axis: Axes, excluded: npt.NDArray[np.float32], shape: tuple[int, int]) -> None:
+def _shade(axis: Axes, excluded: FloatImage, shape: tuple[int, int]) -> None:
     """Cover what is excluded, the more the less its weight."""
     from matplotlib.colors import to_rgb
 

@@ -19,7 +19,7 @@ from rgbmidic.report.figures import (
     share_figure,
     uncertainty_figure,
 )
-from rgbmidic.sequence.store import Result
+from rgbmidic.results.store import Result
 
 __all__ = ["remove_figures", "write_figures"]
 

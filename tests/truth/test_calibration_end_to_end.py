@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic.config import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.frames.writers import write_dng
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.registration import Registration, frame_geometry
+from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
+from rgbmidic.lab.virtual.capture import dark_frames, target_scene
 from rgbmidic.pipeline import measure
-from rgbmidic.sequence.writers import write_dng
-from rgbmidic.virtual import record, render, sphere_scene, truth, turned
-from rgbmidic.virtual.capture import dark_frames, target_scene
+from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic_calibration.blocks import block_means
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
 from rgbmidic_calibration.noise import photon_transfer

@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 
 from rgbmidic.cli import app
 from rgbmidic.errors import InputError
-from rgbmidic.study import METHODS, run_paper_study
-from rgbmidic.study.causes import VARIATIONS, find_causes
-from rgbmidic.study.claims import judge
-from rgbmidic.study.paper import PaperStudy
+from rgbmidic.lab.study import METHODS, run_paper_study
+from rgbmidic.lab.study.causes import VARIATIONS, find_causes
+from rgbmidic.lab.study.claims import judge
+from rgbmidic.lab.study.paper import PaperStudy
 
 ANGLES = (1.0, 8.0)
 
@@ -83,7 +83,7 @@ def test_command_writes_tables_pictures_and_report(study, tmp_path, monkeypatch)
         asked.update(angles=angles, **settings)
         return study
 
-    monkeypatch.setattr("rgbmidic.study.run_paper_study", canned)
+    monkeypatch.setattr("rgbmidic.lab.study.run_paper_study", canned)
     out = tmp_path / "study"
     result = CliRunner().invoke(app, ["study", "paper", "--out", str(out), "--angles", "1,8", "--size", "512"])
     assert result.exit_code == 0, result.output

@@ -14,12 +14,12 @@ from rgbmidic import correlate
 from rgbmidic.correlation import NodeStatus, Solution
 from rgbmidic.fields import at_nodes, field_rms, fill
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.mosaic import linearise
+from rgbmidic.illumination.linearise import linearise
 from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.unmix import unmix
-from rgbmidic.illumination.weights import threshold_weights
+from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.virtual import record, render, sphere_scene, truth, turned
+from rgbmidic.weights.threshold import threshold_weights
 
 DRAWS = 100
 RATIO = (0.9, 1.1)  # stated over observed, median of the field

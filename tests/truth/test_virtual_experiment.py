@@ -7,7 +7,7 @@ import pytest
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 
 from rgbmidic import correlate
-from rgbmidic.virtual import (
+from rgbmidic.lab.virtual import (
     Cylinder,
     Finish,
     Light,
@@ -22,7 +22,7 @@ from rgbmidic.virtual import (
     truth,
     turned,
 )
-from rgbmidic.virtual.scenes import paint
+from rgbmidic.lab.virtual.scenes import paint
 
 FRONT = (0.0, 0.0, 600.0)
 SIZE = 144

@@ -12,8 +12,8 @@ import pytest
 from small_tests import colour_test
 
 from rgbmidic import NodeStatus, Status, TestSettings, measure
-from rgbmidic.config import _place, _sections
-from rgbmidic.report.export import export_result
+from rgbmidic.results.export import export_result
+from rgbmidic.settings import _place, _sections
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -45,9 +45,9 @@ def defaults() -> dict[str, dict[str, object]]:
             types = {"frames": "FrameSettings", "region": "RegionSettings"}
             home = entry.default_factory if entry.default_factory is not MISSING else types[section]
             if isinstance(home, str):
-                import rgbmidic.config
+                import rgbmidic.settings
 
-                home = getattr(rgbmidic.config, home)
+                home = getattr(rgbmidic.settings, home)
             found[section] |= {part.name: part.default for part in fields(home)}
     return found
 

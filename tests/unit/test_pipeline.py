@@ -21,8 +21,8 @@ from rgbmidic.errors import (
     ResultError,
     RgbmidicError,
 )
-from rgbmidic.sequence.frames import file_hash
-from rgbmidic.sequence.writers import write_dng, write_tiff
+from rgbmidic.frames.series import file_hash
+from rgbmidic.frames.writers import write_dng, write_tiff
 
 BAYER_RMS = 0.015
 """px: Malvar demosaicing and the noise of a 12-bit camera on a plate without reflections."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.demosaic import PAD, pad_mosaic
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, cfa_channels
+from rgbmidic.frames.data import cfa_channels
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
+from rgbmidic.typing import FloatImage
 
 __all__ = ["Demosaicer", "check_mosaic", "padded_mosaic", "red_position"]
 
@@ -43,7 +44,7 @@ def red_position(cfa: str) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def padded_mosaic(mosaic: LinearMosaic) -> npt.NDArray[np.float32]:
+def padded_mosaic(mosaic: LinearMosaic) -> FloatImage:
     """The mosaic (H + 4, W + 4), mirrored about its border pixels, NaN where saturated."""
     rows, columns = mosaic.values.shape
     padded = np.empty((rows + 2 * PAD, columns + 2 * PAD), dtype=np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 
 from rgbmidic._kernels import demosaic as kernels
 from rgbmidic.illumination.demosaic.base import check_mosaic, padded_mosaic, red_position
-from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
 
 __all__ = ["BilinearDemosaicer", "MalvarDemosaicer"]
 

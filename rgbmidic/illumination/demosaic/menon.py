@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import correlate, correlate1d
 
+from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.demosaic.base import check_mosaic
-from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, cfa_channels
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["MenonDemosaicer"]
 
-FloatImage = npt.NDArray[np.float32]
-BoolImage = npt.NDArray[np.bool_]
 
 _ALONG, _ACROSS = 1, 0
 _GREEN = np.array([-0.25, 0.5, 0.5, 0.5, -0.25])
@@ -54,11 +54,11 @@ class MenonDemosaicer:
         )
 
 
-def _filtered(image: FloatImage, taps: npt.NDArray[np.float64], axis: int) -> FloatImage:
+def _filtered(image: FloatImage, taps: FloatArray, axis: int) -> FloatImage:
     return np.asarray(correlate1d(image, taps, axis=axis, mode="mirror"))
 
 
-def _green(values: FloatImage, site: npt.NDArray[np.intp]) -> tuple[FloatImage, BoolImage]:
+def _green(values: FloatImage, site: npt.NDArray[np.intp]) -> tuple[FloatImage, BoolArray]:
     """Green everywhere, and where the direction along the row was the better one."""
     is_green = site == 1
     candidates, variations = [], []
@@ -72,7 +72,7 @@ def _green(values: FloatImage, site: npt.NDArray[np.intp]) -> tuple[FloatImage, 
     return np.where(along, candidates[0], candidates[1]), along
 
 
-def _complete(values: FloatImage, green: FloatImage, site: npt.NDArray[np.intp], along: BoolImage) -> FloatImage:
+def _complete(values: FloatImage, green: FloatImage, site: npt.NDArray[np.intp], along: BoolArray) -> FloatImage:
     """All three channels from the samples and the full green."""
     out = np.stack([np.where(site == 0, values, 0), green, np.where(site == 2, values, 0)]).astype(np.float32)
     for colour in (0, 2):
@@ -90,7 +90,7 @@ def _complete(values: FloatImage, green: FloatImage, site: npt.NDArray[np.intp],
     return out
 
 
-def _refined(channels: FloatImage, site: npt.NDArray[np.intp], along: BoolImage) -> FloatImage:
+def _refined(channels: FloatImage, site: npt.NDArray[np.intp], along: BoolArray) -> FloatImage:
     """Colour differences averaged along the chosen direction, first for green, then for red and blue."""
     red, green, blue = channels
     for colour, plane in ((0, red), (2, blue)):
@@ -106,5 +106,5 @@ def _refined(channels: FloatImage, site: npt.NDArray[np.intp], along: BoolImage)
     return np.stack([red, green, blue]).astype(np.float32)
 
 
-def _directed(image: FloatImage, along: BoolImage) -> FloatImage:
+def _directed(image: FloatImage, along: BoolArray) -> FloatImage:
     return np.where(along, _filtered(image, _THREE, _ALONG), _filtered(image, _THREE, _ACROSS))

@@ -7,18 +7,18 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.kriging import TILE, predict
 from rgbmidic._kernels.texture import scaled_contrast, subtract_mean
 from rgbmidic.errors import InputError
+from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.colour_factors import BLOCK, MEAN_BLOCK, local_means
 from rgbmidic.illumination.demosaic.base import check_mosaic, red_position
-from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, cfa_channels
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
+from rgbmidic.typing import BoolArray, FloatImage
 
 __all__ = ["BandLimitedDemosaicer", "NormalisedMosaic"]
 
-FloatImage = npt.NDArray[np.float32]
 
 _SIZE = 11
 """Side of the square of samples of the band-limited reconstruction."""
@@ -103,7 +103,7 @@ def _expanded(grid: FloatImage, rows: int, columns: int) -> FloatImage:
     return np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)[:rows, :columns])
 
 
-def _validity(saturated: npt.NDArray[np.bool_], cfa: str) -> npt.NDArray[np.bool_]:
+def _validity(saturated: BoolArray, cfa: str) -> BoolArray:
     if not saturated.any():
         return np.ones((3, *saturated.shape), dtype=bool)
     rows, columns = saturated.shape

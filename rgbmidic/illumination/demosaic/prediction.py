@@ -16,12 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.kriging import TILE
-from rgbmidic.illumination.mosaic import cfa_channels
+from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["SIZE", "WIDE", "FilterTable", "prediction_filters"]
 
-Floats = npt.NDArray[np.float64]
 
 SIZE, WIDE = 5, 7
 """Side of the square of samples that a value is predicted from, and where the colours have nothing in common."""
@@ -54,14 +54,14 @@ class FilterTable:
     """
 
     index: npt.NDArray[np.int32]
-    taps: npt.NDArray[np.float32]
-    variance: Floats
-    noise: Floats
+    taps: FloatImage
+    variance: FloatArray
+    noise: FloatArray
     size: int = SIZE
 
 
 def prediction_filters(
-    private: Floats, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
+    private: FloatArray, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
 ) -> FilterTable:
     """The table of filters for tiles whose channels have some private variance.
 
@@ -98,7 +98,9 @@ def prediction_filters(
     )
 
 
-def _solved(share: Floats, noise: Floats, texture: TextureModel, cfa: str, size: int) -> tuple[Floats, Floats, Floats]:
+def _solved(
+    share: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Filters (T, 4, 3, size²), error variances (T, 3) and noise covariances (T, 3, 3) for shares (T, 3)."""
     common, coarse, fine = _covariances(texture, size)
     private = texture.private * coarse + (1 - texture.private) * fine
@@ -122,7 +124,7 @@ def _solved(share: Floats, noise: Floats, texture: TextureModel, cfa: str, size:
 
 
 @lru_cache(maxsize=64)
-def _covariances(texture: TextureModel, size: int) -> tuple[Floats, Floats, Floats]:
+def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Covariance between the samples of the square: of the texture, of coarse and of fine private contrast."""
     offset = np.arange(size) - size // 2
     points = np.stack(np.meshgrid(offset, offset, indexing="ij"), -1).reshape(-1, 2)

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.kriging import TILE, fill_unknown, predict
 from rgbmidic.errors import InputError
+from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.colour_factors import (
     BLOCK,
     MEAN_BLOCK,
@@ -31,12 +31,12 @@ from rgbmidic.illumination.colour_factors import (
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic.base import check_mosaic, red_position
 from rgbmidic.illumination.demosaic.prediction import SIZE, WIDE, FilterTable, prediction_filters
-from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, cfa_channels
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["SMALLEST_FRAME", "Reconstruction", "ReflectionAwareDemosaicer"]
 
-Floats = npt.NDArray[np.float64]
 
 SMALLEST_FRAME = 64
 """Rows and columns under which a frame holds too few speckles for statistics."""
@@ -65,9 +65,9 @@ class Reconstruction:
     channels: LinearChannels
     texture: TextureModel
     factors: ColourFactors
-    mean: npt.NDArray[np.float32]
+    mean: FloatImage
     table: FilterTable
-    noise: Floats | None
+    noise: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,7 +133,7 @@ def _filters(factors: ColourFactors, texture: TextureModel, cfa: str) -> FilterT
     return prediction_filters(_per_tile(factors.private), noise, texture, cfa, size=size)
 
 
-def _per_tile(grid: Floats) -> Floats:
+def _per_tile(grid: FloatArray) -> FloatArray:
     """Mean of a grid of blocks over the tiles; the last one may be narrower."""
     ratio = TILE // BLOCK
     missing = [(0, 0), *((0, -side % ratio) for side in grid.shape[1:])]
@@ -143,7 +143,7 @@ def _per_tile(grid: Floats) -> Floats:
 
 def _predict(
     moments: Moments, factors: ColourFactors, table: FilterTable, *, damaged: bool
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+) -> tuple[FloatImage, BoolArray]:
     """Channels (3, H, W) and where samples stayed unknown (H, W)."""
     spread, pad = factors.spread.astype(np.float32), table.size // 2
     padded = scaled(moments, np.float32(1) / spread, pad=pad, width=table.index.shape[1] * TILE)
@@ -157,7 +157,7 @@ def _predict(
     return out, unknown[pad : pad + rows, pad : pad + columns]
 
 
-def _validity(saturated: npt.NDArray[np.bool_], unknown: npt.NDArray[np.bool_], cfa: str) -> npt.NDArray[np.bool_]:
+def _validity(saturated: BoolArray, unknown: BoolArray, cfa: str) -> BoolArray:
     """A channel is not known within a pixel of its own saturated samples, none where the texture is not known."""
     cell = cfa_channels(cfa)
     rows, columns = saturated.shape
@@ -168,7 +168,7 @@ def _validity(saturated: npt.NDArray[np.bool_], unknown: npt.NDArray[np.bool_], 
     return np.stack([~(mask | wide) for mask in own])
 
 
-def _noise(factors: ColourFactors, table: FilterTable) -> Floats:
+def _noise(factors: ColourFactors, table: FilterTable) -> FloatArray:
     """Covariance (3, 3) of the camera noise at a typical pixel, DN²."""
     typical = np.bincount(table.index.ravel()).argmax()
     spread = np.median(factors.spread, axis=(1, 2))

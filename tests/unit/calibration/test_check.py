@@ -7,10 +7,11 @@ import pytest
 from calibration_scene import BLACK, GAIN, MATRICES, READ, WHITE, captures, expose, registered_pictures, speckle_target
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
+from rgbmidic.frames.data import Mosaic
+from rgbmidic.frames.readers import read_frame
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.mosaic import Mosaic, NoiseModel
+from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.registration import Registration, frame_geometry
-from rgbmidic.sequence.readers import read_frame
 from rgbmidic_calibration.blocks import block_means
 from rgbmidic_calibration.stacks import stack_frames
 from rgbmidic_calibration.verdict import read_limits

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from calibration_scene import MATRICES, captures, expose, speckle_target, white_target
 
+from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.sequence.writers import write_dng, write_tiff
 from rgbmidic_calibration.cli import main
 
 MATRIX = MATRICES[1.5]

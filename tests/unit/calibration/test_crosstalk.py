@@ -7,8 +7,8 @@ import pytest
 from calibration_scene import BLACK, MATRICES, WHITE, captures, expose, speckle_target, white_target
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.mosaic import BAYER_PATTERNS, ChannelFrame, Mosaic
 from rgbmidic_calibration.blocks import block_centres, block_means
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
 

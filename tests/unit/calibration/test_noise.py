@@ -7,8 +7,8 @@ import pytest
 from calibration_scene import BLACK, GAIN, READ, WHITE, expose, speckle_target, white_target
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.mosaic import ChannelFrame, Mosaic
 from rgbmidic_calibration.noise import photon_transfer
 from rgbmidic_calibration.stacks import stack_frames
 

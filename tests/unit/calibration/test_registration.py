@@ -7,8 +7,8 @@ import pytest
 from calibration_scene import BLACK, MATRICES, WHITE, expose, registered_pictures, wave_texture, white_target
 
 from rgbmidic.errors import CalibrationError, InputError
+from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.mosaic import Mosaic
 from rgbmidic.illumination.registration import Registration, frame_geometry, registration_basis
 from rgbmidic_calibration.registration import estimate_registration, jitter, light_picture
 from rgbmidic_calibration.stacks import stack_frames

@@ -9,7 +9,7 @@ from naive_calibration import unmix_field as naive_unmix_field
 from rgbmidic._kernels.unmix_field import unmix_field
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
-from rgbmidic.illumination.mosaic import LinearChannels
+from rgbmidic.illumination.linearise import LinearChannels
 from rgbmidic.illumination.unmix import unmix
 
 LIGHTS = ("red", "green", "blue")

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
+from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.demosaic import (
     BandLimitedDemosaicer,
     BilinearDemosaicer,
@@ -13,7 +14,7 @@ from rgbmidic.illumination.demosaic import (
     MenonDemosaicer,
     NormalisedMosaic,
 )
-from rgbmidic.illumination.mosaic import BAYER_PATTERNS, LinearMosaic
+from rgbmidic.illumination.linearise import LinearMosaic
 
 METHODS = {"bilinear": BilinearDemosaicer(), "malvar": MalvarDemosaicer()}
 

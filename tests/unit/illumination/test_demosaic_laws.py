@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from naive_demosaic import site_channels
 
+from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
 from rgbmidic.illumination.demosaic import (
     BandLimitedDemosaicer,
     BilinearDemosaicer,
@@ -16,7 +17,7 @@ from rgbmidic.illumination.demosaic import (
     MenonDemosaicer,
     ReflectionAwareDemosaicer,
 )
-from rgbmidic.illumination.mosaic import BAYER_PATTERNS, LinearMosaic, shift_cfa
+from rgbmidic.illumination.linearise import LinearMosaic
 from rgbmidic.illumination.separate import DEMOSAICERS, separate, separate_reflections
 from rgbmidic.illumination.texture import TextureModel
 

@@ -6,10 +6,10 @@ import pytest
 from naive_demosaic import site_channels
 
 from rgbmidic.errors import InputError
+from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.colour_factors import colour_factors, gather_moments, learn_texture
 from rgbmidic.illumination.demosaic import Demosaicer, ReflectionAwareDemosaicer
 from rgbmidic.illumination.demosaic.prediction import prediction_filters
-from rgbmidic.illumination.mosaic import BAYER_PATTERNS
 from rgbmidic.illumination.separate import separate, separate_reflections
 from rgbmidic.illumination.texture import TextureModel
 

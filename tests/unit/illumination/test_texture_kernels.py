@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from rgbmidic._kernels import kriging, texture
+from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.demosaic.base import red_position
-from rgbmidic.illumination.mosaic import BAYER_PATTERNS
 
 SHAPES = [(16, 24), (19, 21), (33, 18)]
 

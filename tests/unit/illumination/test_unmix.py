@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.calibration import Crosstalk
-from rgbmidic.illumination.mosaic import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.separate import DEMOSAICERS, separate
 from rgbmidic.illumination.unmix import NEGLIGIBLE, unmix
 

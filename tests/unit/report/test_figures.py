@@ -13,7 +13,7 @@ from results import LIGHTS, MESH, NODES, make_result
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.report import figures
 from rgbmidic.report.gallery import remove_figures, write_figures
-from rgbmidic.sequence.store import FrameRecord, Result, ResultStore
+from rgbmidic.results.store import FrameRecord, Result, ResultStore
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 
@@ -129,6 +129,6 @@ def test_impossible_frame_and_file(tmp_path: Path) -> None:
 
 
 def test_matplotlib_is_imported_only_for_a_figure() -> None:
-    code = "import sys, rgbmidic.report.gallery, rgbmidic.report.export; print('matplotlib' in sys.modules)"
+    code = "import sys, rgbmidic.report.gallery, rgbmidic.results.export; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

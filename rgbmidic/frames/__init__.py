@@ -1,0 +1,1 @@
+"""Raw frames and where they come from."""

@@ -1,0 +1,149 @@
+"""Camera raw files (DNG, NEF, CR2, ARW, ...) through LibRaw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import FrameError
+from rgbmidic.frames.contents import FileContents, damaged
+from rgbmidic.frames.data import BAYER_PATTERNS
+from rgbmidic.frames.tiff_structure import RawStructure
+from rgbmidic.typing import AnyArray, FloatArray
+
+if TYPE_CHECKING:
+    import rawpy
+
+__all__ = ["MAXIMUM_FLAT_ROWS", "camera_raw_shape", "has_camera_header", "read_camera_raw"]
+
+MAXIMUM_FLAT_ROWS = 0.01
+"""Share of rows without any noise above which a camera raw counts as not decoded: defective rows may exist."""
+
+_CAMERA_HEADERS = (
+    *(b"II*\0", b"MM\0*"),  # TIFF: DNG, NEF, CR2, ARW, PEF, KDC, ...
+    *(b"IIU\0", b"IIRO", b"IIRS", b"MMOR"),  # Panasonic, Olympus
+    *(b"II\x1a\0", b"IIII", b"MMMM"),  # Canon CRW, Phase One
+    *(b"\0MRM", b"FUJIFILM", b"FOVb"),  # Minolta, Fujifilm, Sigma
+)
+_CR3_HEADER = b"ftypcrx "
+
+
+def read_camera_raw(path: Path) -> FileContents:
+    """Read the visible part of a camera raw: the mosaic of a Bayer camera or the image of a monochrome one.
+
+    Orientation and default crop of the file are not applied: pixels stay where they are on the sensor.
+
+    Raises
+    ------
+    FrameError
+        LibRaw does not know or cannot decode the file, the file is truncated, its image is already demosaiced, or
+        its colour filter array is not a Bayer pattern.
+    """
+    structure = RawStructure.read(path)
+    with _open(path) as raw:
+        cell = _colour_cell(raw, path)
+        values = np.array(raw.raw_image_visible, dtype=np.uint16)
+        black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
+        white, margins, names = float(raw.white_level), raw.sizes, _names(raw, cell)
+        monochrome = raw.num_colors == 1
+    told = structure.black_level(margins.top_margin, margins.left_margin) if structure else None
+    black = black if told is None else told
+    _check_filled(values, black, white, stored_as_is=structure is not None and structure.stored_as_is, path=path)
+    if monochrome:
+        return FileContents(values=values, kind="monochrome", black_level=black, white_level=white)
+    return FileContents(values=values, kind="bayer", cfa=names, black_level=black, white_level=white)
+
+
+def camera_raw_shape(path: Path) -> tuple[int, int]:
+    """Rows and columns of the visible part, from the header alone."""
+    with _open(path) as raw:
+        return int(raw.sizes.height), int(raw.sizes.width)
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[rawpy.RawPy]:
+    """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError."""
+    import rawpy
+
+    if not has_camera_header(path):
+        raise _unsupported(path)
+    try:
+        with rawpy.imread(str(path)) as raw:
+            yield raw
+    except rawpy.LibRawFileUnsupportedError:
+        raise _unsupported(path) from None
+    except NotImplementedError:  # rawpy's answer to filters that repeat neither after 2x2 nor after 6x6 pixels
+        raise _not_bayer(path, "that is no mosaic of 2x2 pixels") from None
+    except rawpy.LibRawError as error:
+        raise _undecodable(path, error) from None
+
+
+def has_camera_header(path: Path) -> bool:
+    """Whether the file starts as camera raws do.
+
+    LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture.
+    """
+    with path.open("rb") as file:
+        head = file.read(12)
+    return head.startswith(_CAMERA_HEADERS) or head[4:] == _CR3_HEADER
+
+
+def _unsupported(path: Path) -> FrameError:
+    return FrameError(
+        f"{path} is not a frame that rgbmidic reads; allowed are camera raws (DNG, NEF, CR2, ARW, ...), TIFF, PNG, and "
+        "headerless .raw or .bin files whose shape and dtype are stated"
+    )
+
+
+def _not_bayer(path: Path, what: str) -> FrameError:
+    allowed = ", ".join(BAYER_PATTERNS)
+    return FrameError(f"{path} has a colour filter array {what}; allowed are the Bayer patterns {allowed}")
+
+
+def _undecodable(path: Path, error: Exception) -> FrameError:
+    text = error.args[0] if error.args else type(error).__name__
+    return damaged(path, f"LibRaw says: {text.decode(errors='replace') if isinstance(text, bytes) else text}")
+
+
+def _colour_cell(raw: rawpy.RawPy, path: Path) -> AnyArray:
+    """Colour numbers of the first visible 2x2 cell; only single-plane sensors, Bayer or without filters, have one."""
+    pattern = raw.raw_pattern
+    if raw.raw_type.name != "Flat" or pattern is None:
+        raise FrameError(
+            f"{path} holds an image that is already demosaiced (linear raw); needed is the mosaic as the sensor "
+            "recorded it"
+        )
+    if raw.num_colors == 1:
+        return np.zeros((2, 2), dtype=np.intp)
+    cell = raw.raw_colors_visible[:2, :2].copy()
+    if pattern.shape != (2, 2) or _names(raw, cell) not in BAYER_PATTERNS:
+        rows, columns = pattern.shape
+        raise _not_bayer(path, f"of {rows}x{columns} pixels with the colours {_names(raw, pattern)}")
+    return cell
+
+
+def _names(raw: rawpy.RawPy, colours: AnyArray) -> str:
+    return "".join(raw.color_desc.decode()[colour] for colour in colours.ravel())
+
+
+def _check_filled(
+    values: npt.NDArray[np.uint16], black: FloatArray, white: float, *, stored_as_is: bool, path: Path
+) -> None:
+    """Refuse a mosaic that LibRaw filled with zeros because the file's data ended.
+
+    A row of a real sensor has noise, even in the dark: rows of one single value are not measured unless they are
+    saturated. Where the samples are stored uncompressed and the file is complete, such rows may be real (a computed
+    frame), except zeros below a positive black level, which no sensor gives.
+    """
+    lowest, highest = values.min(axis=1), values.max(axis=1)
+    flat = (lowest == highest) & (highest < white)
+    if stored_as_is:
+        flat &= (highest == 0) & (black.min() > 0)
+    share = float(flat.mean())
+    if flat[-1] or share > MAXIMUM_FLAT_ROWS:
+        raise damaged(path, f"{share:.1%} of its rows are empty (one single value, {highest[flat][-1]} in the last)")

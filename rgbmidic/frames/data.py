@@ -1,0 +1,115 @@
+"""Raw frames as the camera recorded them: the first step of docs/conventions.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import InputError
+from rgbmidic.settings import BAYER_PATTERNS
+from rgbmidic.typing import FloatArray
+
+__all__ = ["BAYER_PATTERNS", "ChannelFrame", "Mosaic", "cfa_channels", "shift_cfa"]
+
+
+def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
+    """Channel index (R 0, G 1, B 2) of each position of the 2x2 cell of a Bayer pattern.
+
+    Parameters
+    ----------
+    cfa
+        One of `BAYER_PATTERNS`; upper or lower case.
+
+    Returns
+    -------
+    ndarray, shape (2, 2)
+        ``channels[row % 2, column % 2]`` is the channel sampled at that pixel.
+
+    Raises
+    ------
+    InputError
+        The name is not a Bayer pattern.
+    """
+    name = cfa.upper() if isinstance(cfa, str) else cfa
+    if name not in BAYER_PATTERNS:
+        raise InputError(f"unknown colour filter array {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
+    return np.array(["RGB".index(letter) for letter in name], dtype=np.intp).reshape(2, 2)
+
+
+def shift_cfa(cfa: str, rows: int, columns: int) -> str:
+    """Name of the Bayer pattern seen after the first `rows` rows and `columns` columns are cropped away."""
+    cell = np.array(list(cfa.upper())).reshape(2, 2)
+    return "".join(np.roll(cell, (-rows, -columns), axis=(0, 1)).ravel())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mosaic:
+    """One raw frame behind a Bayer colour filter array.
+
+    Attributes
+    ----------
+    values : ndarray, shape (H, W), uint16
+        Raw grey levels (DN).
+    cfa : str
+        One of `BAYER_PATTERNS`, valid for ``values[0, 0]``.
+    black_level : ndarray, shape (2, 2), float64
+        Black level (DN) of each position of the 2x2 cell.
+    white_level : float
+        Smallest grey level (DN) that counts as saturated.
+    """
+
+    values: npt.NDArray[np.uint16]
+    cfa: str
+    black_level: FloatArray
+    white_level: float
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values)
+        if values.ndim != 2:
+            raise InputError(f"a mosaic is one (H, W) image, not an array of shape {values.shape}")
+        cfa_channels(self.cfa)
+        black = np.broadcast_to(np.asarray(self.black_level, dtype=np.float64), (2, 2)).copy()
+        _check_levels(black, self.white_level)
+        object.__setattr__(self, "values", np.ascontiguousarray(values, dtype=np.uint16))
+        object.__setattr__(self, "cfa", self.cfa.upper())
+        object.__setattr__(self, "black_level", black)
+        object.__setattr__(self, "white_level", float(self.white_level))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelFrame:
+    """One frame with all its channels at every pixel: monochrome (1 channel) or 3-CCD colour (3 channels).
+
+    Attributes
+    ----------
+    values : ndarray, shape (C, H, W), uint16
+        Raw grey levels (DN).
+    black_level : ndarray, shape (C,), float64
+        Black level (DN) of each channel.
+    white_level : float
+        Smallest grey level (DN) that counts as saturated.
+    """
+
+    values: npt.NDArray[np.uint16]
+    black_level: FloatArray
+    white_level: float
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values)
+        if values.ndim != 3 or values.shape[0] not in (1, 3):
+            raise InputError(f"a channel frame has shape (1 or 3, H, W), not {values.shape}")
+        black = np.broadcast_to(np.asarray(self.black_level, dtype=np.float64), values.shape[:1]).copy()
+        _check_levels(black, self.white_level)
+        object.__setattr__(self, "values", np.ascontiguousarray(values, dtype=np.uint16))
+        object.__setattr__(self, "black_level", black)
+        object.__setattr__(self, "white_level", float(self.white_level))
+
+
+def _check_levels(black: FloatArray, white: float) -> None:
+    if not (np.isfinite(black).all() and np.isfinite(white) and black.min() >= 0 and white > black.max()):
+        raise InputError(
+            f"black and white level must be finite with 0 <= black < white; given are black {black.tolist()}, "
+            f"white {white}"
+        )

@@ -1,0 +1,185 @@
+"""The skeleton of TIFF files (DNG, NEF, ARW and other raws are TIFF inside): is all the image data there?
+
+LibRaw and tifffile both open some truncated files and fill what is missing with zeros, so the extents are checked
+first.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rgbmidic.errors import RgbmidicError
+from rgbmidic.frames.contents import damaged
+from rgbmidic.typing import FloatArray
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile, TiffPage
+
+__all__ = [
+    "RawStructure",
+    "cfa_pattern",
+    "is_dng",
+    "is_stored_as_is",
+    "tag",
+    "tiff_pages",
+]
+
+# A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+_UNCOMPRESSED = 1
+_REDUCED = 1
+_RAW_PHOTOMETRIC = (32803, 34892)
+_DNG_VERSION = 50706
+_CFA_REPEAT, _CFA_PATTERN = 33421, 33422
+_ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715, 50716)
+
+
+@contextmanager
+def tiff_pages(path: Path) -> Iterator[list[TiffPage] | None]:
+    """The images of a TIFF file in full resolution, neither thumbnails nor previews; None for other files.
+
+    Raises
+    ------
+    FrameError
+        Image data that the header announces is not in the file, or what is done inside fails over a damaged header.
+    """
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            pages = [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
+            for page in pages:
+                _check_complete(page, path)
+            yield pages
+    except tifffile.TiffFileError as error:
+        if "not a TIFF file" not in str(error):
+            raise damaged(path, error) from None
+        yield None
+    except (RgbmidicError, OSError):
+        raise
+    except Exception as error:  # tifffile meets damaged headers with many kinds of error
+        raise damaged(path, error) from None
+
+
+def is_dng(path: Path) -> bool:
+    """Whether the file is a DNG, whatever its name says; False where it has no readable first image."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            return _DNG_VERSION in tiff.pages.first.tags
+    except OSError:
+        raise
+    except Exception:  # see tiff_pages; whoever reads the image tells what is wrong
+        return False
+
+
+def _pages(tiff: TiffFile) -> Iterator[TiffPage]:
+    seen: set[int] = set()
+    for frame in tiff.pages:
+        page = frame.aspage()
+        if page.offset in seen:  # tifffile would go round for ever
+            raise ValueError("its list of images leads back to itself")
+        seen.add(page.offset)
+        yield page
+        yield from (child.aspage() for child in page.pages or ())
+
+
+def _check_complete(page: TiffPage, path: Path) -> None:
+    """Raise where image data that the page announces lies outside the file or is empty."""
+    size = path.stat().st_size
+    parts = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+    end = max((offset + count for offset, count in parts), default=0)
+    if end > size:
+        raise damaged(path, f"the header announces image data up to byte {end}, the file has {size} bytes")
+    if any(count == 0 for _, count in parts):
+        raise damaged(path, "a part of its image data has the length zero")
+
+
+def is_stored_as_is(page: TiffPage) -> bool:
+    """Whether the page's samples are uncompressed and their bytes are all there."""
+    bits = page.bitspersample if isinstance(page.bitspersample, int) else page.bitspersample[0]
+    needed = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
+    return bool(page.compression == _UNCOMPRESSED and sum(page.databytecounts) >= needed)
+
+
+def tag(page: TiffPage, code: int) -> tuple[Any, ...] | None:
+    """Value of a tag as a tuple, or None where the page does not have it."""
+    if code not in page.tags:
+        return None
+    value = page.tags[code].value
+    return tuple(value) if isinstance(value, tuple | list | bytes) else (value,)
+
+
+def cfa_pattern(page: TiffPage) -> str | None:
+    """Name of the 2x2 colour filter array in the page's tags, or None where there is none."""
+    pattern = tag(page, _CFA_PATTERN)
+    if pattern is None or tag(page, _CFA_REPEAT) != (2, 2) or not set(pattern) <= {0, 1, 2}:
+        return None
+    return "".join("RGB"[channel] for channel in pattern)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawStructure:
+    """What the TIFF skeleton of a camera raw tells beyond LibRaw.
+
+    Attributes
+    ----------
+    stored_as_is
+        Whether the samples are uncompressed and all there, so that zeros in them are real.
+    black_cell : ndarray, shape (2, 2), or None
+        DNG black level by position at `origin`; None where no tag says it or says more than a 2x2 cell can hold.
+    origin
+        First row and column of the DNG's active area on the sensor.
+    """
+
+    stored_as_is: bool
+    black_cell: FloatArray | None
+    origin: tuple[int, int]
+
+    @classmethod
+    def read(cls, path: Path) -> RawStructure | None:
+        """Read and check the skeleton; None for files that are not TIFF inside.
+
+        Raises
+        ------
+        FrameError
+            Image data that the header announces is not in the file.
+        """
+        with tiff_pages(path) as pages:
+            if not pages:
+                return None
+            raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
+            page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
+            area = tag(page, _ACTIVE_AREA) or (0, 0)
+            return cls(stored_as_is=is_stored_as_is(page), black_cell=_black_cell(page), origin=(area[0], area[1]))
+
+    def black_level(self, top: int, left: int) -> FloatArray | None:
+        """Black level of each position of the 2x2 cell that starts at row `top`, column `left` of the sensor.
+
+        LibRaw moves odd margins to the next even row and column without moving the black levels along.
+        """
+        if self.black_cell is None:
+            return None
+        return np.roll(self.black_cell, (self.origin[0] - top, self.origin[1] - left), axis=(0, 1))
+
+
+def _black_cell(page: TiffPage) -> FloatArray | None:
+    levels, repeat = tag(page, _BLACK), tag(page, _BLACK_REPEAT) or (1, 1)
+    if levels is None or any(delta in page.tags for delta in _BLACK_DELTAS) or not set(repeat) <= {1, 2}:
+        return None
+    numbers = np.array(levels, dtype=np.float64)
+    if len(numbers) == 2 * math.prod(repeat):  # rationals come as numerator, denominator
+        numbers = numbers[::2] / numbers[1::2]
+    if len(numbers) != math.prod(repeat):
+        return None
+    return np.tile(numbers.reshape(repeat), (2 // repeat[0], 2 // repeat[1]))

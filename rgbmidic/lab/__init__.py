@@ -1,0 +1,1 @@
+"""The laboratory: virtual experiments, the paper's studies, planning, inspection, the demonstration."""

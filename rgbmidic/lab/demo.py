@@ -1,0 +1,182 @@
+"""The demonstration: a virtual test made, calibrated, measured and compared with its exact truth.
+
+It goes the way a laboratory goes: raw frames and calibration captures on disk, the two commands, the result folder.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rgbmidic.correlation import Deformed, Reference, SolveOptions
+from rgbmidic.errors import CalibrationError, ResultError
+from rgbmidic.fields import at_nodes, field_rms
+from rgbmidic.frames.series import open_frames
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.pipeline import Separator, Start, measure, read_region, texture, track
+from rgbmidic.results.store import Result
+from rgbmidic.settings import TestSettings, read_test
+from rgbmidic.typing import FloatArray
+
+__all__ = ["DemoRow", "run_demo"]
+
+Say = Callable[[str], None]
+
+_SCENE = """\
+# The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
+[body]
+kind = "sphere"
+
+[[lights]]
+name = "red"
+position = [-190.0, -12.0, 90.0]
+
+[[lights]]
+name = "green"
+position = [200.0, 15.0, 90.0]
+
+[[lights]]
+name = "blue"
+position = [10.0, -220.0, 60.0]
+
+[camera]
+shape = [448, 448]
+crosstalk = [[1.0, 0.10, 0.02], [0.14, 1.0, 0.16], [0.03, 0.12, 1.0]]
+
+[output]
+seed = 2026
+"""
+_ANGLES = (0.33, 1.0, 2.0, 4.0, 8.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoRow:
+    """One frame of the demonstration.
+
+    Attributes
+    ----------
+    angle_deg
+        Rotation of the sphere.
+    rms_px
+        Root mean square error of the displacement over the field, px.
+    predicted_px
+        Root mean square of the uncertainty that the result states for its nodes, px.
+    nodal_px
+        Root mean square error at the nodes, px.
+    single_px
+        Error of each colour alone, with the same solver.
+    measured
+        Share of the nodes that are measured.
+    """
+
+    angle_deg: float
+    rms_px: float
+    predicted_px: float
+    nodal_px: float
+    single_px: tuple[float, ...]
+    measured: float
+
+
+def run_demo(out: Path, say: Say, progress: Callable[[int, int, str], None] | None = None) -> list[DemoRow]:
+    """Make the virtual test in `out`/test, calibrate it, measure it into `out`/result, and compare.
+
+    Parameters
+    ----------
+    out
+        Folder; it must be empty or not exist.
+    say
+        Called with a line about each step.
+    progress
+        Called with frames done, their total and a line.
+
+    Returns
+    -------
+    list of DemoRow
+        One row per turned frame.
+
+    Raises
+    ------
+    RgbmidicError
+        The folder is not empty, or a step fails.
+    """
+    from rgbmidic.lab.virtual.dataset import write_dataset
+
+    test, scene = out / "test", out / "scene.toml"
+    if out.exists() and any(out.iterdir()):
+        raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder with --out")
+    out.mkdir(parents=True, exist_ok=True)
+    states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in _ANGLES)
+    scene.write_text(_SCENE + states, encoding="utf-8")
+    say(f"virtual test: raw DNG frames, calibration captures and the exact truth in {test}")
+    settings_file = write_dataset(scene, test, progress)
+    (test / "calibration.json").rename(test / "true_calibration.json")
+    say("calibration: rgbmidic-calibrate crosstalk, from the captures with one light on at a time")
+    _calibrate(test)
+    settings = read_test(settings_file)
+    say(f"measurement: rgbmidic run {settings_file} --out {out / 'result'}")
+    result = measure(settings, out / "result", progress=progress)
+    say("the same with each colour alone, for comparison")
+    return _compare(settings, result)
+
+
+def _calibrate(test: Path) -> None:
+    """Run the calibration command on the captures, as a user would."""
+    lights = [argument for name in ("red", "green", "blue") for argument in ("--light", f"{name}=light_{name}/*.dng")]
+    command = [sys.executable, "-m", "rgbmidic_calibration", "crosstalk", "--dark", "dark/*.dng", *lights]
+    done = subprocess.run(
+        [*command, "--out", "calibration.json"], cwd=test, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise CalibrationError(f"rgbmidic-calibrate failed: {done.stderr.strip() or done.stdout.strip()}")
+
+
+def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
+    with np.load(settings.base / "truth.npz") as archive:
+        truth, angles = archive["displacement"].astype(np.float64), archive["angle_deg"]
+    mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
+    singles = _each_light_alone(settings, mesh)
+    rows = []
+    for index in range(1, len(result)):
+        field = np.stack([result.u[index], result.v[index]], axis=1)
+        std = np.stack([result.u_std[index], result.v_std[index]], axis=1)
+        rows.append(
+            DemoRow(
+                angle_deg=float(angles[index]),
+                rms_px=field_rms(mesh, field, truth[index]),
+                nodal_px=_rms(field - at_nodes(truth[index], mesh.nodes)),
+                predicted_px=_rms(std),
+                single_px=tuple(field_rms(mesh, single[index], truth[index]) for single in singles),
+                measured=float(np.isfinite(field[:, 0]).mean()),
+            )
+        )
+    return rows
+
+
+def _each_light_alone(settings: TestSettings, mesh: Tri3Mesh) -> list[list[FloatArray]]:
+    """Displacement (N, 2) of every frame from each light's images alone, with the same solver."""
+    separator = Separator.from_settings(settings)
+    frames = open_frames(settings.frames, settings.base)
+    images = [texture(separator(frames.read(index)), settings) for index in range(len(frames))]
+    region = read_region(settings.region, images[0].shape[1:])
+    singles = []
+    for light in range(len(images[0])):
+        stacks = [image[light : light + 1] for image in images]
+        reference = Reference.prepare(stacks[0], region, mesh=mesh, prefilter="binomial")
+        fields = [np.zeros((len(mesh.nodes), 2))]
+        start = Start(displacement=fields[0])
+        for stack in stacks[1:]:
+            deformed = Deformed.prepare(stack, prefilter="binomial")
+            solution = track(reference, deformed, start, SolveOptions(), search_radius=64.0)
+            start = start.after(solution)
+            fields.append(solution.displacement)
+        singles.append(fields)
+    return singles
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))

@@ -1,0 +1,15 @@
+"""What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect."""
+
+from rgbmidic.lab.inspection.inspect import inspect_files, inspect_frame, state_frames
+from rgbmidic.lab.inspection.results import ChannelFacts, Finding, Inspection, LightFacts, Spread
+
+__all__ = [
+    "ChannelFacts",
+    "Finding",
+    "Inspection",
+    "LightFacts",
+    "Spread",
+    "inspect_files",
+    "inspect_frame",
+    "state_frames",
+]

@@ -1,0 +1,289 @@
+"""What an inspection finds, as plain values, and the warnings that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.texture import COLOURED, TextureModel
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = ["TOO_FINE", "ChannelFacts", "Finding", "Inspection", "LightFacts", "Spread", "findings"]
+
+
+BLIND = 0.5
+"""Share of the usual contrast that no light reaches where the specimen cannot be seen."""
+TOO_FINE = 0.75
+"""Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs/inspect.md)."""
+COARSE = 3.0
+"""Speckles along the side of an element that it needs at least."""
+SATURATED, DARK, HIDDEN, NEGATIVE, GREENS = 0.01, 0.1, 0.01, 0.01, 0.05
+"""Shares from which a warning is worth its line: of saturated samples; of the full scale that the bright twentieth of a
+channel reaches; of the region that no light shows; of pixels where a light is negative; between the two greens."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spread:
+    """A quantity over the measured nodes: median and 95 % quantile, both in px; NaN where nothing is measured."""
+
+    median: float
+    q95: float
+
+    @classmethod
+    def of(cls, std: FloatArray) -> Spread:
+        """Of standard uncertainties (N, 2) of u and v; the root mean square of both at each node."""
+        both = np.sqrt((std**2).mean(axis=1))
+        both = both[np.isfinite(both)]
+        if not both.size:
+            return cls(median=float("nan"), q95=float("nan"))
+        return cls(median=float(np.median(both)), q95=float(np.quantile(both, 0.95)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelFacts:
+    """The samples of one camera channel in the region.
+
+    Attributes
+    ----------
+    name : str
+        R, G, B; M for a monochrome camera, M1, M2, ... for lights in succession.
+    mean, low, high : float
+        Mean, 5 % and 95 % quantile of the samples above black, in shares of the full scale.
+    saturated : float
+        Share of the samples that are saturated.
+    speckle_px : float
+        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.samples.speckle_size`).
+    noise_dn : float
+        Standard deviation of the camera noise of a sample at the mean level, DN; estimated from the frame where the
+        calibration does not know the noise.
+    """
+
+    name: str
+    mean: float
+    low: float
+    high: float
+    saturated: float
+    speckle_px: float
+    noise_dn: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LightFacts:
+    """The separated image of one light in the region.
+
+    Attributes
+    ----------
+    name : str
+    mean : float
+        Mean grey level in shares of the full scale.
+    contrast : float
+        Median of the local standard deviation over the local mean.
+    reflecting : float or None
+        Share of the region where the reflection index exceeds `REFLECTING` of the images; None for a single light.
+    valid : float
+        Share of the region where the light is known.
+    negative : float
+        Share of the region where the light's local mean is negative, which no light can be.
+    alone : Spread
+        Predicted standard uncertainty with this light alone, px.
+    """
+
+    name: str
+    mean: float
+    contrast: float
+    reflecting: float | None
+    valid: float
+    negative: float
+    alone: Spread
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """A warning.
+
+    Attributes
+    ----------
+    code : str
+        For programs, such as ``"fine speckle"``.
+    text : str
+        What it means and what helps.
+    """
+
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inspection:
+    """What one frame tells before a test.
+
+    Attributes
+    ----------
+    name : str
+        The frame.
+    kind : str
+        ``"bayer"``, ``"rgb"`` or ``"monochrome"``.
+    channels : tuple of ChannelFacts
+    lights : tuple of LightFacts
+    images : IlluminationImages
+        The separated lights (k, H, W), DN.
+    reflection_index : ndarray, shape (k, H, W), float32, or None
+        Share of a light's light that is not diffuse, 0 to 1; relative to the light with the most contrast at each
+        place. None for a single light.
+    saturated, region : ndarray, shape (H, W), bool
+    hidden : ndarray, shape (H, W), bool
+        Where no light reaches half the usual contrast: all of them reflect, or there is no paint.
+    texture : TextureModel or None
+        The texture that the colours of a mosaic have in common; None for cameras without a mosaic.
+    noise : NoiseModel
+        Camera noise, calibrated or estimated from the frame.
+    noise_known, crosstalk_known : bool
+        Whether the calibration tells them; a monochrome camera has no crosstalk to know.
+    element_size : float
+        px.
+    nodes : ndarray, shape (N, 2), float64
+        Of the mesh, (x, y) in px.
+    elements : ndarray, shape (E, 3), int32
+    std : ndarray, shape (N, 2), float64
+        Predicted standard uncertainty of u and v, px, all lights together, camera noise and separation; NaN where no
+        light sees enough.
+    noise_std, sampling_std : ndarray, shape (N, 2), float64
+        The parts of it from camera noise, and from what the mosaic did not sample.
+    greens : float
+        Difference of the means of the two greens of a mosaic over their mean; 0 for other cameras.
+    """
+
+    name: str
+    kind: str
+    channels: tuple[ChannelFacts, ...]
+    lights: tuple[LightFacts, ...]
+    images: IlluminationImages
+    reflection_index: FloatImage | None
+    saturated: BoolArray
+    region: BoolArray
+    hidden: BoolArray
+    texture: TextureModel | None
+    noise: NoiseModel
+    noise_known: bool
+    crosstalk_known: bool
+    element_size: float
+    nodes: FloatArray
+    elements: npt.NDArray[np.int32]
+    std: FloatArray
+    noise_std: FloatArray
+    sampling_std: FloatArray
+    greens: float
+
+    @property
+    def unmeasured(self) -> float:
+        """Share of the nodes that cannot be measured."""
+        return float(np.isnan(self.std).any(axis=1).mean())
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The warnings, the gravest first."""
+        return tuple(findings(self))
+
+    @property
+    def speckle_px(self) -> float:
+        """Speckle size: the median over the channels; px, NaN where there is no texture."""
+        sizes = [one.speckle_px for one in self.channels if np.isfinite(one.speckle_px)]
+        return float(np.median(sizes)) if sizes else float("nan")
+
+
+def findings(seen: Inspection) -> Iterator[Finding]:
+    """Warnings that an inspection gives rise to."""
+    yield from _of_set_up(seen)
+    yield from _of_exposure(seen)
+    yield from _of_speckle(seen)
+    yield from _of_field(seen)
+
+
+def _of_set_up(seen: Inspection) -> Iterator[Finding]:
+    if seen.greens > GREENS:
+        yield Finding(
+            code="pattern",
+            text=f"the two greens of the pattern differ by {seen.greens:.0%}: check cfa, they are one colour",
+        )
+    if not seen.crosstalk_known:
+        yield Finding(
+            code="crosstalk unknown",
+            text="no crosstalk calibration: the camera's channels stand for the lights, and a reflection of one light "
+            "shows in the others too; rgbmidic-calibrate crosstalk",
+        )
+    if not seen.noise_known:
+        yield Finding(
+            code="noise unknown",
+            text="no noise calibration: noise and the uncertainty from it are estimated from the frame, up to a few "
+            "times too high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
+        )
+    for light in seen.lights:
+        if light.negative > NEGATIVE:
+            yield Finding(
+                code="negative light",
+                text=f"light {light.name} is negative on {light.negative:.0%} of the region: crosstalk, pattern or "
+                "black level are not those of this frame",
+            )
+
+
+def _of_exposure(seen: Inspection) -> Iterator[Finding]:
+    for one in seen.channels:
+        if one.saturated > SATURATED:
+            yield Finding(
+                code="saturated",
+                text=f"channel {one.name}: {one.saturated:.1%} of the samples are saturated and will not be measured; "
+                "less exposure, or another place of the lamp",
+            )
+        if one.high < DARK:
+            yield Finding(
+                code="dark",
+                text=f"channel {one.name} is dark: 95 % of its samples are below {one.high:.1%} of the full scale; "
+                "more light or exposure",
+            )
+
+
+def _of_speckle(seen: Inspection) -> Iterator[Finding]:
+    texture, size = seen.texture, seen.speckle_px
+    if texture is not None and (texture.private > 0.5 or texture.correlation < COLOURED):
+        yield Finding(
+            code="coloured",
+            text=f"the colours do not show one texture (agreement {texture.correlation:.2f}): a coloured specimen, or "
+            "speckle far too fine; each colour has only its own lattice, so speckles need 6 px and more",
+        )
+    elif texture is not None and texture.correlation < TOO_FINE:
+        yield Finding(
+            code="fine speckle",
+            text=f"the speckle is too fine for the colour lattice: neighbouring colours agree to "
+            f"{texture.correlation:.2f}, {TOO_FINE} is needed (speckles of about 2.0 px); displacements will be pulled "
+            "towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
+        )
+    if np.isnan(size):
+        yield Finding(code="no texture", text="no speckle is seen: its autocorrelation has no width")
+    elif seen.element_size < COARSE * size:
+        yield Finding(
+            code="coarse speckle",
+            text=f"speckles of {size:.1f} px are coarse for elements of {seen.element_size:g} px: at least {COARSE:g} "
+            f"per side, so element_size = {np.ceil(COARSE * size):.0f} or finer speckle",
+        )
+
+
+def _of_field(seen: Inspection) -> Iterator[Finding]:
+    hidden = float(seen.hidden[seen.region].mean())
+    if hidden > HIDDEN:
+        what = "no light shows" if len(seen.lights) > 1 else "the light does not show"
+        yield Finding(
+            code="hidden",
+            text=f"{what} the texture on {hidden:.1%} of the region: "
+            + (
+                "all lights reflect or saturate there, or there is no paint"
+                if len(seen.lights) > 1
+                else "it reflects or saturates there, or there is no paint"
+            ),
+        )
+    if seen.unmeasured > 0:
+        yield Finding(code="not measured", text=f"{seen.unmeasured:.1%} of the nodes will not be measured")

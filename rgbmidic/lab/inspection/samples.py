@@ -1,0 +1,182 @@
+"""What the samples of one camera channel say by themselves: exposure, speckle size, noise.
+
+Nothing here demosaics: a channel of a mosaic is an image (H, W) with NaN where another channel was sampled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from rgbmidic.frames.data import cfa_channels
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.normalise import local_mean
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = ["Channel", "channels_of", "noise_estimate", "speckle_size"]
+
+
+MEAN_WIDTH = 20.0
+"""Standard deviation (px) of the local mean that the contrast is taken against; wide, so as to keep coarse speckle."""
+FARTHEST = 24
+"""Largest distance (px) at which the autocorrelation is looked at."""
+_WIDTHS = 0.5 * 1.25 ** np.arange(17)
+"""Standard deviations (px) of the Gaussians that are fitted to it."""
+_REGRESSED, _FLATTEST = 20_000, 0.05
+"""Samples that are looked at, and the share of them, with the flattest surroundings, that the regression is made on."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Channel:
+    """One camera channel as it was sampled.
+
+    Attributes
+    ----------
+    name : str
+    values : ndarray, shape (H, W), float32
+        DN above black; NaN where another channel was sampled.
+    saturated : ndarray, shape (H, W), bool
+    step : int
+        Distance (px) of neighbouring samples along a row: 2 on the lattice of a mosaic, else 1.
+    """
+
+    name: str
+    values: FloatImage
+    saturated: BoolArray
+    step: int
+
+
+def channels_of(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
+    """The channels of a frame, or of the frames of lights fired in succession."""
+    found: list[Channel] = []
+    for frame in frames:
+        if isinstance(frame, LinearMosaic):
+            rows, columns = frame.values.shape
+            site = np.tile(cfa_channels(frame.cfa), (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
+            for colour, name in enumerate("RGB"):
+                own = site == colour
+                values = np.where(own, frame.values, np.float32(np.nan))
+                found.append(Channel(name=name, values=values, saturated=frame.saturated & own, step=2))
+            continue
+        names = "RGB" if len(frame.values) == 3 else "M"
+        for name, values, valid in zip(names, frame.values, frame.valid, strict=True):
+            found.append(Channel(name=name, values=values, saturated=~valid, step=1))
+    if len(frames) > 1:
+        return [Channel(name=f"M{i + 1}", values=c.values, saturated=c.saturated, step=1) for i, c in enumerate(found)]
+    return found
+
+
+def speckle_size(channel: Channel, inside: BoolArray, noise: NoiseModel | None) -> float:
+    """Full width at half maximum (px) of the autocorrelation of a channel's contrast; NaN where there is no texture.
+
+    The contrast is the sample over the local mean, less 1. Products of samples of this channel alone enter, so that
+    demosaicing has no part in it. The noise is a peak at distance 0, where its variance is subtracted; with unknown
+    noise distance 0 is left out, and speckle that is finer than the lattice goes unseen. A sum of Gaussians fitted to
+    the products bridges the distances that the lattice does not have.
+
+    References
+    ----------
+    G. Crammond, S. W. Boyd, J. M. Dulieu-Barton, Speckle pattern quality assessment for digital image correlation,
+    Optics and Lasers in Engineering 51 (2013) 1368-1378; M. A. Sutton, J.-J. Orteu, H. Schreier, Image Correlation for
+    Shape, Motion and Deformation Measurements, Springer 2009, section 5 (speckle size from the autocorrelation).
+    """
+    mean = _mean(channel)
+    known = np.isfinite(channel.values) & ~channel.saturated & inside & (mean > 0)
+    if known.sum() < 64:
+        return float("nan")
+    contrast = np.where(known, channel.values / np.where(known, mean, np.float32(1)) - 1, np.float32(0))
+    distance, product, count = _autocorrelation(contrast, known)
+    at_zero = distance == 0
+    if noise is not None:
+        product[at_zero] -= float((noise.variance(mean[known]) / mean[known] ** 2).mean())
+    kept = (count > 0.05 * count.max()) & (~at_zero if noise is None else True)
+    narrowest = 0.0 if noise is not None else channel.step / 2  # nothing tells narrower ones from noise
+    return _width(distance[kept], product[kept], np.asarray(_WIDTHS[narrowest < _WIDTHS], dtype=np.float64))
+
+
+def _autocorrelation(contrast: FloatImage, known: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Distances (px) up to `FARTHEST`, the mean product of samples so far apart, and how many there are."""
+    from scipy.fft import irfft2, next_fast_len, rfft2
+
+    size = [next_fast_len(side + FARTHEST + 1, real=True) for side in contrast.shape]
+    sums, pairs = (
+        irfft2(np.abs(rfft2(one, s=size)) ** 2, s=size) for one in (contrast.astype(np.float64), known.astype(float))
+    )
+    lag = np.arange(-FARTHEST, FARTHEST + 1)
+    square = np.minimum(lag[:, None] ** 2 + lag**2, FARTHEST**2 + 1)
+    totals, counts = (
+        np.bincount(square.ravel(), weights=one[np.ix_(lag, lag)].ravel())[:-1] for one in (sums, np.round(pairs))
+    )
+    seen = np.flatnonzero(counts > 0)
+    return np.sqrt(seen.astype(np.float64)), np.asarray(totals[seen] / counts[seen]), counts[seen].astype(np.float64)
+
+
+def _width(distance: FloatArray, product: FloatArray, widths: FloatArray) -> float:
+    """Full width at half maximum of ``sum w exp(-r^2/2s^2) - c`` with w, c >= 0, fitted to the products."""
+    importance = 1 / (1 + distance)
+    system = np.column_stack([np.exp(-0.5 * (distance[:, None] / widths) ** 2), -np.ones(distance.size)])
+    scale = float(np.abs(product).max()) or 1.0
+    fitted = nnls(system * importance[:, None], product / scale * importance)[0]
+    r = np.arange(0, FARTHEST, 0.01)
+    curve = np.exp(-0.5 * (r[:, None] / widths) ** 2) @ fitted[:-1] - fitted[-1]
+    below = np.flatnonzero(curve < curve[0] / 2)
+    return float(2 * r[below[0]]) if curve[0] > 0 and below.size else float("nan")
+
+
+def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
+    """Standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
+
+    Where its surroundings are bright and flattest, a sample's contrast is predicted from the 24 samples around it, of
+    whatever channel, by linear regression, one for each position in the cell of the mosaic. What is left is the
+    sample's own noise, that of its neighbours through the regression, and texture that they do not tell: fair where
+    paint is flat over five samples, too high for finer speckle and in reflections (docs/inspect.md). Its scale is
+    1.4826 times the median absolute value.
+    """
+    means = [_mean(channel) for channel in channels]
+    if channels[0].step == 1:
+        images = [channel.values / mean - 1 for channel, mean in zip(channels, means, strict=True)]
+    else:
+        total = np.full(inside.shape, np.nan, dtype=np.float32)
+        for channel, mean in zip(channels, means, strict=True):
+            total = np.where(np.isfinite(channel.values), channel.values / mean - 1, total)
+        images = [total] * len(channels)
+    estimates = []
+    for channel, mean, image in zip(channels, means, images, strict=True):
+        lattice = inside & np.isfinite(channel.values) & ~channel.saturated
+        phases = [(p, q) for p in range(channel.step) for q in range(channel.step)]
+        left = [_unpredicted(image, lattice, phase, channel.step) for phase in phases]
+        found = np.concatenate([one for one in left if one.size] or [np.full(1, np.nan)])
+        level = float(np.nanmean(mean[lattice])) if lattice.any() else float("nan")
+        estimates.append(1.4826 * float(np.median(np.abs(found))) * level)
+    return estimates
+
+
+def _mean(channel: Channel) -> FloatImage:
+    mean = local_mean(np.where(channel.saturated, np.float32(np.nan), channel.values), MEAN_WIDTH)
+    return np.where(mean > 0, mean, np.float32(np.nan))
+
+
+def _unpredicted(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], step: int) -> FloatImage:
+    """What a regression on the 5 x 5 samples around leaves of the samples of one phase, flat."""
+    rows, columns = np.nonzero(lattice[2:-2, 2:-2])
+    kept = ((rows + 2) % step == phase[0]) & ((columns + 2) % step == phase[1])
+    rows, columns = rows[kept], columns[kept]
+    every = max(1, rows.size // _REGRESSED)
+    patches = np.lib.stride_tricks.sliding_window_view(image, (5, 5))[rows[::every], columns[::every]].reshape(-1, 25)
+    patches = patches[np.isfinite(patches).all(axis=1)].astype(np.float64)
+    if len(patches) < 100:
+        return np.empty(0, dtype=np.float32)
+    # the sample itself takes no part in the choice; dark places would be flattest, but have less photon noise
+    others = np.delete(patches, 12, axis=1)
+    patches, others = (one[others.mean(axis=1) >= 0] for one in (patches, others))
+    if len(patches) < 100:
+        return np.empty(0, dtype=np.float32)
+    spread = others.std(axis=1)
+    patches = patches[spread <= np.quantile(spread, min(max(_FLATTEST, 250 / len(patches)), 1.0))]
+    around = np.delete(patches, 12, axis=1)
+    system = np.column_stack([around, np.ones(len(around))])
+    coefficients = np.linalg.lstsq(system, patches[:, 12], rcond=None)[0]
+    share = np.sqrt(len(patches) / max(len(patches) - system.shape[1], 1))
+    return np.asarray((patches[:, 12] - system @ coefficients) * share, dtype=np.float32)

@@ -1,0 +1,1 @@
+"""Where lamps will reflect, what uncertainty to expect, and where the lamps would stand better."""

@@ -1,0 +1,274 @@
+"""A plan on paper: the rows of its tables, plan.json, and plan.png with zones and uncertainty."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rgbmidic import __version__
+from rgbmidic.errors import ResultError
+from rgbmidic.lab.planning.lamps import Proposal
+from rgbmidic.lab.planning.plan import Outlook, Plan
+from rgbmidic.report.figures import _LIGHT_COLOURS, _STYLE, save_figure
+from rgbmidic.scene.light import Light
+from rgbmidic.scene.scene import Scene
+from rgbmidic.scene.zones import REFLECTS, Zones
+from rgbmidic.typing import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "check_folder",
+    "lamp_rows",
+    "plan_document",
+    "plan_figure",
+    "summary",
+    "uncertainty_rows",
+    "write_plan",
+    "zone_rows",
+]
+
+FILES = ("plan.json", "plan.png")
+
+
+def check_folder(out: Path, *, overwrite: bool) -> None:
+    """Raise `ResultError` where a plan would be overwritten."""
+    taken = [name for name in FILES if (out / name).exists()]
+    if taken and not overwrite:
+        raise ResultError(f"{out / taken[0]} is already there; state --overwrite or choose another folder")
+
+
+def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwrite: bool = False) -> None:
+    """Write plan.json and plan.png.
+
+    Parameters
+    ----------
+    plan
+        The scene as it is.
+    proposals
+        Name to better lamps.
+    out
+        Folder; made where it does not exist.
+
+    Raises
+    ------
+    ResultError
+        A plan is already there, or the folder cannot be written.
+    """
+    check_folder(out, overwrite=overwrite)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(plan_document(plan, proposals), indent=2, allow_nan=False)
+        (out / "plan.json").write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ResultError(f"{out} cannot be written: {error.strerror or error}") from None
+    save_figure(plan_figure(plan, proposals), out / "plan.png")
+
+
+def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
+    """Headings and one row per state: shares of the field where each light reflects, all do, one or none is clean."""
+    names = [light.name for light in plan.scene.lights]
+    rows = []
+    for label, one in _labelled(plan):
+        shares = [one["reflecting"][name] for name in names]
+        shares += [one[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
+        rows.append([label, f"{one['largest_motion_px']:.1f}", *(f"{share:.1%}" for share in shares)])
+    return ["state", "motion, px", *names, "all", "one", "none", "clipped"], rows
+
+
+def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
+    """Headings and one row per state: standard uncertainty over the field in px, and what it is made of."""
+    rows = []
+    for label, one in _labelled(plan):
+        std = one["std_px"]
+        values = [std["median"], std["q95"], one["random_px"], one["feigned_by_domes_px"], one["mesh_px"]]
+        rows.append([label, *("-" if value is None else f"{value:.4f}" for value in values)])
+    return ["state", "median", "95 %", "random", "feigned", "mesh"], rows
+
+
+def _labelled(plan: Plan) -> list[tuple[str, dict[str, Any]]]:
+    states = [_state(plan, outlook) for outlook in plan.outlooks]
+    turned = [f": {one['angle_deg']:g} deg" if one["angle_deg"] else "" for one in states]
+    return [(f"{number}{label}", one) for number, (label, one) in enumerate(zip(turned, states, strict=True), start=1)]
+
+
+def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
+    """Headings and one row per lamp: position (mm) as SCENE.toml states it, direction, largest zone of any state."""
+    rows = []
+    for index, light in enumerate(plan.scene.lights):
+        azimuth, inclination = _angles(plan.scene, light)
+        worst = max(plan.share(outlook.reflects[index]) for outlook in plan.outlooks)
+        place = ", ".join(f"{round(value)}" for value in light.position)
+        rows.append([light.name, f"[{place}]", f"{azimuth:.0f}", f"{inclination:.0f}", f"{worst:.1%}"])
+    return ["light", "position = (mm)", "azimuth", "inclination", "reflects on"], rows
+
+
+def summary(plan: Plan) -> str:
+    """One line: how much two lights share at worst, and the uncertainty over field and states."""
+    overlap = max(plan.share(np.asarray(outlook.reflects.sum(axis=0) > 1)) for outlook in plan.outlooks)
+    std = f"{plan.std:.4f} px" if math.isfinite(plan.std) else "unbounded: somewhere no light sees"
+    return f"reflections overlap on up to {overlap:.1%} of the field; u_std {std}"
+
+
+def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
+    """The plan as plain values, for plan.json; shares are of the field, a number that is not known is null."""
+    return {
+        "schema": "rgbmidic-plan",
+        "rgbmidic": __version__,
+        "field_px": list(plan.field),
+        "element_size_px": plan.instrument.element_size,
+        "reflects_from_specular_share": REFLECTS,
+        **_arrangement(plan),
+        "proposals": {
+            name: {"gain": proposal.gain, **_arrangement(proposal.plan)} for name, proposal in proposals.items()
+        },
+    }
+
+
+def _arrangement(plan: Plan) -> dict[str, Any]:
+    return {
+        "lights": [_lamp(plan.scene, light) for light in plan.scene.lights],
+        "std_px": _number(plan.std),
+        "states": [_state(plan, outlook) for outlook in plan.outlooks],
+    }
+
+
+def _lamp(scene: Scene, light: Light) -> dict[str, Any]:
+    azimuth, inclination = _angles(scene, light)
+    return {
+        "name": light.name,
+        "position_mm": list(light.position),
+        "azimuth_deg": azimuth,
+        "inclination_deg": inclination,
+        "power": light.power,
+    }
+
+
+def _angles(scene: Scene, light: Light) -> tuple[float, float]:
+    """Azimuth about the optical axis (degrees, 0 to the right, 90 down) and inclination from it, seen from the body."""
+    x, y, z = (a - b for a, b in zip(light.position, scene.body.front, strict=True))
+    return math.degrees(math.atan2(y, x)) % 360, math.degrees(math.atan2(math.hypot(x, y), -z))
+
+
+def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
+    inside, state = plan.inside, outlook.state
+    std = outlook.std[inside]
+    known = std[np.isfinite(std)]
+    quantiles = [float(np.quantile(known, level)) if known.size else None for level in (0.5, 0.95, 1.0)]
+    names = [light.name for light in plan.scene.lights]
+    return {
+        "angle_deg": state.angle_deg,
+        "translation_mm": list(state.translation),
+        "largest_motion_px": float(np.hypot(*outlook.displacement[:, inside]).max()),
+        "reflecting": {name: plan.share(mask) for name, mask in zip(names, outlook.reflects, strict=True)},
+        "all_reflect": plan.share(np.asarray(outlook.reflects.all(axis=0))),
+        "one_light": plan.share(outlook.clean == 1),
+        "no_light": plan.share(outlook.clean == 0),
+        "saturated": plan.share(np.asarray(outlook.saturated.any(axis=0))),
+        "std_px": dict(zip(("median", "q95", "largest"), quantiles, strict=True)),
+        "random_px": _rms(outlook.forecast.std[inside]),
+        "feigned_by_domes_px": _rms(outlook.forecast.bias[inside]),
+        "mesh_px": _rms(outlook.mesh[inside]),
+    }
+
+
+def _rms(values: FloatArray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else None
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
+    """Zones of the lights (above) and uncertainty (below) in the first and last state, and in the last as proposed."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    panels = {"first state": (plan, plan.outlooks[0]), "last state": (plan, plan.outlooks[-1])}
+    panels |= {f"last state, {name}": (p.plan, p.plan.outlooks[-1]) for name, p in proposals.items() if p.gain > 1}
+    levels = np.concatenate([outlook.std[one.inside] for one, outlook in panels.values()])
+    levels = levels[np.isfinite(levels)]
+    top = float(np.quantile(levels, 0.98)) if levels.size else 1.0
+    height, width = plan.scene.camera.shape
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(2.9 * len(panels) + 0.6, 2 * 2.7 * height / width + 0.9), layout="compressed")
+        axes = figure.subplots(2, len(panels), squeeze=False, sharex=True, sharey=True)
+        for column, (title, (one, outlook)) in enumerate(panels.items()):
+            _draw_zones(axes[0, column], one, outlook)
+            turned = f": {outlook.state.angle_deg:g}°" if outlook.state.angle_deg else ""
+            axes[0, column].set_title(f"{title}{turned}")
+            shown = _draw_std(axes[1, column], one, outlook, top)
+        figure.colorbar(shown, ax=list(axes[1]), label="u_std (px)", extend="max", aspect=20, pad=0.02)
+        figure.legend(*_legend(plan.scene), loc="outside upper center", ncols=len(plan.scene.lights) + 2)
+        for axis in axes[:, 0]:
+            axis.set_ylabel("y (px)")
+        for axis in axes[1]:
+            axis.set_xlabel("x (px)")
+    return figure
+
+
+def _colours(scene: Scene) -> list[str]:
+    return [_LIGHT_COLOURS.get(light.name, f"C{index}") for index, light in enumerate(scene.lights)]
+
+
+def _extent(plan: Plan) -> tuple[float, float, float, float]:
+    half = (plan.x[0, 1] - plan.x[0, 0]) / 2
+    return plan.x[0, 0] - half, plan.x[0, -1] + half, plan.y[-1, 0] + half, plan.y[0, 0] - half
+
+
+def _draw_zones(axis: Axes, plan: Plan, outlook: Outlook) -> None:
+    """Specular shares as colours, zones as lines: broken in the reference state, whole in this one."""
+    from matplotlib.colors import to_rgb
+
+    body = np.isfinite(outlook.displacement[0])
+    picture = np.where(body[..., None], 0.93, 1.0) * np.ones(3)
+    for colour, share in zip(_colours(plan.scene), _largest(plan.reference, outlook.zones), strict=True):
+        cover = 0.85 * np.clip(np.nan_to_num(share), 0, 1)[..., None]
+        picture = picture * (1 - cover) + np.array(to_rgb(colour)) * cover
+    axis.imshow(picture, extent=_extent(plan), interpolation="bilinear")
+    for index, colour in enumerate(_colours(plan.scene)):
+        for zones, style in ((plan.reference, "--"), (outlook.zones, "-")):
+            share = zones.share[index]
+            if np.nanmin(share, initial=1.0) < REFLECTS < np.nanmax(share, initial=0.0):
+                axis.contour(plan.x, plan.y, share, [REFLECTS], colors=[colour], linestyles=style, linewidths=1)
+    _draw_field(axis, plan)
+
+
+def _largest(first: Zones, second: Zones) -> FloatArray:
+    return np.asarray(np.fmax(first.share, second.share))
+
+
+def _draw_std(axis: Axes, plan: Plan, outlook: Outlook, top: float) -> Any:
+    shown = np.ma.masked_invalid(outlook.std)
+    axis.set_facecolor("0.85")
+    picture = axis.imshow(shown, extent=_extent(plan), cmap="magma", vmin=0, vmax=top, interpolation="nearest")
+    _draw_field(axis, plan)
+    return picture
+
+
+def _draw_field(axis: Axes, plan: Plan) -> None:
+    from matplotlib.patches import Rectangle
+
+    x0, y0, x1, y1 = plan.field
+    axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="k", linewidth=0.9))
+    height, width = plan.scene.camera.shape
+    axis.set_xlim(-0.5, width - 0.5)
+    axis.set_ylim(height - 0.5, -0.5)
+    axis.set_aspect("equal")
+    axis.locator_params(nbins=4)
+
+
+def _legend(scene: Scene) -> tuple[list[Any], list[str]]:
+    from matplotlib.lines import Line2D
+
+    lines = [Line2D([], [], color=colour) for colour in _colours(scene)]
+    lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
+    return lines, [*(light.name for light in scene.lights), "at rest", "field"]

@@ -1,0 +1,228 @@
+"""The report of a study: tables, pictures and a page that sets the paper's statements beside the figures measured."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rgbmidic import __version__
+from rgbmidic.errors import ResultError
+from rgbmidic.lab.study import figures as figures
+from rgbmidic.lab.study.causes import RADIUS, Cause
+from rgbmidic.lab.study.claims import Claim, judge
+from rgbmidic.lab.study.competitors import METHODS
+from rgbmidic.lab.study.paper import PaperStudy, SceneStudy
+from rgbmidic.report.figures import save_figure
+from rgbmidic.report.page import Page
+
+__all__ = ["check_folder", "write_study"]
+
+_SCENES = {
+    "sequential": "two white lamps in succession, monochrome camera",
+    "bayer": "three colours at once, one Bayer shot",
+}
+
+
+def check_folder(out: Path | str, *, overwrite: bool = False) -> Path:
+    """The folder for a study, made where it does not exist.
+
+    Raises
+    ------
+    ResultError
+        It holds something already and may not be overwritten, or cannot be made.
+    """
+    out = Path(out)
+    try:
+        if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not overwrite)):
+            raise ResultError(f"{out} already exists and is not empty; give another folder or --overwrite it")
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultError(f"{out} cannot be made: {error.strerror or error}") from None
+    return out
+
+
+def write_study(study: PaperStudy, out: Path | str, *, overwrite: bool = False) -> tuple[Claim, ...]:
+    """Write tables (CSV), pictures, ``report.md`` and ``report.html``.
+
+    Parameters
+    ----------
+    study
+        What `rgbmidic.lab.study.run_paper_study` gives.
+    out
+        Folder.
+    overwrite
+        Whether files that are there may be replaced.
+
+    Returns
+    -------
+    tuple of Claim
+        The paper's statements with their verdicts.
+    """
+    folder = check_folder(out, overwrite=overwrite)
+    claims = judge(study)
+    _write_tables(study, claims, folder)
+    for name, figure in _figures(study).items():
+        save_figure(figure, folder / name)
+    _page(study, claims).write(folder)
+    return claims
+
+
+def _write_tables(study: PaperStudy, claims: Iterable[Claim], folder: Path) -> None:
+    _write_csv(folder / "perturbation.csv", ("scene", "method", "angle_deg", "area", "P_px"), _perturbation_rows(study))
+    header = ("scene", "method", "angle_deg", "area", "mean_u_px", "mean_v_px", "error_v_px")
+    _write_csv(folder / "areas.csv", header, _area_rows(study))
+    header = ("scene", "method", "angle_deg", "status", "measured_share", "residual_percent", "frontier_ratio")
+    _write_csv(folder / "solves.csv", header, _solve_rows(study))
+    turning = study.goniometry
+    pixels = [f"pixel_{i}" for i in range(turning.levels.shape[1])]
+    rows = (
+        [angle, *levels] for angle, levels in zip(turning.angles_deg.tolist(), turning.levels.tolist(), strict=True)
+    )
+    _write_csv(folder / "goniometry.csv", ("angle_deg", *pixels), rows)
+    columns = ("figure", "scene", "statement", "measured", "verdict", "reason")
+    _write_csv(folder / "claims.csv", columns, ([getattr(claim, c) for c in columns] for claim in claims))
+
+
+def _perturbation_rows(study: PaperStudy) -> Iterator[list[Any]]:
+    for scene, method, angle, number, area in _cells(study):
+        yield [scene.bench.name, method, angle, area, scene.measurements[method, angle].perturbation[number]]
+
+
+def _area_rows(study: PaperStudy) -> Iterator[list[Any]]:
+    for scene, method, angle, number, area in _cells(study):
+        one = scene.measurements[method, angle]
+        yield [scene.bench.name, method, angle, area, *one.mean[:, number], one.error[number]]
+
+
+def _solve_rows(study: PaperStudy) -> Iterator[list[Any]]:
+    for scene in study.scenes:
+        for (method, angle), one in scene.measurements.items():
+            yield [scene.bench.name, method, angle, one.status, one.measured, one.residual, one.frontier]
+
+
+def _cells(study: PaperStudy) -> Iterator[tuple[SceneStudy, str, float, int, str]]:
+    for scene in study.scenes:
+        for method in METHODS:
+            for angle in scene.angles:
+                for number, area in enumerate(scene.bench.areas):
+                    yield scene, method, angle, number, area.name
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A table; numbers with six digits, an empty field where there is none."""
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            writer.writerows([_cell(value) for value in row] for row in rows)
+    except OSError as error:
+        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def _cell(value: Any) -> Any:
+    if not isinstance(value, float | np.floating):
+        return value
+    return f"{float(value):.6g}" if np.isfinite(value) else ""
+
+
+def _figures(study: PaperStudy) -> dict[str, Any]:
+    pictures = {
+        "fig09_goniometry.png": figures.goniometry_figure(study.goniometry),
+        "fig10_11_topography.png": figures.topography_figure(study.topography),
+    }
+    for scene in study.scenes:
+        name = scene.bench.name
+        pictures |= {
+            f"{name}_fig04_images.png": figures.images_figure(scene),
+            f"{name}_fig05_dic.png": figures.displacement_maps(scene, "dic"),
+            f"{name}_fig06_means.png": figures.mean_figure(scene),
+            f"{name}_fig07_08_13_17_perturbation.png": figures.perturbation_figure(scene),
+            f"{name}_fig15_midic.png": figures.displacement_maps(scene, "midic"),
+            f"{name}_fig16_masks.png": figures.masks_figure(scene),
+            f"{name}_ripple.png": figures.ripple_figure(scene),
+        }
+        if scene.threshold is not None:
+            pictures[f"{name}_fig14_threshold.png"] = figures.threshold_figure(scene)
+    return pictures
+
+
+def _page(study: PaperStudy, claims: Sequence[Claim]) -> Page:
+    page = Page("The paper's results on the virtual bench")
+    angles = ", ".join(f"{angle:g}" for angle in study.angles)
+    page.text(
+        f"rgbmidic {__version__}; frames of {study.size} px, angles {angles}°, seed {study.seed}. P is the standard "
+        "deviation over 50 x 100 px of the vertical displacement minus its Gaussian-filtered copy (40 px); the mesh is "
+        "TRI3 with 25 px, grey levels as recorded, weights binary, as in the paper. Nothing here was adjusted to the "
+        "paper's P: the paint is that of `rgbmidic.lab.virtual.paper_scene`."
+    )
+    page.heading("Statements of the paper and what was measured")
+    page.text(_score(claims))
+    header = ("paper", "statement", "measured here", "verdict", "why it differs")
+    for scene in ("", *(one.bench.name for one in study.scenes)):
+        rows = [(c.figure, c.statement, c.measured, c.verdict, c.reason) for c in claims if c.scene == scene]
+        page.text(f"Scene `{scene}`: {_SCENES[scene]}." if scene else "The flat specimen.")
+        page.table(header, rows)
+    for scene_study in study.scenes:
+        _scene_section(page, scene_study)
+    page.heading("The flat specimen")
+    page.picture("fig09_goniometry.png", "Fig. 9: grey level of 40 pixels against the angle of the light")
+    page.picture("fig10_11_topography.png", "Figs 10 and 11: intensity, height, and slope with the pixels of 55 um")
+    _causes_section(page, study.causes)
+    return page
+
+
+def _score(claims: Sequence[Claim]) -> str:
+    counts = {
+        v: sum(claim.verdict == v for claim in claims)
+        for v in ("reproduced", "in part", "not reproduced", "not measured")
+    }
+    return (
+        f"{len(claims)} tests: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count) + "."
+    )
+
+
+def _scene_section(page: Page, scene: SceneStudy) -> None:
+    name = scene.bench.name
+    page.heading(f"Scene {name}: {_SCENES[name]}")
+    page.picture(f"{name}_fig04_images.png", "Fig. 4: the reflection at the first and the last angle, and the areas")
+    page.picture(f"{name}_fig07_08_13_17_perturbation.png", "Figs 7, 8, 13 and 17: perturbation P of the areas")
+    page.table(("method", "angle (°)", *(area.name for area in scene.bench.areas)), list(_table(scene)))
+    page.text("P in 1e-3 px; a dash where less than half of the area was measured.")
+    page.picture(f"{name}_ripple.png", "What P is taken from: the vertical displacement without its long waves")
+    page.picture(f"{name}_fig05_dic.png", "Fig. 5: vertical displacement by plain DIC")
+    page.picture(f"{name}_fig06_means.png", "Fig. 6: mean displacement of the areas, plain DIC")
+    if scene.threshold is not None:
+        page.picture(f"{name}_fig14_threshold.png", "Fig. 14: how the weighting threshold is found")
+    page.picture(f"{name}_fig15_midic.png", "Fig. 15: vertical displacement by MIDIC")
+    page.picture(f"{name}_fig16_masks.png", "Fig. 16: excluded zones (orange), reference and deformed state together")
+
+
+def _table(scene: SceneStudy) -> Iterator[tuple[str, ...]]:
+    for method, settings in METHODS.items():
+        for angle, row in zip(scene.angles, scene.perturbation(method), strict=True):
+            yield settings.title, f"{angle:g}", *("-" if np.isnan(p) else f"{1000 * p:.1f}" for p in row)
+
+
+def _causes_section(page: Page, causes: Sequence[Cause]) -> None:
+    if not causes:
+        return
+    page.heading("Causes: one thing changed at a time")
+    page.text(
+        f"P in 1e-3 px within {RADIUS:g} px of the middle of the reflection / far from it. Plain DIC suffers from the "
+        "reflection's brightness as such: paint without any roughness that reflects as much on average gives the same "
+        "P, and P follows the gloss. Grey-level correction removes that part; what it leaves is the erratic part: on "
+        "flat, smooth paint it leaves hardly more than noise. Away from the reflection P of plain DIC rises with the "
+        "angle because the diffuse light changes with its incidence, with wrinkles and without them."
+    )
+    angles = causes[0].angles
+    rows = [(cause.title, *map(_pair, cause.inside.ravel(), cause.outside.ravel())) for cause in causes]
+    header = ("change", *(f"{method} {angle:g}°" for method in ("DIC", "GLC-DIC") for angle in angles))
+    page.table(header, rows)
+
+
+def _pair(inside: float, outside: float) -> str:
+    return f"{1000 * inside:.1f} / {1000 * outside:.1f}"

@@ -1,0 +1,177 @@
+"""The camera of a scene: pin-hole projection, lens blur, colour channels, sensor noise and quantisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from rgbmidic.errors import InputError
+from rgbmidic.frames.data import cfa_channels
+from rgbmidic.illumination.calibration import Crosstalk
+from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.spectra import Sensitivities, spectral_response
+from rgbmidic.scene.light import Light
+from rgbmidic.typing import FloatArray
+
+__all__ = ["DISTANCE", "PIXEL", "REFERENCE_CROSSTALK", "Camera", "reference_camera"]
+
+REFERENCE_CROSSTALK = ((1.0, 0.10, 0.02), (0.14, 1.0, 0.16), (0.03, 0.12, 1.0))
+"""Rows: camera R, G, B; columns: red, green and blue light."""
+PIXEL = 0.055
+"""mm per px on the object."""
+DISTANCE = 600.0
+"""mm from the camera to the object's front point."""
+
+CameraKind = Literal["bayer", "rgb", "monochrome"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Camera:
+    """A camera at the origin that looks along +z, x to the right and y downwards.
+
+    Attributes
+    ----------
+    shape
+        Rows and columns of the frame.
+    focal_px
+        Focal length in px: distance / (mm per px at that distance).
+    lens_blur
+        Standard deviation of the Gaussian lens blur (px), on top of the pixel's square aperture.
+    kind
+        ``"bayer"``: one colour per pixel; ``"rgb"``: all three at every pixel (3-CCD); ``"monochrome"``.
+    cfa
+        Bayer pattern.
+    crosstalk
+        A in channels = A . lights, shape (3, k), or (1, k) for a monochrome camera. None: from `sensitivities` and the
+        lights' spectra, or without these the identity (all ones for a monochrome camera).
+    sensitivities
+        Spectral sensitivities, for a crosstalk that follows from physics.
+    exposure
+        Fraction of full scale that an ideal white gives under a light of power 1 at its nominal distance, in the
+        channel that sees the light best.
+    bits, black_level
+        Depth of the analogue-digital converter; grey level of a dark sample. Saturation is at 2**bits - 1.
+    gain
+        Electrons per grey level.
+    read_noise
+        Standard deviation in electrons.
+    samples
+        Rays per pixel and direction: ``samples**2`` rays per pixel. None: as many as the paint needs
+        (`rgbmidic.lab.virtual.rendering.samples_needed`).
+    exposure_time
+        Seconds; a body with a velocity is blurred over it.
+    """
+
+    shape: tuple[int, int]
+    focal_px: float = 600 / 0.055
+    lens_blur: float = 0.45
+    kind: CameraKind = "bayer"
+    cfa: str = "RGGB"
+    crosstalk: FloatArray | None = None
+    sensitivities: Sensitivities | None = None
+    exposure: float = 0.5
+    bits: int = 12
+    black_level: int = 64
+    gain: float = 4.0
+    read_noise: float = 12.0
+    samples: int | None = None
+    exposure_time: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (len(self.shape) == 2 and min(self.shape) >= 2):
+            raise InputError(f"a frame has at least 2 rows and 2 columns, not {self.shape}")
+        if self.kind not in ("bayer", "rgb", "monochrome"):
+            raise InputError(f"unknown camera kind {self.kind!r}; allowed are bayer, rgb, monochrome")
+        cfa_channels(self.cfa)
+        if not (8 <= self.bits <= 16 and 0 <= self.black_level < 2**self.bits - 1):
+            raise InputError(f"bits lie in 8 to 16 and black_level below saturation: {self.bits}, {self.black_level}")
+        if not (self.focal_px > 0 and 0 <= self.lens_blur <= 20 and (self.samples is None or 1 <= self.samples <= 64)):
+            raise InputError(
+                f"focal_px is positive, lens_blur 0 to 20 px, samples 1 to 64; given are {self.focal_px}, "
+                f"{self.lens_blur}, {self.samples}"
+            )
+        if not (self.gain > 0 and self.read_noise >= 0 and self.exposure > 0 and self.exposure_time >= 0):
+            raise InputError(
+                f"gain and exposure are positive, read_noise and exposure_time not negative; given are {self.gain}, "
+                f"{self.exposure}, {self.read_noise}, {self.exposure_time}"
+            )
+        if self.crosstalk is not None:
+            object.__setattr__(self, "crosstalk", np.asarray(self.crosstalk, dtype=np.float64))
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Principal point (x, y) in px: the middle of the frame."""
+        return (self.shape[1] - 1) / 2, (self.shape[0] - 1) / 2
+
+    @property
+    def channels(self) -> int:
+        """Number of colour channels."""
+        return 1 if self.kind == "monochrome" else 3
+
+    @property
+    def white_level(self) -> int:
+        """Grey level at which samples saturate."""
+        return int(2**self.bits - 1)
+
+    @property
+    def full_scale(self) -> float:
+        """Saturation above black, DN."""
+        return float(self.white_level - self.black_level)
+
+    @property
+    def noise(self) -> NoiseModel:
+        """The noise in the terms of the rest of rgbmidic; read noise in DN, quantisation not included."""
+        return NoiseModel(gain=self.gain, read_noise=self.read_noise / self.gain)
+
+    def response(self, lights: tuple[Light, ...]) -> FloatArray:
+        """Response (C, k) of each channel to each light; its largest entry is 1.
+
+        Raises
+        ------
+        InputError
+            The crosstalk does not fit the lights, or a light lacks its spectrum.
+        """
+        matrix = self._matrix(lights)
+        if matrix.shape != (self.channels, len(lights)) or not np.isfinite(matrix).all() or matrix.min() < 0:
+            raise InputError(
+                f"the crosstalk of a {self.kind} camera under {len(lights)} lights is a matrix of shape "
+                f"({self.channels}, {len(lights)}) of numbers not negative, not {matrix.tolist()}"
+            )
+        if not (matrix.max(axis=0) > 0).all():
+            raise InputError(f"the camera does not see every light: crosstalk {matrix.tolist()}")
+        return np.asarray(matrix / matrix.max())
+
+    def _matrix(self, lights: tuple[Light, ...]) -> FloatArray:
+        if self.crosstalk is not None:
+            return self.crosstalk
+        if self.sensitivities is not None:
+            spectra = tuple(light.spectrum for light in lights if light.spectrum is not None)
+            if len(spectra) != len(lights):
+                raise InputError("camera sensitivities are given, so every light needs its spectrum")
+            matrix = spectral_response(self.sensitivities, spectra)
+            return matrix.mean(axis=0, keepdims=True) if self.kind == "monochrome" else matrix
+        if self.kind == "monochrome":
+            return np.ones((1, len(lights)))
+        return np.eye(3)[:, : len(lights)]
+
+    def mixing(self, lights: tuple[Light, ...]) -> FloatArray:
+        """A (C, k) in channels = A . light images; every column's largest entry is 1."""
+        matrix = self.response(lights)
+        return np.asarray(matrix / matrix.max(axis=0))
+
+    def true_crosstalk(self, lights: tuple[Light, ...]) -> Crosstalk:
+        """The crosstalk that a perfect calibration would find."""
+        return Crosstalk(matrix=self.mixing(lights), lights=tuple(light.name for light in lights))
+
+
+def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
+    """RGGB, 12 bit, 4 e-/DN, read noise 12 e-, lens blur 0.45 px, 0.055 mm per px; `changes` to any setting.
+
+    A monochrome camera has no crosstalk of its own.
+    """
+    camera = Camera(shape=shape, focal_px=DISTANCE / PIXEL)
+    if changes.get("kind") != "monochrome" and "sensitivities" not in changes:
+        camera = replace(camera, crosstalk=np.array(REFERENCE_CROSSTALK))
+    return replace(camera, **changes)  # type: ignore[arg-type]

@@ -1,0 +1,370 @@
+"""Displacement uncertainty expected from a scene, in closed form: nothing is rendered and nothing is solved.
+
+The covariance of the nodes is ``M^-1 S M^-1`` with M the Hessian of the weighted sum over the lights and S the
+covariance of its right-hand side; with equal white noise it is the well-known ``2 sigma^2 M^-1``. Both are integrals of
+the speckle's gradient spectrum: of the texture alone for M, of its product with the spectrum of what disturbs for S:
+
+- camera noise of both states, through demosaicing and unmixing (the crosstalk's amplification of noise);
+- what demosaicing leaves of the mosaic in the images, which stays with the sensor while the texture moves;
+- the erratic part of the reflections, which changes as facets and droplets turn in and out of the mirror direction.
+
+The elements enter by the consistent mass matrix of a regular TRI3 mesh. Images are taken to be locally normalised and
+every light weighted by the inverse variance of its residual, as the main job does by default. A plain Gaussian law is
+taken for the slopes of the wrinkles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rgbmidic.illumination.camera_noise import QUANTISATION
+from rgbmidic.illumination.unmix import NEGLIGIBLE
+from rgbmidic.scene.scene import Scene
+from rgbmidic.scene.speckle_patch import SpecklePatch, cross_spectra, mosaic_disturbances
+from rgbmidic.scene.speckle_spectrum import SpeckleSpectrum
+from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = ["Energies", "Forecast", "Instrument", "channel_mixing", "node_constant", "pixel_size", "trace_change"]
+
+
+WRINKLE_AREA = 0.085
+"""Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared (measured,
+see the tests, at a lobe of 4 and slopes of 6 degrees; 0.06 at 3 and 8 degrees, 0.11 at 6 and 4)."""
+_SATURATED = 0.98
+"""Fraction of full scale from which the white paint is taken to saturate a channel: noise does the rest."""
+
+
+def node_constant() -> float:
+    """Variance of an inner node's value per unit of white noise density and element area: about 2.6.
+
+    The diagonal of the inverse of the consistent mass matrix of a regular mesh of right triangles with alternating
+    diagonals, in units of 1/h^2: a mean over all wave numbers (a, b), and over its two kinds of nodes, with eight
+    triangles (2/3 + cos a cos b / 3 on the diagonal) and with four (1/3), coupled by (cos a + cos b)/6.
+    """
+    angle = (np.arange(256) + 0.5) * (2 * np.pi / 256)
+    a, b = np.cos(np.meshgrid(angle, angle))
+    eight, four, coupling = 2 / 3 + a * b / 3, 1 / 3, (a + b) / 6
+    return float(((eight + four) / (eight * four - coupling**2)).mean() / 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Forecast:
+    """What a measurement between two states is expected to give; NaN where no light sees.
+
+    Attributes
+    ----------
+    std : ndarray, shape (...)
+        Standard uncertainty (px) of u, and of v, at an inner node, from what is random.
+    bias : ndarray, shape (...)
+        Root mean square, per component, of the displacement (px) that the droplets' domes feign: their lit sides change
+        when a reflection moves.
+    weight_share : ndarray, shape (k, ...)
+        Share of each light in the information about the displacement.
+    residual : ndarray, shape (k, ...)
+        Standard deviation of the residual of each light, in units of its local mean.
+    """
+
+    std: FloatArray
+    bias: FloatArray
+    weight_share: FloatArray
+    residual: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Energies:
+    """What a disturbance of unit strength adds to a variance: to that of a pixel, or to that of the right-hand side.
+
+    Attributes
+    ----------
+    noise : ndarray, shape (C, k, k)
+        Between the lights' images, of noise of unit variance in the samples of each colour (DN squared).
+    mosaic : ndarray, shape (3, k, k)
+        Of what demosaicing leaves in one image at each carrier of the mosaic (alternating along x, along y, along
+        both), for lights of equal brightness, in units of their means.
+    erratic
+        Of a disturbance that is white before lens and pixel, with a spectrum of 1 px^2.
+    dome
+        Of the slope of the droplets' domes along a random direction.
+    contrast
+        Of a change of the texture's contrast.
+    """
+
+    noise: FloatArray
+    mosaic: FloatArray
+    erratic: float
+    dome: float
+    contrast: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instrument:
+    """Paint, camera, lights' colours, processing and mesh, reduced to the numbers that the forecast needs.
+
+    Attributes
+    ----------
+    scene
+        Where they come from; positions of lamps and body do not enter.
+    element_size
+        px.
+    energy
+        Mean square of the speckle's gradient along x, px^-2.
+    residual, score
+        Of a pixel, and of the right-hand side per pixel.
+    dome_pull
+        Mean product of the gradients of texture and domes, px^-1.
+    """
+
+    scene: Scene
+    element_size: float
+    energy: float
+    residual: Energies
+    score: Energies
+    dome_pull: float
+
+    @classmethod
+    def of(
+        cls, scene: Scene, *, element_size: float = 25.0, demosaic: str = "malvar", prefilter: str = "binomial"
+    ) -> Instrument:
+        """Reduce a scene.
+
+        Parameters
+        ----------
+        scene
+            Paint, camera and lights.
+        element_size
+            Of the TRI3 mesh, px.
+        demosaic
+            Method for a Bayer camera (`rgbmidic.illumination.separate.DEMOSAICERS`).
+        prefilter
+            Of the solve (`rgbmidic.correlation.images.PREFILTERS`).
+        """
+        camera = scene.camera
+        spectrum = SpeckleSpectrum.of(
+            scene.surface, pixel=pixel_size(scene), blur=camera.lens_blur, prefilter=prefilter
+        )
+        patch = SpecklePatch.of(scene, len(spectrum.frequency))
+        relief = cross_spectra(np.stack([patch.texture, patch.domes]))
+        if camera.kind == "bayer":
+            noise, mosaic = mosaic_disturbances(scene, patch.texture, demosaic)
+        else:
+            unmixing = np.linalg.pinv(channel_mixing(scene))
+            noise = np.einsum("jc,kc->cjk", unmixing, unmixing)[..., None, None]
+            mosaic = np.zeros((3, *noise.shape[1:]))
+
+        def energies(measure: Callable[[FloatArray], FloatArray], contrast: float) -> Energies:
+            erratic, dome = measure(spectrum.optics), measure(spectrum.slope * relief[1, 1])
+            return Energies(
+                noise=measure(noise),
+                mosaic=measure(mosaic),
+                erratic=float(erratic),
+                dome=float(dome),
+                contrast=contrast,
+            )
+
+        return cls(
+            scene=scene,
+            element_size=element_size,
+            energy=spectrum.energy,
+            residual=energies(spectrum.residual, spectrum.variance),
+            score=energies(spectrum.score, spectrum.contrast_score(element_size)),
+            dome_pull=spectrum.pull(relief[0, 1]),
+        )
+
+    def forecast(self, before: Zones, after: Zones, change: FloatArray) -> Forecast:
+        """Uncertainty between two states, at the points at which their zones were predicted.
+
+        Parameters
+        ----------
+        before, after
+            Predictions at the same material points.
+        change : ndarray, shape (3, ...)
+            Of the mosaic's trace between them (`trace_change`), as a mean over the elements of a node.
+        """
+        residual = self.variance(self.residual, before, after, change)
+        seen = np.isfinite(residual) & ~self.saturated(before) & ~self.saturated(after)
+        contrast = np.where(seen, 1 - (before.share + after.share) / 2, 0.0)
+        pull = np.where(seen, contrast / np.where(seen, residual, 1.0), 0.0)
+        information = self.energy * pull * contrast
+        total = information.sum(axis=0)
+        domes = self._dome_factor(after) - self._dome_factor(before)
+        drag = np.nan_to_num(domes * pull[:, None]).sum(axis=0) * self.dome_pull
+        with np.errstate(invalid="ignore", divide="ignore"):
+            std = np.sqrt(node_constant() * self._score(before, after, change, pull)) / (self.element_size * total)
+            bias = np.sqrt((drag**2).sum(axis=0) / 2) / total
+            share = information / total
+        sees = total > 0
+        return Forecast(
+            std=np.where(sees, std, np.nan),
+            bias=np.where(sees, bias, np.nan),
+            weight_share=np.where(sees, share, 0.0),
+            residual=np.where(seen, np.sqrt(np.where(seen, residual, 0.0)), np.nan),
+        )
+
+    def weights(self, before: Zones, after: Zones, *, known: bool = True) -> FloatImage:
+        """Weights (k, ...) in [0, 1] for the solve: the inverse variance with which each light pulls on the
+        displacement, 1 for the best light at the best point; 0 where it does not see or saturates.
+
+        Parameters
+        ----------
+        before, after
+            Predictions at the same material points.
+        known
+            Whether they tell the motion between the states. If not, the reflections are taken to have changed wholly.
+        """
+        change = np.full((3, *before.share.shape[1:]), 2.0)
+        variance = self.variance(self.score, before, after, change, common=float(known))
+        seen = np.isfinite(variance) & ~self.saturated(before) & ~self.saturated(after)
+        inverse = np.where(seen, 1 / np.where(seen, variance, 1.0), 0.0)
+        return (inverse / max(float(inverse.max()), 1e-30)).astype(np.float32)
+
+    def variance(
+        self, energies: Energies, before: Zones, after: Zones, change: FloatArray, common: float = 1.0
+    ) -> FloatArray:
+        """Variance of the change of each light's image (k, ...), in units of its local mean.
+
+        Parameters
+        ----------
+        energies
+            `residual` or `score`.
+        before, after
+            Predictions at the same material points.
+        change : ndarray, shape (3, ...)
+            See `trace_change`.
+        common
+            1: the two states share their reflections as predicted; 0: they have nothing in common.
+        """
+        variance = self._reflections(energies, before, after, common)
+        variance += np.einsum("cjj,c...->j...", energies.mosaic, change)
+        for zones in (before, after):
+            variance += np.einsum("cjj,c...->j...", energies.noise, self._sample_variance(zones)) / zones.level**2
+        return np.asarray(variance)
+
+    def light_variance(self, light: int, before: Zones, after: Zones, brightness: FloatArray) -> FloatArray:
+        """Variance of the pull (n, ...) of one light that is tried in n places, the others as bright as they are.
+
+        Parameters
+        ----------
+        light
+            Its index.
+        before, after
+            Predictions of this light alone in its n places.
+        brightness : ndarray, shape (k,)
+            Mean grey level of every light, for the noise that crosstalk brings.
+        """
+        variance = self._reflections(self.score, before, after)
+        variance += 2 * float(self.score.mosaic[:, light, light].sum())
+        mixing = channel_mixing(self.scene)
+        others = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
+        for zones in (before, after):
+            for colour, share in enumerate(self.score.noise[:, light, light]):
+                samples = self.scene.camera.noise.variance(others[colour] + mixing[colour, light] * zones.level)
+                variance += share * (samples + QUANTISATION) / zones.level**2
+        return np.asarray(variance)
+
+    def _score(self, before: Zones, after: Zones, change: FloatArray, pull: FloatArray) -> FloatArray:
+        """Variance density (...) of the right-hand side with the pull (k, ...) of each light on the displacement."""
+        square = (np.nan_to_num(self._reflections(self.score, before, after)) * pull**2).sum(axis=0)
+        square += np.einsum("cjk,c...,j...,k...->...", self.score.mosaic, change, pull, pull)
+        for zones in (before, after):
+            share = np.where(pull > 0, pull / zones.level, 0.0)
+            samples = np.nan_to_num(self._sample_variance(zones))
+            square += np.einsum("cjk,c...,j...,k...->...", self.score.noise, samples, share, share)
+        return np.asarray(square)
+
+    def _reflections(self, energies: Energies, before: Zones, after: Zones, common: float = 1.0) -> FloatArray:
+        """Variance (k, ...) that comes from a change of the reflections; between the lights it is independent."""
+        first, second = self._dome_factor(before), self._dome_factor(after)
+        domes = (first**2 + second**2 - 2 * common * first * second).sum(axis=1)
+        contrast = before.share**2 + after.share**2 - 2 * common * before.share * after.share
+        erratic = self._erratic(before, after, common)
+        return np.asarray(energies.erratic * erratic + energies.dome * domes + energies.contrast * contrast)
+
+    def _erratic(self, before: Zones, after: Zones, common: float) -> FloatArray:
+        """Spectrum (px^2) of the erratic part of the change of each light's image (k, ...), in units of its mean.
+
+        Facets with Gaussian slopes of variance a^2 per axis reflect ``q = exp(-|s - h|^2/(2 b^2))``; the covariance of
+        q between the half-way slopes h of two states is an integral of Gaussians. What is linear in the slopes is finer
+        than the pixel and is left out: wrinkles have no slope on average.
+        """
+        a2, b2 = self._roughness
+        parts = [
+            _facet_covariance(one.geometry.slopes, other.geometry.slopes, a2, b2) * one.share * other.share
+            for one, other in ((before, before), (after, after), (before, after))
+        ]
+        area = WRINKLE_AREA * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
+        return np.asarray(area * np.maximum(parts[0] + parts[1] - 2 * common * parts[2], 0))
+
+    def _dome_factor(self, zones: Zones) -> FloatArray:
+        """Effect (k, 3, ...) of a unit slope of a droplet's dome on the light's image, in units of its mean.
+
+        A slope s changes the reflection at the half-way slope h by the factor exp(h.s/(a^2 + b^2)); its linear part is
+        taken.
+        """
+        return np.asarray(zones.share[:, None] * zones.geometry.slopes / sum(self._roughness))
+
+    @property
+    def _roughness(self) -> tuple[float, float]:
+        """Variances per axis of the wrinkles' slopes and of the facets' lobe, mean of both paints."""
+        surface, cover = self.scene.surface, self.scene.surface.coverage
+        slope = (1 - cover) * slope_variance(surface.white) + cover * slope_variance(surface.black)
+        return slope, (1 - cover) * facet_variance(surface.white) + cover * facet_variance(surface.black)
+
+    def saturated(self, zones: Zones) -> BoolArray:
+        """Where white paint is expected to saturate a channel that the light is seen by, (k, ...)."""
+        surface = self.scene.surface
+        white = surface.white.albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance)
+        channels = _channels(channel_mixing(self.scene), zones.irradiance * white)
+        full = channels > _SATURATED * self.scene.camera.full_scale
+        unmixing = np.abs(np.linalg.pinv(channel_mixing(self.scene)))
+        needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
+        return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)
+
+    def _sample_variance(self, zones: Zones) -> FloatArray:
+        """Noise variance (C, ...) of one sample of each colour at the mean grey level, DN squared."""
+        levels = _channels(channel_mixing(self.scene), zones.level)
+        return np.asarray(self.scene.camera.noise.variance(levels) + QUANTISATION)
+
+
+def trace_change(displacement: FloatArray) -> FloatArray:
+    """Mean square change (3, ...) of the three carriers of the mosaic under a displacement (2, ...) in px.
+
+    The trace stays with the sensor: it differs most where the texture has moved by an odd number of pixels.
+    """
+    x, y = np.cos(np.pi * displacement)
+    return np.asarray(2 * (1 - np.stack([x, y, x * y])))
+
+
+def pixel_size(scene: Scene) -> float:
+    """mm per px at the body's front point."""
+    return scene.body.front[2] / scene.camera.focal_px
+
+
+def channel_mixing(scene: Scene) -> FloatArray:
+    """Camera samples from lights, (C, k); before a monochrome camera every light has a frame of its own."""
+    if scene.camera.kind == "monochrome":
+        return np.eye(len(scene.lights))
+    return scene.camera.mixing(scene.lights)
+
+
+def _channels(mixing: FloatArray, levels: FloatArray) -> FloatArray:
+    """Levels (C, ...) of the channels; a light that does not reach a point adds nothing."""
+    return np.asarray(np.einsum("cj,j...->c...", mixing, np.nan_to_num(levels)))
+
+
+def _facet_covariance(first: FloatArray, second: FloatArray, a2: float, b2: float) -> FloatArray:
+    """Covariance of the facets' reflections at two half-way slopes (k, 3, ...), relative to the product of the means,
+    without the part that is linear in the facets' slopes."""
+    middle, apart = (first + second) / 2, first - second
+
+    def square(vector: FloatArray) -> FloatArray:
+        return np.asarray((vector**2).sum(axis=1))
+
+    mean = 2 * math.log(b2 / (a2 + b2)) - (square(first) + square(second)) / (2 * (a2 + b2))
+    product = math.log(b2 / (2 * a2 + b2)) - square(apart) / (4 * b2) - square(middle) / (2 * a2 + b2)
+    linear = (first * second).sum(axis=1) * a2 / (a2 + b2) ** 2
+    return np.asarray(np.exp(np.minimum(product - mean, 50.0)) - 1 - linear)

@@ -1,0 +1,189 @@
+"""The painted surface: black mat droplets sprayed on white paint, wrinkled below the pixel (paper, section 2.4)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rgbmidic._kernels.render import PLATE, sample_paint
+from rgbmidic.errors import InputError
+from rgbmidic.typing import FloatArray
+
+__all__ = ["Finish", "Surface", "height_map"]
+
+WRINKLE_FREQUENCY = 0.525
+"""Wrinkles per lattice cell: where the height spectrum of the gradient noise peaks (measured; see the tests)."""
+WRINKLE_SLOPE = 0.704
+"""Rms tangential slope of the gradient noise in lattice units (measured; see the tests)."""
+_SQRT6 = math.sqrt(6.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finish:
+    """How one paint reflects.
+
+    Attributes
+    ----------
+    albedo
+        Share of light scattered diffusely (Lambert).
+    gloss
+        Peak of the specular reflection of one facet, in units of the radiance of an ideal white.
+    lobe_deg
+        Standard deviation of the facet's lobe, as the angle between its normal and the half-way vector.
+    slope_deg
+        Root mean square slope of the wrinkles.
+    spacing
+        Distance between wrinkles (mm).
+    """
+
+    albedo: float
+    gloss: float = 1.5
+    lobe_deg: float = 4.0
+    slope_deg: float = 6.0
+    spacing: float = 0.025
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.albedo <= 1 and self.gloss >= 0 and 0 <= self.slope_deg <= 30):
+            raise InputError(f"albedo lies in 0 to 1, gloss is not negative, slope_deg is 0 to 30: {self}")
+        if not (0 < self.lobe_deg <= 30 and self.spacing > 0):
+            raise InputError(f"lobe_deg lies in 0 to 30 and spacing is positive: {self}")
+        if self.reflectance > 1:
+            raise InputError(
+                f"the paint would reflect {self.reflectance:.2f} times the light it receives: lower albedo, gloss or "
+                f"lobe_deg of {self}"
+            )
+
+    @property
+    def reflectance(self) -> float:
+        """Share of the light reflected, diffuse + specular: albedo + 8 gloss lobe**2 (lobe in rad)."""
+        return self.albedo + 8 * self.gloss * math.radians(self.lobe_deg) ** 2
+
+    def _parameters(self) -> list[float]:
+        slope = math.tan(math.radians(self.slope_deg)) / WRINKLE_SLOPE
+        lattice = self.spacing * WRINKLE_FREQUENCY
+        return [self.albedo, slope, lattice, self.gloss, math.radians(self.lobe_deg) ** 2]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surface:
+    """White paint under a spray of black droplets, thrown at random (Boolean model).
+
+    Attributes
+    ----------
+    white, black
+        The two paints.
+    droplet
+        Median diameter of the droplets (mm).
+    spread
+        Standard deviation of the logarithm of the diameter (bounded at 2.45 of it).
+    coverage
+        Share of the surface that is black, 0 to 0.95; 0 leaves white paint alone.
+    softness
+        Width over which black fades to white at a droplet's edge (mm).
+    dome
+        Height of a droplet above the white paint (mm); 0: flat.
+    seed
+        Another seed gives another spray of the same kind.
+    """
+
+    white: Finish = field(default_factory=lambda: Finish(albedo=0.80))
+    black: Finish = field(default_factory=lambda: Finish(albedo=0.10))
+    droplet: float = 0.23
+    spread: float = 0.2
+    coverage: float = 0.45
+    softness: float = 0.02
+    dome: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.droplet > 0 and 0 <= self.spread <= 0.6 and 0 <= self.coverage <= 0.95):
+            raise InputError(
+                f"a droplet is larger than 0, its spread 0 to 0.6, the coverage 0 to 0.95; given are droplet "
+                f"{self.droplet}, spread {self.spread}, coverage {self.coverage}"
+            )
+        if not (0 <= self.softness <= self.droplet and 0 <= self.dome <= self.droplet):
+            raise InputError(
+                f"softness and dome lie between 0 and the droplet's diameter {self.droplet} mm, not {self.softness} "
+                f"and {self.dome}"
+            )
+
+    @property
+    def droplets_per_area(self) -> float:
+        """Droplets per mm2, from the coverage 1 - exp(-number x mean area) of the Boolean model."""
+        a = 2 * self.spread * _SQRT6
+        mean_square = (2 * math.sinh(a / 2) / a) ** 2 if a else 1.0
+        return -math.log(1 - self.coverage) / (math.pi / 4 * self.droplet**2 * mean_square)
+
+    def parameters(self) -> tuple[FloatArray, FloatArray, np.uint32]:
+        """What the kernels of `rgbmidic._kernels.render` take: paint, counts and seed."""
+        radius = self.droplet / 2
+        shell = 0.3 * radius
+        far = radius * math.exp(_SQRT6 * self.spread) + self.softness / 2
+        reach = math.hypot(far, shell)
+        cell = 1.5 * (reach + 0.5 * radius)
+        counts = _poisson_table(self.droplets_per_area * cell**3 / (2 * shell))
+        head = [cell, shell, reach, radius, self.spread, self.softness, self.dome]
+        paint = np.array([*head, *self.white._parameters(), *self.black._parameters()])
+        return paint, counts, np.uint32(np.random.SeedSequence(self.seed).generate_state(1)[0])
+
+    def sample(self, points: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cover by black paint (0 to 1), height (mm) and slope vector at material points.
+
+        Parameters
+        ----------
+        points : (N, 3)
+            Points (mm) on the body's surface, in its axes.
+        body : (4,)
+            The body's parameters (`Plate.parameters` and so on).
+
+        Returns
+        -------
+        cover : (N,)
+        height : (N,)
+        slope : (N, 3)
+            Gradient of the height in the tangent plane.
+        """
+        out = np.empty((len(points), 5))
+        sample_paint(out, np.ascontiguousarray(points, dtype=float), body, *self.parameters())
+        return out[:, 0], out[:, 1], out[:, 2:]
+
+
+def height_map(
+    surface: Surface, *, size: float, pitch: float, corner: tuple[float, float] = (0.0, 0.0)
+) -> tuple[FloatArray, FloatArray]:
+    """Topography of a painted plate, as a profilometer would scan it (paper, Fig. 10).
+
+    Parameters
+    ----------
+    surface
+        The paint.
+    size, pitch
+        Side of the square and distance between points (mm).
+    corner
+        Material coordinates (x, y) of the first point (mm).
+
+    Returns
+    -------
+    height : (N, N)
+        Height in mm, rows along y.
+    black : (N, N)
+        Cover by black paint, 0 to 1.
+    """
+    if not (pitch > 0 and size >= 2 * pitch):
+        raise InputError(f"a height map has at least 3 points a side; given are size {size} mm, pitch {pitch} mm")
+    steps = np.arange(round(size / pitch) + 1) * pitch
+    x, y = np.meshgrid(corner[0] + steps, corner[1] + steps)
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    cover, height, _ = surface.sample(points, np.array([PLATE, 0.0, np.inf, np.inf]))
+    return height.reshape(x.shape), cover.reshape(x.shape)
+
+
+def _poisson_table(mean: float) -> FloatArray:
+    """Distribution function of the Poisson law; a uniform number passes as many entries as there are droplets."""
+    if mean == 0:
+        return np.ones(1)
+    number = np.arange(int(mean + 8 * math.sqrt(mean) + 12))
+    logarithm = number * math.log(mean) - mean - np.array([math.lgamma(n + 1) for n in number])
+    return np.cumsum(np.exp(logarithm))

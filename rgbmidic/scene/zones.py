@@ -1,0 +1,139 @@
+"""Reflection zones of a scene, predicted without rendering: where each light reflects on each state of the body."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rgbmidic.scene.light import NOMINAL_DISTANCE, Light
+from rgbmidic.scene.projection import material_points, placed
+from rgbmidic.scene.reflection import Reflectance, Reflection, reflection
+from rgbmidic.scene.scene import Scene, State
+from rgbmidic.scene.surface import Finish, Surface
+from rgbmidic.typing import FloatArray
+
+__all__ = ["REFLECTS", "Zones", "macroscopic", "predict_zones", "zones_on_surface"]
+
+
+REFLECTS = 0.2
+"""Specular share from which a light counts as reflecting at a point."""
+_DOME_SLOPE = 4 / 3
+"""Mean square slope of a droplet's dome h (1 - r^2/R^2)^2 over its disc, in units of (h/R)^2."""
+
+
+def macroscopic(surface: Surface) -> Reflectance:
+    """Reflectance of a painted surface at the scale of the speckle, averaged over white and black paint.
+
+    A facet's Gaussian lobe of variance b^2 convolved with slopes of variance a^2 per axis is a Gaussian of variance
+    ``a^2 + b^2`` whose peak is lower by ``b^2/(a^2 + b^2)``. Where the paints differ the lobe keeps peak and volume.
+    """
+    dome = _DOME_SLOPE * (surface.dome / (surface.droplet / 2)) ** 2 / 2
+    parts = ((surface.white, 0.0, 1 - surface.coverage), (surface.black, dome, surface.coverage))
+    diffuse = sum(paint.albedo * area for paint, _, area in parts)
+    volume = sum(paint.gloss * facet_variance(paint) * area for paint, _, area in parts)
+    lobes = [(facet_variance(paint), slope_variance(paint) + more) for paint, more, _ in parts]
+    peak = sum(p.gloss * b / (a + b) * area for (p, _, area), (b, a) in zip(parts, lobes, strict=True))
+    width = math.sqrt(volume / peak) if peak > 0 else math.sqrt(sum(lobes[0]))
+    return Reflectance(diffuse=max(diffuse, 1e-9), specular=peak, width_deg=math.degrees(width))
+
+
+def facet_variance(paint: Finish) -> float:
+    """Variance (rad^2, per axis) of the specular lobe of one facet."""
+    return math.radians(paint.lobe_deg) ** 2
+
+
+def slope_variance(paint: Finish) -> float:
+    """Variance per axis of the slopes of the wrinkles."""
+    return math.tan(math.radians(paint.slope_deg)) ** 2 / 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Zones:
+    """What each light is expected to do at points of the surface, in one state; NaN where it does not see them.
+
+    Attributes
+    ----------
+    geometry
+        Angles of the reflection; the slopes are in the body's axes.
+    irradiance : ndarray, shape (k, ...)
+        Across the rays, in grey levels of the channel that sees the light best (DN of an ideal white).
+    reflectance
+        The paint's.
+    """
+
+    geometry: Reflection
+    irradiance: FloatArray
+    reflectance: Reflectance
+
+    @property
+    def share(self) -> FloatArray:
+        """Specular share (k, ...) of the light that reaches the camera."""
+        return self.geometry.share(self.reflectance)
+
+    @property
+    def level(self) -> FloatArray:
+        """Expected mean grey level (k, ...) of the light's image, DN above black."""
+        return self.irradiance * (self.geometry.diffuse(self.reflectance) + self.geometry.specular(self.reflectance))
+
+
+def predict_zones(
+    scene: Scene,
+    state: State | None = None,
+    *,
+    material: FloatArray | None = None,
+    lights: tuple[Light, ...] | None = None,
+    reflectance: Reflectance | None = None,
+) -> Zones:
+    """Predict where the lights of a scene reflect.
+
+    Parameters
+    ----------
+    scene
+        Body, paint, lights and camera.
+    state
+        Where the body is; None: at rest.
+    material : ndarray, shape (3, ...), optional
+        Material points (mm) to be followed; None: those that the camera's pixels see in this state.
+    lights
+        Instead of the scene's, in the same colours.
+    reflectance
+        Of the paint, for instance from a goniometry; None: what follows from the scene's facets and wrinkles.
+    """
+    where = material_points(scene, state) if material is None else material
+    zones = zones_on_surface(scene, *placed(scene, where, state), lights=lights, reflectance=reflectance)
+    turn, _ = (state or State()).pose(scene.body)
+    slopes = np.einsum("ji,kj...->ki...", turn, zones.geometry.slopes)
+    return replace(zones, geometry=replace(zones.geometry, slopes=slopes))
+
+
+def zones_on_surface(
+    scene: Scene,
+    points: FloatArray,
+    normals: FloatArray,
+    *,
+    lights: tuple[Light, ...] | None = None,
+    reflectance: Reflectance | None = None,
+) -> Zones:
+    """Predict where the lights reflect on any surface before the scene's camera, for instance one from a height map.
+
+    `points` (mm) and unit `normals` of shape (3, ...) in camera axes, which the slopes then have, too; `lights` and
+    `reflectance` as in `predict_zones`.
+    """
+    chosen = scene.lights if lights is None else lights
+    positions = np.array([light.position for light in chosen])
+    return Zones(
+        geometry=reflection(points, normals, positions),
+        irradiance=_irradiance(scene, chosen, positions, points),
+        reflectance=reflectance or macroscopic(scene.surface),
+    )
+
+
+def _irradiance(scene: Scene, lights: tuple[Light, ...], positions: FloatArray, points: FloatArray) -> FloatArray:
+    camera = scene.camera
+    levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
+    powers = np.array([light.power for light in lights]) * NOMINAL_DISTANCE**2 * levels
+    rest = (1,) * (points.ndim - 1)
+    square = ((positions.reshape(-1, 3, *rest) - points) ** 2).sum(axis=1)
+    return np.asarray(powers.reshape(-1, *rest) / square)

@@ -1,1 +1,0 @@
-"""Frames in (`readers`, `frames`, `writers`) and results out (`store`)."""

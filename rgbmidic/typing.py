@@ -1,0 +1,15 @@
+"""Array types of the annotations; a docstring tells their shapes."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["AnyArray", "BoolArray", "FloatArray", "FloatImage"]
+
+AnyArray = npt.NDArray[Any]
+FloatArray = npt.NDArray[np.float64]
+"""Coordinates, sums, matrices: double precision."""
+FloatImage = npt.NDArray[np.float32]
+"""Grey levels and weights at pixels: single precision."""
+BoolArray = npt.NDArray[np.bool_]

@@ -1,0 +1,98 @@
+"""The weighting threshold of a test, found from its own first deformed frame (paper, section 3.2).
+
+Every light is first correlated alone and without weights. Where its reflection disturbs the displacement, the grey
+level on the contour of the disturbed zone becomes the threshold of all lights and frames. The paper looks at one light;
+here the one whose reflection disturbs most is taken, as the others' may lie outside the region.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from rgbmidic.correlation import Status, correlate
+from rgbmidic.errors import InputError
+from rgbmidic.fields import at_pixels, high_pass
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.typing import FloatImage
+from rgbmidic.weights.disturbed_zone import SetUpThreshold, set_up_threshold
+from rgbmidic.weights.threshold import blurred
+
+__all__ = ["FALLBACK", "automatic_threshold"]
+
+logger = logging.getLogger(__name__)
+
+FALLBACK = 2 / 3
+"""Threshold where no reflection disturbs the first deformed frame: the paper's."""
+
+
+def automatic_threshold(
+    reference: IlluminationImages,
+    deformed: IlluminationImages,
+    region: Region,
+    *,
+    blur: float = 10.0,
+    element_size: float = 25.0,
+    prefilter: str = "binomial",
+) -> SetUpThreshold | None:
+    """Threshold from the reference and one deformed state, or None where no light's reflection disturbs.
+
+    A threshold that would exclude more than half of any light's image is not taken: without the margin below the
+    contour if that helps, else not at all, as the reflection is not told from the rest by its brightness.
+
+    Parameters
+    ----------
+    reference, deformed
+        Illumination images of the two states.
+    region
+        What is measured.
+    blur
+        Standard deviation (px) of the blur that the weights will use.
+    element_size
+        px.
+    prefilter
+        Of the correlation; a Bayer mosaic needs ``"binomial"``.
+    """
+    found = []
+    typical = float(np.median(blurred(reference, blur)[:, region.mask], axis=1).max()) / reference.full_scale
+    for light, name in enumerate(reference.names):
+        for component, field in _displacement(reference, deformed, region, light, element_size, prefilter):
+            try:
+                threshold = set_up_threshold(high_pass(field), reference, light=light, blur=blur)
+            except InputError as error:
+                logger.info("%s alone, without weights, %s: %s", name, component, error)
+                continue
+            values = [value for value in (threshold.value, threshold.contour) if typical < value <= 1]
+            if not values:
+                logger.info("%s alone, %s: the disturbed zone is not brighter than the rest", name, component)
+                continue
+            found.append(replace(threshold, value=values[0]))
+    return max(found, key=lambda threshold: threshold.zone.contrast, default=None)
+
+
+def _displacement(
+    reference: IlluminationImages,
+    deformed: IlluminationImages,
+    region: Region,
+    light: int,
+    element_size: float,
+    prefilter: str,
+) -> list[tuple[str, FloatImage]]:
+    """u and v (H, W) of one light alone, without weights; the smaller of the two shows a disturbance best."""
+    solution = correlate(
+        reference.values[light],
+        deformed.values[light],
+        region=region,
+        element_size=element_size,
+        prefilter=prefilter,
+        statistics=False,
+    )
+    if solution.status is Status.FAILED:
+        logger.info("%s alone, without weights: %s", reference.names[light], solution.reason)
+        return []
+    mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
+    fields = at_pixels(mesh, solution.displacement, reference.shape)
+    return list(zip("uv", fields, strict=True))

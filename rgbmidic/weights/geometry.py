@@ -1,0 +1,184 @@
+"""Weights of a test's frames predicted from a SCENE.toml: the paper's first method (section 3.2), for the main job."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rgbmidic.errors import ConfigurationError, InputError
+from rgbmidic.scene.forecast import Instrument
+from rgbmidic.scene.projection import material_points
+from rgbmidic.scene.reflection import angle_weights, surface_from_heights
+from rgbmidic.scene.scene import Scene, State
+from rgbmidic.scene.scenefile import read_scene
+from rgbmidic.scene.zones import Zones, predict_zones, zones_on_surface
+from rgbmidic.settings import TestSettings
+from rgbmidic.typing import FloatArray, FloatImage
+
+__all__ = ["GeometryWeights"]
+
+
+_STEP = 4
+"""Pixels between the points of the prediction; in between it is interpolated."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GeometryWeights:
+    """Weights of every frame of a test, from lamps, camera and specimen.
+
+    Attributes
+    ----------
+    scene
+        Lamps, camera, paint and body.
+    states
+        State of every frame; empty: not known, all frames show the body at rest.
+    order
+        For each light of the test its place in the scene.
+    limit_deg
+        Angle of binary weights; None: soft weights, the inverse of the variance that is expected.
+    instrument
+        For the soft weights.
+    surface
+        Points and normals (3, h, w) on the grid of the prediction, from a height map; None: the scene's body.
+    """
+
+    scene: Scene
+    states: tuple[State, ...]
+    order: tuple[int, ...]
+    limit_deg: float | None
+    instrument: Instrument
+    surface: tuple[FloatArray, FloatArray] | None = None
+
+    @classmethod
+    def prepare(
+        cls, settings: TestSettings, *, lights: Sequence[str], shape: tuple[int, int], frames: int
+    ) -> GeometryWeights:
+        """Read the scene that the settings name and check that it is that of the test.
+
+        Parameters
+        ----------
+        settings
+            With ``weights.method = "geometry"``.
+        lights, shape, frames
+            Names of the lights, size of the frames (H, W) and their number.
+
+        Raises
+        ------
+        ConfigurationError
+            The scene is not readable, or its camera, lights or states are not those of the test.
+        """
+        weights = settings.weights
+        assert weights.geometry is not None
+        experiment = read_scene(weights.geometry)
+        scene = experiment.scene
+        if scene.camera.shape != shape:
+            raise ConfigurationError(
+                f"{weights.geometry}: camera.shape is {list(scene.camera.shape)}, the frames have {list(shape)}"
+            )
+        if experiment.states and len(experiment.states) != frames - 1:
+            raise ConfigurationError(
+                f"{weights.geometry}: frame 0 shows the body at rest and every other frame one of the [[states]]; "
+                f"there are {frames} frames and {len(experiment.states)} states. State all of them or none"
+            )
+        surface = None if weights.height_map is None else _read_surface(weights.height_map, scene)
+        if surface is not None and experiment.states:
+            raise ConfigurationError(f"{weights.geometry}: weights.height_map shows one pose; remove the [[states]]")
+        return cls(
+            scene=scene,
+            states=(State(), *experiment.states) if experiment.states else (),
+            order=_order(scene, lights, weights.geometry),
+            limit_deg=weights.limit_deg,
+            instrument=Instrument.of(
+                scene,
+                element_size=settings.element_size,
+                demosaic=settings.illumination.demosaic,
+                prefilter=settings.solver.prefilter or "binomial",
+            ),
+            surface=surface,
+        )
+
+    def reference(self, indices: Sequence[int]) -> FloatImage:
+        """Weights (k, H, W) of the reference, the mean of some frames: binary ones, or 1.
+
+        Soft weights belong to a pair of states and are given to the deformed one.
+        """
+        if self.limit_deg is None:
+            return np.ones((len(self.order), *self.scene.camera.shape), dtype=np.float32)
+        each = [self._binary(self._state(index)) for index in indices]
+        return np.asarray(np.min(each, axis=0))
+
+    def frame(self, index: int, reference: int) -> FloatImage:
+        """Weights (k, H, W) of a frame, `reference` being the frame that it is compared with."""
+        state = self._state(index)
+        if self.limit_deg is not None:
+            return self._binary(state)
+        before, after = self._zones(self._state(reference), state), self._zones(state, state)
+        return self._whole(self.instrument.weights(before, after, known=bool(self.states)))
+
+    def _binary(self, state: State) -> FloatImage:
+        assert self.limit_deg is not None
+        deviation = self._zones(state, state).geometry.deviation_deg
+        seen = self._whole(np.isfinite(deviation).astype(np.float32)) > 0.5
+        smooth = self._whole(np.nan_to_num(deviation, nan=180.0).astype(np.float32))
+        return angle_weights(np.where(seen, smooth, np.nan), self.limit_deg)
+
+    def _state(self, index: int) -> State:
+        return self.states[index] if self.states else State()
+
+    def _zones(self, state: State, seen: State) -> Zones:
+        """Zones in a state at the material points that the grid's pixels see in another one."""
+        if self.surface is not None:
+            return zones_on_surface(self.scene, *self.surface)
+        return predict_zones(self.scene, state, material=material_points(self.scene, seen, _grid(self.scene)))
+
+    def _whole(self, coarse: FloatImage) -> FloatImage:
+        """Values (k, h, w) on the grid at all pixels (k, H, W), in the order of the test's lights."""
+        height, width = self.scene.camera.shape
+        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        place = x / _STEP, y / _STEP
+        return np.stack([cv2.remap(coarse[light], *place, cv2.INTER_LINEAR) for light in self.order])
+
+
+def _grid(scene: Scene) -> tuple[FloatArray, FloatArray]:
+    """Image points (x, y) of the prediction, up to beyond the last pixel."""
+    rows, columns = (np.arange(0, size + _STEP, _STEP, dtype=np.float64) for size in scene.camera.shape)
+    x, y = np.meshgrid(columns, rows)
+    return x, y
+
+
+def _order(scene: Scene, lights: Sequence[str], file: Path) -> tuple[int, ...]:
+    names = [light.name for light in scene.lights]
+    if set(names) == set(lights):
+        return tuple(names.index(name) for name in lights)
+    if scene.camera.kind == "monochrome" and len(names) == len(lights):  # files do not name the lights: their order
+        return tuple(range(len(names)))
+    raise ConfigurationError(f"{file}: the scene's lights are {', '.join(names)}, the test's are {', '.join(lights)}")
+
+
+def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
+    """Points and normals on the grid, from a height map on disk."""
+    camera = scene.camera
+    try:
+        heights = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise ConfigurationError(f"weights.height_map not found: {path}") from None
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"weights.height_map {path} is not a readable npy file: {error}") from None
+    if not isinstance(heights, np.ndarray) or heights.shape != camera.shape or heights.dtype.kind not in "fiu":
+        raise ConfigurationError(
+            f"weights.height_map {path} must hold one height in mm per pixel, shape {camera.shape}, not "
+            f"{getattr(heights, 'shape', 'several arrays')}"
+        )
+    try:
+        points, normals = surface_from_heights(
+            heights, distance=scene.body.front[2], focal_px=camera.focal_px, centre=camera.centre
+        )
+    except InputError as error:
+        raise ConfigurationError(f"weights.height_map {path}: {error}") from None
+    limits = camera.shape[1] - 1, camera.shape[0] - 1
+    columns, rows = (np.minimum(place, limit).astype(int) for place, limit in zip(_grid(scene), limits, strict=True))
+    return points[:, rows, columns], normals[:, rows, columns]

@@ -1,0 +1,186 @@
+"""Camera raws: margins, black levels by position, and files that LibRaw opens although they hold no frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from frames import colour_mosaic, noisy_mosaic, write_cropped_dng, write_monochrome_dng
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rgbmidic.errors import FrameError
+from rgbmidic.frames import camera_raw
+from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.readers import frame_shape, read_frame, tells_camera
+from rgbmidic.frames.writers import write_dng
+
+
+@pytest.fixture(scope="module")
+def dng(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("raw") / "whole.dng"
+    write_dng(path, noisy_mosaic())
+    return path
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+@pytest.mark.parametrize("margin", [(0, 0), (1, 0), (0, 1), (1, 1), (2, 3), (4, 2)])
+def test_pattern_and_black_levels_follow_odd_margins(tmp_path: Path, cfa: str, margin: tuple[int, int]) -> None:
+    path = tmp_path / "cropped.dng"
+    black = np.array([[60, 61], [62, 63]])
+    write_cropped_dng(path, colour_mosaic((39, 41), cfa), top=margin[0], left=margin[1], cfa=cfa, black=black)
+    frame = read_frame(path)
+    assert isinstance(frame, Mosaic)
+    cell = frame.values[:2, :2]
+    np.testing.assert_array_equal(cell // 1000 - 1, cfa_channels(frame.cfa))
+    np.testing.assert_array_equal(cell % 1000 + 60, frame.black_level)
+    assert frame.values.min() >= 1000, "a masked margin is in the frame"
+    assert frame_shape(path) == frame.values.shape
+
+
+def test_monochrome_camera_raw_is_one_channel(tmp_path: Path) -> None:
+    values = noisy_mosaic().values
+    write_monochrome_dng(tmp_path / "mono.dng", values)
+    frame = read_frame(tmp_path / "mono.dng", kind="monochrome")
+    assert isinstance(frame, ChannelFrame)
+    np.testing.assert_array_equal(frame.values, values[None])
+    assert (frame.black_level.tolist(), frame.white_level) == ([64.0], 4095.0)
+    with pytest.raises(FrameError, match=r"bayer.*mono\.dng.*monochrome"):
+        read_frame(tmp_path / "mono.dng", kind="bayer")
+
+
+def test_demosaiced_raw_is_refused(tmp_path: Path) -> None:
+    write_monochrome_dng(tmp_path / "linear.dng", noisy_mosaic().values, linear_rgb=True)
+    with pytest.raises(FrameError, match=r"linear\.dng.*already demosaiced"):
+        read_frame(tmp_path / "linear.dng")
+
+
+def test_every_file_that_must_be_rejected_is(shared_data: Path) -> None:
+    files = [file for file in (shared_data / "raw_must_reject").iterdir() if file.suffix != ".txt"]
+    assert files
+    for file in files:
+        with pytest.raises(FrameError, match=r"demosaiced|damaged"):
+            read_frame(file)
+
+
+def test_colour_chart(shared_data: Path) -> None:
+    frame = read_frame(shared_data / "raw_colorchart_dng" / "colorchart.dng")
+    assert isinstance(frame, Mosaic)
+    assert (frame.values.shape, frame.cfa, frame.white_level) == ((1156, 1734), "RGGB", 15000)
+    assert frame.black_level.tolist() == [[2056, 2056], [2056, 2056]]
+    assert frame.values.max() == 12128
+
+
+def test_kodak_with_a_non_ascii_name(shared_data: Path) -> None:
+    (file,) = (shared_data / "raw_kodak_kdc").glob("*.KDC")
+    frame = read_frame(file)
+    assert isinstance(frame, Mosaic)
+    assert (frame.values.shape, frame.cfa, frame.white_level) == ((512, 768), "GRBG", 16383)
+    assert (frame.black_level == 0).all()
+    assert (frame.values.min(), frame.values.max()) == (23, 16383)
+
+
+@given(share=st.floats(0, 1, exclude_max=True))
+@settings(max_examples=60, deadline=None)
+def test_truncated_dng_is_refused_at_any_length(dng: Path, share: float) -> None:
+    content = dng.read_bytes()
+    path = dng.with_name("cut.dng")
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(FrameError, match=r"cut\.dng"):
+        read_frame(path)
+
+
+@pytest.mark.parametrize("kept", [0.1, 0.5, 0.9, 0.99])
+@pytest.mark.parametrize("zeros", [False, True])
+def test_truncated_real_raws_are_refused(tmp_path: Path, shared_data: Path, kept: float, zeros: bool) -> None:
+    files = [shared_data / "raw_colorchart_dng" / "colorchart.dng", *(shared_data / "raw_kodak_kdc").glob("*.KDC")]
+    for file in files:
+        content = file.read_bytes()
+        length = int(kept * len(content))
+        cut = tmp_path / f"cut{file.suffix}"
+        cut.write_bytes(content[:length] + bytes(len(content) - length if zeros else 0))
+        with pytest.raises(FrameError, match="damaged"):
+            read_frame(cut)
+
+
+def test_zeros_below_a_positive_black_level_are_no_frame_but_a_computed_dark_frame_is(tmp_path: Path) -> None:
+    values = noisy_mosaic().values.copy()
+    values[-1] = 0
+    write_dng(tmp_path / "hole.dng", Mosaic(values=values, cfa="RGGB", black_level=64, white_level=4095))
+    with pytest.raises(FrameError, match="empty"):
+        read_frame(tmp_path / "hole.dng")
+    for level in (0, 64):
+        dark = Mosaic(values=np.full((40, 40), level), cfa="RGGB", black_level=level, white_level=4095)
+        write_dng(tmp_path / "dark.dng", dark)
+        assert (read_frame(tmp_path / "dark.dng").values == level).all()
+
+
+def test_saturated_frame_is_a_frame(tmp_path: Path) -> None:
+    bright = Mosaic(values=np.full((40, 40), 4095), cfa="RGGB", black_level=64, white_level=4095)
+    write_dng(tmp_path / "bright.dng", bright)
+    assert (read_frame(tmp_path / "bright.dng").values == 4095).all()
+
+
+def test_headerless_file_is_not_taken_for_a_camera_raw_by_its_length(shared_data: Path, tmp_path: Path) -> None:
+    # LibRaw alone opens this file as a 768x1024 frame of 8 bit
+    content = (shared_data / "mosaic16_nikon" / "DSC_1339_768x512_rggb.raw").read_bytes()
+    for name in ("frame.raw", "frame.nef"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(FrameError, match="shape and dtype"):
+            read_frame(tmp_path / name)
+        assert not tells_camera(tmp_path / name)
+
+
+def test_what_a_camera_raw_tells_need_not_be_stated_but_must_not_be_contradicted(dng: Path) -> None:
+    stated = {"kind": "bayer", "cfa": "rggb", "black_level": 64, "white_level": 4095, "shape": (40, 50)}
+    np.testing.assert_array_equal(read_frame(dng, **stated).values, read_frame(dng).values)
+    wrong = {"kind": "rgb", "cfa": "GRBG", "black_level": 60, "white_level": 1023, "shape": (50, 40)}
+    for name, value in wrong.items():
+        with pytest.raises(FrameError, match=rf"{name} is stated as .*whole\.dng says"):
+            read_frame(dng, **{**stated, name: value})
+    assert tells_camera(dng)
+
+
+def test_dng_with_a_tiff_name_is_read_as_dng(dng: Path) -> None:
+    named = dng.with_suffix(".tif")
+    named.write_bytes(dng.read_bytes())
+    frame = read_frame(named)
+    assert isinstance(frame, Mosaic)
+    assert (frame.cfa, frame.white_level, frame.black_level.min()) == ("RGGB", 4095, 64)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=60, deadline=None)
+def test_damaged_header_never_gives_another_error(dng: Path, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    content = bytearray(dng.read_bytes())
+    for position in random.integers(0, 700, 3):
+        content[position] = random.integers(256)
+    bad = dng.with_name("bad.dng")
+    bad.write_bytes(content)
+    try:
+        read_frame(bad)
+    except FrameError as error:
+        named = str(error)
+        assert "bad.dng" in named
+
+
+@pytest.mark.parametrize(("black", "fill"), [(0, 0), (64, 0), (64, 64), (64, 128)])
+def test_rows_without_noise_mean_that_nothing_was_decoded(black: int, fill: int) -> None:
+    """Compressed raws whose data end early: LibRaw leaves rows of one value (a truncated Panasonic, a Sony)."""
+    values = noisy_mosaic((200, 50)).values.copy()
+    level = np.full((2, 2), float(black))
+    for damage, refused in (
+        (slice(0, 0), False),
+        (slice(7, 8), False),
+        (slice(100, 110), True),
+        (slice(198, 200), True),
+    ):
+        broken = values.copy()
+        broken[damage] = fill
+        if refused:
+            with pytest.raises(FrameError, match="empty"):
+                camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
+        else:
+            camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))

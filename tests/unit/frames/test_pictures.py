@@ -1,0 +1,250 @@
+"""TIFF, PNG and headerless frames: what is read, and what is refused with its reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from frames import noisy_mosaic
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rgbmidic.errors import FrameError, InputError
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.readers import frame_shape, read_frame
+
+GREY = noisy_mosaic((31, 45)).values
+RGB = np.random.default_rng(1).integers(0, 65536, (31, 45, 3)).astype(np.uint16)
+
+
+def _png(path: Path, values: np.ndarray[Any, Any]) -> Path:
+    assert cv2.imwrite(str(path), values[..., ::-1] if values.ndim == 3 else values)
+    return path
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"byteorder": ">"},
+        {"compression": "zlib"},
+        {"compression": "zlib", "predictor": True},
+        {"tile": (16, 16)},
+        {"rowsperstrip": 3},
+        {"bigtiff": True},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_tiff_of_any_layout(tmp_path: Path, options: dict[str, Any], dtype: Any) -> None:
+    values = (GREY % 256).astype(dtype) if dtype is np.uint8 else GREY
+    tifffile.imwrite(tmp_path / "f.tif", values, photometric="minisblack", **options)
+    frame = read_frame(tmp_path / "f.tif", cfa="GBRG")
+    assert isinstance(frame, Mosaic)
+    np.testing.assert_array_equal(frame.values, values)
+    assert (frame.cfa, frame.white_level, frame.black_level.max()) == ("GBRG", np.iinfo(dtype).max, 0)
+    assert frame_shape(tmp_path / "f.tif") == GREY.shape
+
+
+@pytest.mark.parametrize("values", [GREY, RGB], ids=["grey", "rgb"])
+def test_lzw_tiff_and_png_from_opencv_keep_values_and_colour_order(
+    tmp_path: Path, values: np.ndarray[Any, Any]
+) -> None:
+    kind = "monochrome" if values.ndim == 2 else None
+    for name in ("f.tif", "f.png"):
+        frame = read_frame(_png(tmp_path / name, values), kind=kind)
+        assert isinstance(frame, ChannelFrame)
+        np.testing.assert_array_equal(np.moveaxis(frame.values, 0, -1).squeeze(), values)
+        assert frame_shape(tmp_path / name) == values.shape[:2]
+
+
+def test_planes_one_after_the_other(tmp_path: Path) -> None:
+    planes = np.ascontiguousarray(np.moveaxis(RGB, -1, 0))
+    tifffile.imwrite(tmp_path / "f.tif", planes, photometric="rgb", planarconfig="separate")
+    np.testing.assert_array_equal(read_frame(tmp_path / "f.tif").values, planes)
+
+
+def test_tiff_that_names_its_pattern(tmp_path: Path) -> None:
+    tags = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\x01\x00\x02\x01", True)]
+    tifffile.imwrite(tmp_path / "f.tif", GREY, photometric=32803, extratags=tags)
+    frame = read_frame(tmp_path / "f.tif")
+    assert isinstance(frame, Mosaic)
+    assert frame.cfa == "GRBG"
+    with pytest.raises(FrameError, match=r"cfa is stated as RGGB.*says GRBG"):
+        read_frame(tmp_path / "f.tif", cfa="RGGB")
+
+
+def test_min_is_white_is_turned_round(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "f.tif", GREY, photometric="miniswhite")
+    np.testing.assert_array_equal(read_frame(tmp_path / "f.tif", kind="monochrome").values[0], 65535 - GREY)
+
+
+def test_grey_table_is_read_and_a_colour_table_refused(tmp_path: Path) -> None:
+    values = (GREY % 256).astype(np.uint8)
+    ramp = np.tile(np.arange(256, dtype=np.uint16) * 257, (3, 1))
+    tifffile.imwrite(tmp_path / "grey.tif", values, photometric="palette", colormap=ramp)
+    np.testing.assert_array_equal(read_frame(tmp_path / "grey.tif", kind="monochrome").values[0], values)
+    tifffile.imwrite(tmp_path / "colour.tif", values, photometric="palette", colormap=ramp[:, ::-1])
+    with pytest.raises(FrameError, match=r"colour\.tif.*table"):
+        read_frame(tmp_path / "colour.tif", kind="monochrome")
+
+
+def test_what_is_no_raw_frame_is_refused(tmp_path: Path) -> None:
+    alpha = np.dstack([RGB, RGB[..., :1]])
+    cases: dict[str, tuple[dict[str, Any], np.ndarray[Any, Any]]] = {
+        "32": ({}, GREY.astype(np.float32)),
+        "int16": ({}, GREY.astype(np.int16)),
+        "2 frames": ({"photometric": "minisblack"}, np.stack([GREY, GREY])),
+        "samples of shape": ({"photometric": "rgb"}, alpha),
+    }
+    for reason, (options, values) in cases.items():
+        tifffile.imwrite(tmp_path / "f.tif", values, **options)
+        with pytest.raises(FrameError, match=rf"f\.tif .*{reason}"):
+            read_frame(tmp_path / "f.tif", kind="monochrome")
+    _png(tmp_path / "f.png", (alpha[..., [2, 1, 0, 3]] // 256).astype(np.uint8))
+    with pytest.raises(FrameError, match="without alpha"):
+        read_frame(tmp_path / "f.png")
+
+
+def test_three_equal_channels_count_as_grey_only_where_that_is_stated(tmp_path: Path) -> None:
+    file = _png(tmp_path / "f.png", np.repeat(GREY[..., None], 3, axis=2))
+    assert len(read_frame(file).values) == 3
+    np.testing.assert_array_equal(read_frame(file, kind="monochrome").values[0], GREY)
+    with pytest.raises(FrameError, match=r"kind is stated as monochrome, but .*rgb"):
+        read_frame(_png(tmp_path / "g.png", RGB), kind="monochrome")
+
+
+def test_a_mosaic_needs_its_pattern(tmp_path: Path) -> None:
+    file = _png(tmp_path / "f.png", GREY)
+    with pytest.raises(FrameError, match=r"f\.png does not tell .*RGGB, BGGR, GRBG, GBRG.*monochrome"):
+        read_frame(file)
+    with pytest.raises(InputError, match=r"RGBG.*RGGB, BGGR, GRBG, GBRG"):
+        read_frame(file, cfa="RGBG")
+    for kind in ("monochrome", "rgb"):
+        with pytest.raises(FrameError, match=r"cfa|kind"):
+            read_frame(file, kind=kind, cfa="RGGB")
+
+
+def test_levels_must_fit_the_samples(tmp_path: Path) -> None:
+    file = _png(tmp_path / "f.png", (GREY % 256).astype(np.uint8))
+    with pytest.raises(FrameError, match=r"4095.*f\.png.* 255"):
+        read_frame(file, cfa="RGGB", white_level=4095)
+    with pytest.raises(FrameError, match=r"f\.png: .*300"):
+        read_frame(file, cfa="RGGB", black_level=300)
+    with pytest.raises(FrameError, match=r"dtype is stated as uint16, but .*uint8"):
+        read_frame(file, cfa="RGGB", dtype="uint16")
+    with pytest.raises(FrameError, match=r"shape is stated as \(1, 2\), but .*\(31, 45\)"):
+        read_frame(file, cfa="RGGB", shape=(1, 2))
+
+
+@pytest.mark.parametrize(("dtype", "stored"), [("uint8", "u1"), ("uint16", "<u2"), (">u2", ">u2")])
+def test_headerless(tmp_path: Path, dtype: Any, stored: str) -> None:
+    values = GREY % 256
+    for name in ("f.raw", "f.bin"):
+        values.astype(stored).tofile(tmp_path / name)
+        frame = read_frame(tmp_path / name, cfa="BGGR", shape=GREY.shape, dtype=dtype)
+        np.testing.assert_array_equal(frame.values, values)
+        with pytest.raises(FrameError, match=r"bytes; 30 rows of 45"):
+            read_frame(tmp_path / name, cfa="BGGR", shape=(30, 45), dtype=dtype)
+    RGB.astype("<u2").tofile(tmp_path / "rgb.bin")
+    three = read_frame(tmp_path / "rgb.bin", kind="rgb", shape=GREY.shape, dtype="uint16")
+    np.testing.assert_array_equal(three.values, np.moveaxis(RGB, -1, 0))
+    with pytest.raises(FrameError, match=r"f\.bin has no header"):
+        read_frame(tmp_path / "f.bin", cfa="BGGR", shape=GREY.shape)
+
+
+def test_missing_empty_and_foreign_files(tmp_path: Path) -> None:
+    (tmp_path / "empty.tif").touch()
+    (tmp_path / "text.txt").write_text("no frame")
+    (tmp_path / "text.tif").write_text("no frame")
+    (tmp_path / "text.png").write_text("no frame")
+    for name, reason in {
+        "nothing.tif": "not found",
+        "empty.tif": "empty",
+        "text.txt": "camera raws",
+        "text.tif": "not a TIFF",
+        "text.png": "no PNG header",
+        ".": "folder",
+    }.items():
+        with pytest.raises(FrameError, match=reason):
+            read_frame(tmp_path / name, cfa="RGGB")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("whole")
+    tifffile.imwrite(folder / "plain.tif", GREY)
+    tifffile.imwrite(folder / "zip.tif", GREY, compression="zlib", rowsperstrip=4)
+    _png(folder / "lzw.tif", GREY)
+    _png(folder / "grey.png", GREY)
+    return {file.name: file for file in folder.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["plain.tif", "zip.tif", "lzw.tif", "grey.png"])
+@given(share=st.floats(0, 1, exclude_max=True))
+@settings(max_examples=40, deadline=None)
+def test_a_truncated_file_is_refused_or_read_whole(whole: dict[str, Path], name: str, share: float) -> None:
+    content = whole[name].read_bytes()
+    cut = whole[name].with_name(f"cut_{name}")
+    cut.write_bytes(content[: int(share * len(content))])
+    try:
+        values = read_frame(cut, kind="monochrome").values[0]
+    except FrameError:
+        return
+    np.testing.assert_array_equal(values, GREY)
+
+
+@given(position=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
+@settings(max_examples=40, deadline=None)
+def test_a_changed_byte_in_a_png_is_noticed(whole: dict[str, Path], position: float, flip: int) -> None:
+    content = bytearray(whole["grey.png"].read_bytes())
+    content[int(position * len(content))] ^= flip
+    bad = whole["grey.png"].with_name("bad.png")
+    bad.write_bytes(content)
+    with pytest.raises(FrameError, match=r"bad\.png"):
+        read_frame(bad, kind="monochrome")
+
+
+def test_coins_and_nikon(shared_data: Path) -> None:
+    coin = read_frame(shared_data / "multilight_raw_coin_italy" / "I_03.png", cfa="RGGB")
+    assert coin.values.shape == (2748, 3664)
+    assert coin.white_level == 255
+    nikon = read_frame(
+        shared_data / "mosaic16_nikon" / "DSC_1339_768x512_rggb.raw", cfa="RGGB", shape=(512, 768), dtype="uint16"
+    )
+    means = [nikon.values[row::2, column::2].mean() for row in (0, 1) for column in (0, 1)]
+    assert means == pytest.approx([2140.4, 1739.5, 1740.2, 1152.6], abs=0.05)
+    assert (nikon.values.min(), nikon.values.max()) == (616, 16383)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "shape"),
+    [
+        ("dic_rigid_shift/*.tif", (512, 512)),
+        ("dic_challenge_sample12/*.tiff", (1040, 400)),
+        ("dic_challenge_sample14/*.tif", (589, 2048)),
+        ("dic_challenge2_wave/*.tif", (501, 2000)),
+        ("dic_real_tension_mudic/*.tif", (2050, 871)),
+    ],
+)
+def test_real_dic_images_agree_with_opencv(shared_data: Path, pattern: str, shape: tuple[int, int]) -> None:
+    for file in shared_data.glob(pattern):
+        frame = read_frame(file, kind="monochrome")
+        assert frame.values.shape == (1, *shape)
+        np.testing.assert_array_equal(frame.values[0], cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+
+
+def test_a_list_of_images_that_leads_back_to_itself_is_noticed(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "f.tif", np.stack([GREY, GREY]), photometric="minisblack", metadata=None)
+    content = bytearray((tmp_path / "f.tif").read_bytes())
+    with tifffile.TiffFile(tmp_path / "f.tif") as tiff:
+        first, second = (page.aspage() for page in tiff.pages)
+        next_offset = second.offset + 2 + 12 * len(second.tags)
+    content[next_offset : next_offset + 4] = first.offset.to_bytes(4, "little")
+    (tmp_path / "f.tif").write_bytes(content)
+    with pytest.raises(FrameError, match="leads back"):
+        read_frame(tmp_path / "f.tif", kind="monochrome")

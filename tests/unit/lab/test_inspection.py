@@ -1,0 +1,370 @@
+"""What `rgbmidic inspect` says of frames whose speckle, noise, exposure and reflections are known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from colour_scenes import CROSSTALK, FULL_SCALE, NOISE, A, mosaic_of, sparkle, speckle
+from small_tests import REGION, colour_test, grey_frame
+
+import rgbmidic
+from rgbmidic import cli
+from rgbmidic.correlation import correlate
+from rgbmidic.errors import FrameError, InputError, RegionError
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.writers import write_dng, write_tiff
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.linearise import NoiseModel, linearise
+from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
+from rgbmidic.lab.inspection.repeat import MOTION, gaussian_states
+from rgbmidic.lab.inspection.report import inspection_document, write_inspection
+from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_size
+
+Run = Callable[..., tuple[int, str, str]]
+SHAPE = (192, 192)
+BLACK = 64
+CALIBRATION = Calibration(crosstalk=CROSSTALK, noise=NOISE)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run the command in this process: exit status, standard output, standard error."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        status = cli._run([str(argument) for argument in arguments], debug=False)
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def raw(lights, *, cfa="RGGB", seed=0, noise=NOISE) -> Mosaic:
+    """The frame as a camera stores it: whole grey levels over a black level."""
+    values = mosaic_of(lights, cfa=cfa, seed=seed, noise=noise).values
+    stored = np.clip(np.rint(values) + BLACK, 0, BLACK + FULL_SCALE).astype(np.uint16)
+    return Mosaic(values=stored, cfa=cfa, black_level=np.array(BLACK), white_level=BLACK + FULL_SCALE)
+
+
+@cache
+def mat_lights(diameter=4.2, seed=0, level=1500.0, shape=SHAPE):
+    return np.stack([level * speckle(shape, diameter=diameter, seed=seed)] * 3).astype(np.float32)
+
+
+@cache
+def glaring_lights():
+    """Green reflects everywhere."""
+    lights = mat_lights().copy()
+    lights[1] += sparkle(SHAPE, 1200, 5)
+    return lights
+
+
+@cache
+def mat() -> Inspection:
+    return inspect_frame(raw(mat_lights()), calibration=CALIBRATION)
+
+
+@cache
+def glaring() -> Inspection:
+    return inspect_frame(raw(glaring_lights()), calibration=CALIBRATION)
+
+
+def codes(seen: Inspection) -> set[str]:
+    return {finding.code for finding in seen.findings}
+
+
+def test_a_good_frame_has_no_warnings_and_its_figures_are_those_it_was_made_with():
+    seen = mat()
+    assert codes(seen) == set()
+    assert (seen.kind, [one.name for one in seen.channels]) == ("bayer", ["R", "G", "B"])
+    sampled = mosaic_of(mat_lights(), noise=None)
+    for one, channel in zip(seen.channels, channels_of([sampled]), strict=True):
+        mean = np.nanmean(channel.values)
+        assert one.mean == pytest.approx(mean / FULL_SCALE, rel=0.01)
+        assert one.low < one.mean < one.high
+        assert one.noise_dn == pytest.approx(np.sqrt(NOISE.variance(mean)), rel=0.01)
+        assert one.saturated == 0
+    for light in seen.lights:
+        assert light.mean == pytest.approx(mat_lights()[0].mean() / FULL_SCALE, rel=0.01)
+        assert light.reflecting < 0.02
+        assert light.valid == 1
+
+
+def test_reflection_of_one_light_is_told():
+    shares = [light.reflecting for light in glaring().lights]
+    assert shares[1] > 0.95
+    assert max(shares[0], shares[2]) < 0.05
+    assert glaring().lights[1].contrast < 0.6 * glaring().lights[0].contrast
+    assert codes(glaring()) == set()
+
+
+@pytest.mark.parametrize("diameter", [3.0, 4.2, 6.0])
+def test_speckle_size_of_a_coarse_lattice_is_that_of_the_full_image(diameter):
+    full = mat_lights(diameter, seed=2)[0]
+    nowhere, inside = np.zeros(SHAPE, bool), np.ones(SHAPE, bool)
+    whole = Channel(name="M", values=full, saturated=nowhere, step=1)
+    true = speckle_size(whole, inside, NoiseModel(gain=np.inf, read_noise=0.0))
+    for channel in channels_of([mosaic_of(mat_lights(diameter, seed=2))]):
+        assert speckle_size(channel, inside, NOISE) == pytest.approx(true, rel=0.06)
+        assert speckle_size(channel, inside, None) == pytest.approx(true, rel=0.2)
+
+
+def test_speckle_size_of_gaussian_textures_is_known_in_closed_form():
+    for sigma in (1.2, 2.5):
+        field = gaussian_states(TextureModel(weights=(1.0,), widths=(sigma,)), (256, 256), np.random.default_rng(1))[0]
+        channel = Channel(name="M", values=500 + 50 * field, saturated=np.zeros((256, 256), bool), step=1)
+        size = speckle_size(channel, np.ones((256, 256), bool), NoiseModel(gain=np.inf, read_noise=0.0))
+        assert size == pytest.approx(2 * np.sqrt(2 * np.log(2)) * sigma, rel=0.08)
+
+
+def test_the_two_states_of_a_random_texture_are_one_texture_moved():
+    first, second = gaussian_states(TextureModel.of_speckle(6.0), (160, 160), np.random.default_rng(0))
+    solution = correlate(first, second, initial=MOTION, element_size=40)
+    np.testing.assert_allclose(np.nanmean(solution.displacement, axis=0), MOTION, atol=0.005)
+    assert first.var() == pytest.approx(1, rel=0.1)
+
+
+def test_noise_is_estimated_from_a_flat_or_coarsely_painted_frame():
+    inside = np.ones(SHAPE, bool)
+    flat = np.full((3, *SHAPE), 800.0, dtype=np.float32)
+    for lights, limits in ((flat, (0.8, 1.2)), (mat_lights(6.0), (0.8, 1.8))):
+        channels = channels_of([mosaic_of(lights)])
+        for channel, found in zip(channels, noise_estimate(channels, inside), strict=True):
+            true = np.sqrt(NOISE.variance(np.nanmean(channel.values)))
+            assert limits[0] < found / true < limits[1]
+
+
+@pytest.mark.parametrize("glare", [False, True])
+def test_predicted_uncertainty_is_the_scatter_of_repeated_frames(glare):
+    """Six frames of the paint moved by whole and half pixels of different phase; the truth is known."""
+    seen = glaring() if glare else mat()
+    fine = _moved_lights(glare)
+    errors = []
+    first = _separated(fine((0.0, 0.0)), 10)
+    for seed, motion in enumerate(((1.5, 0.5), (-0.5, 1.25), (1.0, -1.0), (0.25, 2.5))):
+        second = _separated(fine(motion), 20 + seed)
+        solution = correlate(first, second, initial=motion, normalise=10.0, curvature=True)
+        inner = ((solution.nodes > 20) & (solution.nodes < SHAPE[0] - 21)).all(axis=1)
+        errors.append((solution.displacement - motion)[inner])
+    observed = np.sqrt(np.nanmean((np.array(errors) - np.nanmean(errors, axis=1, keepdims=True)) ** 2))
+    inner = ((seen.nodes > 20) & (seen.nodes < SHAPE[0] - 21)).all(axis=1)
+    predicted = np.sqrt(np.nanmean(seen.std[inner] ** 2))
+    # with six elements a side the uncertainty is stated up to a third too large
+    assert 0.75 < predicted / observed < 1.4
+    assert 0 < np.nanmedian(seen.noise_std) <= 1.1 * np.nanmedian(seen.std)
+    assert min(light.alone.median for light in seen.lights) > np.nanmedian(seen.std)
+
+
+def _moved_lights(glare):
+    """Lights of a paint at any place, and a reflection that stays in the same place on it."""
+    from scipy.ndimage import fourier_shift
+
+    base = glaring_lights() if glare else mat_lights()
+    wide = np.pad(base, ((0, 0), (32, 32), (32, 32)), mode="symmetric")
+    spectra = np.fft.fft2(wide)
+
+    def moved(motion):
+        shifted = [np.fft.ifft2(fourier_shift(one, motion[::-1])).real for one in spectra]
+        return np.stack(shifted)[:, 32:-32, 32:-32]
+
+    return moved
+
+
+def _separated(lights, seed):
+    linear = mosaic_of(lights, seed=seed)
+    return separate(linear, CROSSTALK).values
+
+
+def test_more_noise_and_smaller_elements_mean_more_uncertainty():
+    loud = NoiseModel(gain=1.0, read_noise=24.0)
+    frame = raw(mat_lights(), noise=loud)
+    noisy = inspect_frame(frame, calibration=replace(CALIBRATION, noise=loud))
+    ratio = np.sqrt(loud.variance(700.0) / NOISE.variance(700.0))
+    assert np.nanmedian(noisy.noise_std) / np.nanmedian(mat().noise_std) == pytest.approx(ratio, rel=0.2)
+    small = inspect_frame(raw(mat_lights()), calibration=CALIBRATION, element_size=16)
+    assert 1.2 < np.nanmedian(small.std) / np.nanmedian(mat().std) < 2.0
+
+
+def test_the_same_frame_gives_the_same_figures():
+    again = inspect_frame(raw(mat_lights()), calibration=CALIBRATION)
+    np.testing.assert_array_equal(again.std, mat().std)
+    assert inspection_document(again) == inspection_document(mat())
+
+
+def _coloured():
+    return np.stack([1500 * speckle(SHAPE, seed=20 + n) for n in range(3)]).astype(np.float32)
+
+
+def _fine():
+    return np.stack([1500 * speckle(SHAPE, diameter=1.3, blur=0.3)] * 3).astype(np.float32)
+
+
+def _blind():
+    lights = mat_lights().copy()
+    lights[:, 60:120, 60:120] = 700
+    return lights
+
+
+@pytest.mark.parametrize(
+    ("lights", "code"),
+    [
+        (_fine, "fine speckle"),
+        (lambda: mat_lights(11.0), "coarse speckle"),
+        (lambda: mat_lights(level=5200.0), "saturated"),
+        (lambda: mat_lights(level=300.0), "dark"),
+        (_coloured, "coloured"),
+        (_blind, "hidden"),
+    ],
+)
+def test_troubles_are_told(lights, code):
+    seen = inspect_frame(raw(lights()), calibration=CALIBRATION)
+    assert code in codes(seen)
+    assert all(finding.text for finding in seen.findings)
+
+
+def test_without_calibration_the_channels_stand_for_the_lights():
+    seen = inspect_frame(raw(glaring_lights()))
+    assert codes(seen) == {"crosstalk unknown", "noise unknown"}
+    assert [light.name for light in seen.lights] == ["red", "green", "blue"]
+    assert seen.lights[1].reflecting > 0.95
+    assert not seen.crosstalk_known
+    assert not seen.noise_known
+    level = np.tensordot(A, glaring_lights().mean(axis=(1, 2)), axes=1)
+    np.testing.assert_allclose([light.mean * FULL_SCALE for light in seen.lights], level, rtol=0.01)
+
+
+def test_a_wrong_pattern_is_told():
+    lights = mat_lights().copy() * np.array([1.0, 0.6, 0.4], dtype=np.float32)[:, None, None]
+    wrong = replace(raw(lights), cfa="GRBG")
+    assert "pattern" in codes(inspect_frame(wrong, calibration=CALIBRATION))
+    assert "pattern" not in codes(inspect_frame(raw(lights), calibration=CALIBRATION))
+
+
+def test_monochrome_frames_have_neither_lattice_nor_reflection_index():
+    frame = grey_frame(1, (0.0, 0.0))
+    seen = inspect_frame(frame, calibration=Calibration(noise=NoiseModel(gain=np.inf, read_noise=8.0)))
+    assert (seen.kind, seen.reflection_index, seen.texture) == ("monochrome", None, None)
+    assert [one.name for one in seen.channels] == ["M"]
+    assert codes(seen) == set()
+    repeats = [grey_frame(1, (0.0, 0.0), noise_seed=n) for n in (1, 2)]
+    images = [linearise(one).values for one in repeats]
+    solution = correlate(*images, initial=(0, 0), normalise=10.0, curvature=True)
+    observed = np.sqrt(np.nanmean(solution.displacement**2))
+    assert np.sqrt(np.nanmean(seen.std**2)) / observed == pytest.approx(1, abs=0.35)
+
+
+def test_lights_in_succession_and_three_channels():
+    frames = [grey_frame(seed, (0.0, 0.0)) for seed in (1, 2)]
+    seen = inspect_frame(frames)
+    assert [one.name for one in seen.channels] == ["M1", "M2"]
+    assert [light.name for light in seen.lights] == ["light 1", "light 2"]
+    lights = np.clip(np.rint(np.tensordot(A, glaring_lights(), axes=1)) + BLACK, 0, 4095).astype(np.uint16)
+    colour = ChannelFrame(values=lights, black_level=np.array(BLACK), white_level=4095)
+    seen = inspect_frame(colour, calibration=CALIBRATION)
+    assert (seen.kind, seen.texture) == ("rgb", None)
+    assert seen.lights[1].reflecting > 0.9
+    assert np.nanmax(seen.sampling_std) == 0
+
+
+def test_frames_that_cannot_be_inspected():
+    with pytest.raises(InputError, match="at least 64"):
+        inspect_frame(raw(mat_lights()[:, :48, :60]))
+    full = Mosaic(values=np.full(SHAPE, 4095), cfa="RGGB", black_level=np.array(BLACK), white_level=4095)
+    with pytest.raises(InputError, match="saturated"):
+        inspect_frame(full)
+    with pytest.raises(InputError, match="constant"):
+        inspect_frame(replace(full, values=np.full(SHAPE, 700)))
+    with pytest.raises(RegionError):
+        inspect_frame(raw(mat_lights()), region=(400, 400, 500, 500))
+    with pytest.raises(InputError, match="succession"):
+        inspect_frame([raw(mat_lights())] * 2)
+
+
+def test_files_of_a_test_are_inspected_as_the_test_says(tmp_path):
+    test = colour_test(tmp_path / "test", [(0.0, 0.0)])
+    seen = inspect_files([test.frames[0]], test=rgbmidic.read_test(test.folder / "TEST.toml"))
+    assert seen.name == "frame_0.dng"
+    assert seen.crosstalk_known
+    assert seen.noise_known
+    x0, y0, x1, y1 = REGION
+    assert seen.region.sum() == (x1 - x0 + 1) * (y1 - y0 + 1)
+    assert rgbmidic.inspect_frame is inspect_frame
+    damaged = tmp_path / "cut.dng"
+    damaged.write_bytes(test.frames[0].read_bytes()[:2000])
+    with pytest.raises(FrameError, match=r"cut\.dng"):
+        inspect_files([damaged])
+
+
+def test_files_are_written_and_nothing_is_overwritten(tmp_path):
+    out = tmp_path / "out"
+    write_inspection(mat(), out)
+    document = json.loads((out / "inspection.json").read_text())
+    assert document["std_px"]["median"] == pytest.approx(np.nanmedian(np.sqrt((mat().std ** 2).mean(axis=1))))
+    assert [one["name"] for one in document["channels"]] == ["R", "G", "B"]
+    assert document["warnings"] == []
+    assert (out / "inspection.png").stat().st_size > 20_000
+    with pytest.raises(rgbmidic.RgbmidicError, match="already there"):
+        write_inspection(mat(), out)
+
+
+def test_command(command: Run, tmp_path: Path) -> None:
+    test = colour_test(tmp_path / "test", [(0.0, 0.0)])
+    out = tmp_path / "out"
+    arguments = ["inspect", test.frames[0], "--test", test.folder / "TEST.toml", "--out", out]
+    status, printed, error = command(*arguments)
+    assert status == 0, error
+    assert all(word in printed for word in ("green", "speckle", "all lights", "green alone", "inspection.png"))
+    assert {file.name for file in out.iterdir()} == {"inspection.json", "inspection.png"}
+    status, _, error = command(*arguments)
+    assert (status, error.count("\n")) == (2, 1)
+    assert "--overwrite" in error
+    before = set(tmp_path.rglob("*"))
+    status, printed, _ = command("inspect", test.frames[0], "--region", "16,16,128,128", "--element-size", "20")
+    assert status == 0
+    assert "warning: no crosstalk calibration" in printed
+    assert set(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["none.tif"], "none.tif"),
+        (["frame.tif"], "cfa"),
+        (["frame.tif", "--cfa", "RGBG"], "RGBG"),
+        (["frame.dng", "--cfa", "BGGR"], "BGGR"),
+        (["frame.tif", "--cfa", "RGGB", "--calibration", "none.json"], "none.json"),
+        (["frame.tif", "--cfa", "RGGB", "--test", "none.toml"], "none.toml"),
+        (["frame.tif", "--cfa", "RGGB", "--region", "1,2,3"], "x0, y0"),
+        (["frame.tif", "--cfa", "RGGB", "--region", "a"], "--region"),
+        (["frame.tif", "--cfa", "RGGB", "--element-size", "2"], "4 px"),
+        (["frame.tif", "--cfa", "RGGB", "--region", "500,500,600,600"], "overlap"),
+        (["frame.tif", "--kind", "colour"], "kind"),
+        (["frame.tif", "--cfa", "RGGB", "--white-level", "500"], "saturated"),
+        (["small.tif", "--cfa", "RGGB"], "small.tif"),
+        (["cut.dng"], "cut.dng"),
+    ],
+)
+def test_wrong_input_is_one_line_status_2_and_nothing_written(
+    command: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    word: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    frame = raw(mat_lights()[:, :96, :96] + 500)
+    write_tiff(tmp_path / "frame.tif", frame)
+    write_dng(tmp_path / "frame.dng", frame)
+    write_tiff(tmp_path / "small.tif", replace(frame, values=frame.values[:40, :40]))
+    (tmp_path / "cut.dng").write_bytes((tmp_path / "frame.dng").read_bytes()[:3000])
+    status, printed, error = command("inspect", *arguments, "--out", "out")
+    assert (status, printed) == (2, ""), error
+    assert error.count("\n") == 1
+    assert word in error
+    assert not (tmp_path / "out").exists()

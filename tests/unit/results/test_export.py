@@ -1,0 +1,71 @@
+"""Exports hold what the result holds."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from results import LIGHTS, NODES, make_result
+
+from rgbmidic.errors import InputError, ResultError
+from rgbmidic.results.export import EXPORT_FORMATS, export_result
+from rgbmidic.results.store import Result
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Result:
+    return make_result(tmp_path / "result", frames=3)
+
+
+def test_npz_holds_every_array(result: Result, tmp_path: Path) -> None:
+    export_result(result, "npz", tmp_path / "fields.out")
+    with np.load(tmp_path / "fields.out", allow_pickle=False) as archive:
+        assert archive["u"].shape == archive["v_std"].shape == (3, NODES)
+        assert archive["names"].tolist() == ["frame 0", "frame 1", "frame 2"]
+        assert archive["lights"].tolist() == list(LIGHTS)
+        strains = {f"{name}{suffix}" for name in ("exx", "eyy", "exy") for suffix in ("", "_std")}
+        np.testing.assert_array_equal(archive["exy_std"], result.strain_std[..., 2])
+        for name in set(archive.files) - {"names", "lights"} - strains:
+            np.testing.assert_array_equal(archive[name], getattr(result, name), err_msg=name)
+        assert {"nodes", "elements", "u", "v", "u_std", "v_std", "status", "node_status"} <= set(archive.files)
+
+
+def test_csv_has_one_row_per_node_and_frame(result: Result, tmp_path: Path) -> None:
+    export_result(result, "csv", tmp_path / "fields.csv")
+    with (tmp_path / "fields.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * NODES
+    for name in ("u", "v", "u_std", "v_std"):
+        column = np.array([float(row[name] or "nan") for row in rows]).reshape(3, NODES)
+        np.testing.assert_allclose(column, getattr(result, name), rtol=1e-8, err_msg=name)
+    x, y = (np.array([float(row[name]) for row in rows[:NODES]]) for name in ("x", "y"))
+    np.testing.assert_allclose(np.stack([x, y], axis=1), result.nodes, rtol=1e-8)
+    assert [row["status"] for row in rows[::NODES]] == ["0", "1", "0"]
+    assert {(row["u"] == "") == (row["node_status"] == "1") for row in rows} == {True}
+
+
+@pytest.mark.parametrize("to", EXPORT_FORMATS)
+def test_existing_file_is_kept_unless_overwriting_is_allowed(result: Result, tmp_path: Path, to: str) -> None:
+    out = tmp_path / "fields"
+    out.write_text("mine")
+    with pytest.raises(ResultError, match="already exists"):
+        export_result(result, to, out)
+    assert out.read_text() == "mine"
+    export_result(result, to, out, overwrite=True)
+    assert out.stat().st_size > 1000
+
+
+def test_what_cannot_be_exported_leaves_nothing(result: Result, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match='"xls"; allowed are npz, csv'):
+        export_result(result, "xls", tmp_path / "a")
+    with pytest.raises(ResultError, match="no folder"):
+        export_result(result, "npz", tmp_path / "none" / "a")
+    with pytest.raises(ResultError, match="already exists"):
+        export_result(result, "npz", tmp_path, overwrite=True)
+    (result.path / "solution" / "frame_000002.npz").write_bytes(b"PK")
+    for to in EXPORT_FORMATS:
+        with pytest.raises(ResultError, match="damaged"):
+            export_result(Result.open(result.path), to, tmp_path / "b")
+    assert [file.name for file in tmp_path.iterdir()] == ["result"]

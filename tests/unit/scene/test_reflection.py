@@ -1,0 +1,109 @@
+"""Where lights reflect: mirror law, rough-surface lobe, height maps, binary weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rgbmidic.errors import InputError
+from rgbmidic.lab.study.goniometry import Lobe
+from rgbmidic.lab.virtual import Camera, Sphere
+from rgbmidic.lab.virtual.scenes import plate_scene, sphere_scene
+from rgbmidic.scene.projection import material_points, placed
+from rgbmidic.scene.reflection import Reflectance, angle_weights, reflection, surface_from_heights
+
+PAINT = Reflectance(diffuse=0.5, specular=0.7, width_deg=6.0)
+POINT, NORMAL = np.array([0.0, 0.0, 600.0]), np.array([0.0, 0.0, -1.0])
+
+
+def lamp_at(angle_deg: float, distance: float = 500.0) -> list[float]:
+    """A lamp seen from the point under an angle from its normal, which looks at the camera."""
+    a = np.radians(angle_deg)
+    return [distance * np.sin(a), 0.0, 600 - distance * np.cos(a)]
+
+
+def test_a_lamp_in_the_mirror_direction_does_not_deviate():
+    scene = plate_scene(tilt_deg=(8.0, -3.0))
+    points, normals = placed(scene, np.zeros((3, 1)))
+    found = reflection(points, normals, [scene.mirror_position(450.0)])
+    np.testing.assert_allclose(found.deviation_deg, 0, atol=1e-5)
+    np.testing.assert_allclose(found.slopes, 0, atol=1e-7)
+
+
+def test_the_light_turns_twice_as_far_as_the_half_way_vector():
+    angles = np.array([4.0, 15.0, 40.0])
+    found = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(angle) for angle in angles])
+    np.testing.assert_allclose(found.deviation_deg[:, 0], angles, atol=1e-9)
+    half = np.degrees(np.arctan(np.linalg.norm(found.slopes[:, :, 0], axis=1)))
+    np.testing.assert_allclose(half, angles / 2, atol=1e-9)
+
+
+def test_a_measured_lobe_is_met_again():
+    lobe = Lobe(diffuse=0.5, specular=0.7, centre_deg=0.0, width_deg=11.0, std=(0, 0, 0, 0))
+    paint = Reflectance.from_goniometry(diffuse=lobe.diffuse, specular=lobe.specular, width_deg=lobe.width_deg)
+    angles = np.linspace(-40, 40, 17)
+    found = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(angle) for angle in angles])
+    level = (found.diffuse(paint) + found.specular(paint))[:, 0]
+    # the tangent of the half angle instead of the angle, and 1/(v.h)
+    np.testing.assert_allclose(level, lobe(angles), rtol=0.015)
+
+
+def test_the_share_is_that_of_the_peak_in_the_mirror_direction_and_falls_to_nothing():
+    share = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(0.1), lamp_at(60.0)]).share(PAINT)[:, 0]
+    assert share[0] == pytest.approx(0.7 / 1.2, rel=1e-3)
+    assert share[1] < 1e-4
+
+
+def test_what_faces_away_is_not_seen():
+    behind = reflection(POINT[:, None], NORMAL[:, None], [[0.0, 0.0, 900.0], lamp_at(20.0)])
+    assert np.isnan(behind.deviation_deg[0]).all()
+    assert np.isfinite(behind.deviation_deg[1]).all()
+    turned = reflection(POINT[:, None], -NORMAL[:, None], [lamp_at(20.0)])
+    assert np.isnan(turned.share(PAINT)).all()
+    np.testing.assert_array_equal(angle_weights(turned.deviation_deg), 0)
+
+
+def test_binary_weights_exclude_up_to_the_limit():
+    weights = angle_weights(np.array([0.0, 14.9, 15.1, 90.0, np.nan]), 15.0)
+    np.testing.assert_array_equal(weights, [0, 0, 1, 1, 0])
+    assert weights.dtype == np.float32
+
+
+def test_a_height_map_of_a_sphere_reflects_like_the_sphere():
+    scene = sphere_scene(size=96)
+    scene = replace(scene, camera=replace(scene.camera, focal_px=2000.0))
+    points, normals = placed(scene, material_points(scene))
+    front = scene.body.front[2]
+    from_map = surface_from_heights(front - points[2], distance=front, focal_px=2000.0, centre=scene.camera.centre)
+    np.testing.assert_allclose(from_map[0], points, atol=1e-9)
+    lamps = [light.position for light in scene.lights]
+    inner = np.s_[:, 2:-2, 2:-2]
+    exact, mapped = (reflection(*surface, lamps).deviation_deg[inner] for surface in ((points, normals), from_map))
+    np.testing.assert_allclose(mapped, exact, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Reflectance(diffuse=0.0, specular=1.0, width_deg=5.0), "positive diffuse"),
+        (lambda: reflection(np.zeros((2, 4)), np.zeros((2, 4)), [[0, 0, 0]]), r"shape \(3, ...\)"),
+        (lambda: reflection(np.zeros((3, 4)), np.zeros((3, 4)), [0, 0, 0]), r"lamps \(k, 3\)"),
+        (lambda: angle_weights(np.zeros(2), 0.0), "limit angle"),
+        (lambda: surface_from_heights(np.zeros(5), distance=1, focal_px=1, centre=(0, 0)), "one image"),
+        (lambda: surface_from_heights(np.ones((3, 3)), distance=1, focal_px=1, centre=(0, 0)), "below the distance"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(call, message):
+    with pytest.raises(InputError, match=message):
+        call()
+
+
+def test_the_camera_is_where_the_scene_has_it():
+    # points of `placed` are in camera axes: the front point projects on the principal point
+    scene = sphere_scene(size=64)
+    points, _ = placed(scene, np.array([[0.0], [0.0], [-Sphere().radius]]))
+    camera: Camera = scene.camera
+    x = camera.focal_px * points[0] / points[2] + camera.centre[0]
+    np.testing.assert_allclose(x, camera.centre[0], atol=1e-9)

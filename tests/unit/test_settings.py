@@ -1,0 +1,238 @@
+"""Settings of a test: what is read, what is refused and with which words."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rgbmidic.errors import ConfigurationError
+from rgbmidic.settings import (
+    BAYER_PATTERNS,
+    FrameSettings,
+    IlluminationSettings,
+    RegionSettings,
+    ScaleSettings,
+    SolverSettings,
+    TestSettings,
+    WeightSettings,
+    read_test,
+)
+
+LEAST = """
+[frames]
+path = "frames/*.dng"
+[region]
+rectangle = [10, 20, 110, 220]
+"""
+
+FULL = """
+[frames]
+path = "frames/*.tif"
+kind = "bayer"
+cfa = "GRBG"
+black_level = 64
+white_level = 4095
+reference = [0, 1, 2]
+[calibration]
+file = "calibration.json"
+[region]
+polygon = [[0, 0], [100, 0], [50, 80.5]]
+[mesh]
+element_size = 20
+[weights]
+threshold = 0.5
+blur = 3
+[solver]
+prefilter = "gaussian"
+rigid = "translation"
+search_radius = 10
+tolerance = 1e-4
+max_iterations = 30
+[scale]
+mm_per_pixel = 0.055
+frame_rate = 12000
+"""
+
+
+def _read(tmp_path: Path, text: str) -> TestSettings:
+    path = tmp_path / "test.toml"
+    path.write_text(text, encoding="utf-8")
+    return read_test(path)
+
+
+def test_least_test_takes_the_defaults(tmp_path: Path) -> None:
+    settings = _read(tmp_path, LEAST)
+    expected = TestSettings(
+        frames=FrameSettings(path=("frames/*.dng",)),
+        region=RegionSettings(rectangle=(10.0, 20.0, 110.0, 220.0)),
+        base=tmp_path.resolve(),
+    )
+    assert settings == expected
+
+
+def test_every_key(tmp_path: Path) -> None:
+    settings = _read(tmp_path, FULL)
+    assert settings.frames == FrameSettings(
+        path=("frames/*.tif",), kind="bayer", cfa="GRBG", black_level=64.0, white_level=4095.0, reference=(0, 1, 2)
+    )
+    assert settings.calibration_file == tmp_path.resolve() / "calibration.json"
+    assert settings.region.polygon == ((0.0, 0.0), (100.0, 0.0), (50.0, 80.5))
+    assert settings.element_size == 20.0
+    assert (settings.weights.threshold, settings.weights.blur) == (0.5, 3.0)
+    assert settings.solver.tolerance == 1e-4
+    assert settings.scale == ScaleSettings(mm_per_pixel=0.055, frame_rate=12000.0)
+
+
+def test_numbers_become_what_the_field_states(tmp_path: Path) -> None:
+    settings = _read(tmp_path, FULL)
+    for section in (settings.frames, settings.weights, settings.solver, settings.scale):
+        for entry in fields(section):
+            value = getattr(section, entry.name)
+            if "float" in str(entry.type) and value is not None:
+                assert type(value) is float, entry.name
+
+
+def test_several_lights_one_after_the_other(tmp_path: Path) -> None:
+    text = LEAST.replace('"frames/*.dng"', '["left/*.tif", "right/*.tif"]\nkind = "monochrome"\nreference = 1')
+    frames = _read(tmp_path, text).frames
+    assert (frames.path, frames.reference) == (("left/*.tif", "right/*.tif"), (1,))
+
+
+def test_the_threshold_is_a_number_or_automatic(tmp_path: Path) -> None:
+    assert _read(tmp_path, LEAST + '[weights]\nthreshold = "auto"').weights.threshold == "auto"
+    assert _read(tmp_path, LEAST + "[weights]\nthreshold = 1").weights.threshold == 1.0
+
+
+def test_geometry_is_relative_to_the_file_and_survives_the_mapping(tmp_path: Path) -> None:
+    text = LEAST + '[weights]\nmethod = "geometry"\ngeometry = "scene.toml"\nheight_map = "h.npy"\nlimit_deg = 15'
+    settings = _read(tmp_path, text)
+    assert settings.weights.geometry == tmp_path.resolve() / "scene.toml"
+    assert settings.weights.height_map == tmp_path.resolve() / "h.npy"
+    assert TestSettings.from_mapping(settings.to_mapping(), settings.base) == settings
+
+
+def test_mask_is_relative_to_the_file(tmp_path: Path) -> None:
+    settings = _read(tmp_path, LEAST.replace("rectangle = [10, 20, 110, 220]", 'mask = "masks/region.png"'))
+    assert settings.region.mask == tmp_path.resolve() / "masks" / "region.png"
+
+
+def test_absolute_path_stays(tmp_path: Path) -> None:
+    settings = _read(tmp_path, LEAST + '[calibration]\nfile = "/data/c.json"')
+    assert settings.calibration_file == Path("/data/c.json")
+
+
+def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
+    assert _read(tmp_path, "\ufeff" + LEAST.strip()).frames.path == ("frames/*.dng",)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (LEAST + "[solver]\ntolerence = 1", r'unknown key "tolerence" in \[solver\] \(did you mean "tolerance"\?\)'),
+        (LEAST + "[solver]\nfoo = 1", r'unknown key "foo" in \[solver\]; allowed are prefilter, rigid'),
+        (LEAST + "[mesh]\nsize = 1", r'unknown key "size" in \[mesh\].*allowed are element_size'),
+        (LEAST + "[weigths]\nblur = 1", r'unknown section "weigths".*did you mean "weights"'),
+        ("top = 1\n" + LEAST, r'unknown section "top"'),
+        ("frames = 1", r"\[frames\] must be a section"),
+        ("[frames]\npath = 'a'", r"\[region\] is missing"),
+        ("[region]\nrectangle = [0, 0, 1, 1]", r"\[frames\] is missing"),
+        (LEAST.replace('path = "frames/*.dng"', ""), r"frames\.path is missing"),
+        (LEAST.replace('"frames/*.dng"', "3"), r"frames\.path must be a text in quotes, not 3"),
+        (LEAST.replace('"frames/*.dng"', '""'), r"frames\.path must name"),
+        (LEAST.replace('"frames/*.dng"', "[]"), r"frames\.path must name"),
+        (LEAST.replace('"frames/*.dng"', '["a", "b"]'), r"2 entries.*monochrome"),
+        (
+            LEAST.replace('dng"', 'dng"\nkind = "color"'),
+            r'kind must be one of "bayer", "rgb", "monochrome", not "color"',
+        ),
+        (LEAST.replace('dng"', 'dng"\nkind = "rgb"'), r"calibration\.file.*rgbmidic-calibrate"),
+        (LEAST.replace('dng"', 'dng"\ncfa = "RGBG"'), r'frames\.cfa must be one of RGGB.*not "RGBG"'),
+        (LEAST.replace('dng"', 'dng"\nblack_level = -1'), r"frames\.black_level must be at least 0, not -1"),
+        (LEAST.replace('dng"', 'dng"\nblack_level = 9\nwhite_level = 9'), r"white_level must be above black_level 9"),
+        (LEAST.replace('dng"', 'dng"\nreference = [-1]'), r"frames\.reference must be at least 0"),
+        (LEAST.replace('dng"', 'dng"\nreference = [0, 0]'), r"reference must name different frames"),
+        (LEAST.replace('dng"', 'dng"\nreference = []'), r"reference must name"),
+        (LEAST.replace('dng"', 'dng"\nshape = [10]'), r"frames\.shape must be 2 values"),
+        (LEAST.replace('dng"', 'dng"\nshape = [10, 0]'), r"frames\.shape must be at least 1"),
+        (LEAST.replace('dng"', 'dng"\ndtype = "float32"'), r'dtype must be one of "uint8", "uint16", ">u2"'),
+        (LEAST + '[weights]\nthreshold = "otto"', r'weights\.threshold must be a number or "auto", not "otto"'),
+        (LEAST + "[weights]\nthreshold = 1.5", r"weights\.threshold must be at most 1"),
+        (LEAST + '[weights]\nmethod = "geometry"', r'weights\.geometry = "SCENE\.toml" go together'),
+        (LEAST + '[weights]\ngeometry = "s.toml"', r"weights\.method.* go together"),
+        (LEAST + "[weights]\nlimit_deg = 15", r"weights\.limit_deg is for weights\.method"),
+        (
+            LEAST + '[weights]\nmethod = "geometry"\ngeometry = "s.toml"\nlimit_deg = 180',
+            r"weights\.limit_deg must be below 180",
+        ),
+        (LEAST + 'mask = "m.png"', r"exactly one of rectangle, polygon, mask; given are 2"),
+        (LEAST.replace("rectangle = [10, 20, 110, 220]", ""), r"exactly one of .*; given are 0"),
+        (LEAST.replace("10, 20, 110", "110, 20, 10"), r"rectangle is \[x0, y0, x1, y1\] with x0 < x1"),
+        (LEAST.replace("rectangle = [10, 20, 110, 220]", "polygon = [[0, 0], [1, 1]]"), r"at least three corners"),
+        (LEAST.replace("10, 20, 110", "10, nan, 110"), r"region\.rectangle must be finite"),
+        (LEAST + "[mesh]\nelement_size = 0", r"mesh\.element_size must be above 0, not 0"),
+        (LEAST + "[mesh]\nelement_size = true", r"mesh\.element_size must be a number, not True"),
+        (LEAST + "[mesh]\nelement_size = '25'", r'mesh\.element_size must be a number, not "25"'),
+        (LEAST + "[weights]\nthreshold = 1.5", r"weights\.threshold must be at most 1, not 1.5"),
+        (LEAST + "[weights]\nmethod = 'magic'", r'weights\.method must be one of .*not "magic"'),
+        (LEAST + "[solver]\nmax_iterations = 5.5", r"solver\.max_iterations must be a whole number, not 5.5"),
+        (LEAST + "[solver]\ncurvature = 1", r"solver\.curvature must be true or false, not 1"),
+        (LEAST + "[solver]\ntolerance = inf", r"solver\.tolerance must be finite"),
+        (LEAST + "[scale]\nmm_per_pixel = 0", r"scale\.mm_per_pixel must be above 0"),
+        (LEAST + "[calibration]\nfile = 1", r"calibration\.file must be a file name in quotes, not 1"),
+        ("[frames\n", r"not a readable settings file \(TOML\)"),
+    ],
+)
+def test_what_is_wrong_is_told_with_file_and_key(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        _read(tmp_path, text)
+    assert str(tmp_path / "test.toml") in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"not found: .*none\.toml"):
+        read_test(tmp_path / "none.toml")
+    with pytest.raises(ConfigurationError, match="not a readable"):
+        read_test(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b'[frames]\npath = "\xe9"')
+    with pytest.raises(ConfigurationError, match="not a readable"):
+        read_test(tmp_path / "latin.toml")
+
+
+_numbers = st.floats(0.5, 1e4)
+_settings = st.builds(
+    TestSettings,
+    frames=st.builds(
+        FrameSettings,
+        path=st.lists(st.text(min_size=1), min_size=1, max_size=3).map(tuple),
+        kind=st.just("monochrome"),
+        cfa=st.none() | st.sampled_from(BAYER_PATTERNS),
+        black_level=st.none() | st.floats(0, 100),
+        white_level=st.none() | st.floats(101, 65535),
+        reference=st.lists(st.integers(0, 99), min_size=1, max_size=4, unique=True).map(tuple),
+        shape=st.none() | st.tuples(st.integers(1, 99), st.integers(1, 99)),
+        dtype=st.none() | st.sampled_from(["uint8", "uint16", ">u2"]),
+    ),
+    region=st.one_of(
+        st.builds(RegionSettings, rectangle=st.tuples(*[st.floats(0, 0.4)] * 2, *[_numbers] * 2)),
+        st.builds(RegionSettings, polygon=st.lists(st.tuples(_numbers, _numbers), min_size=3, max_size=6).map(tuple)),
+        st.builds(RegionSettings, mask=st.just(Path("/data/mask.png"))),
+    ),
+    calibration_file=st.none() | st.just(Path("/data/calibration.json")),
+    element_size=_numbers,
+    illumination=st.builds(IlluminationSettings),
+    weights=st.builds(WeightSettings, threshold=st.floats(0.01, 1), blur=_numbers),
+    solver=st.builds(SolverSettings, prefilter=st.none() | st.just("none"), max_iterations=st.integers(1, 100)),
+    scale=st.builds(ScaleSettings, mm_per_pixel=st.none() | _numbers, frame_rate=st.none() | _numbers),
+    base=st.just(Path("/data")),
+)
+
+
+@given(settings=_settings)
+def test_settings_come_back_from_their_plain_form(settings: TestSettings) -> None:
+    document: dict[str, dict[str, Any]] = settings.to_mapping()
+    assert TestSettings.from_mapping(document, settings.base) == settings
