@@ -151,9 +151,9 @@ def write_raw_test(folder: Path, f: FloatArray, g: FloatArray) -> None:
 def run_file(folder: Path, repeats: int) -> dict[str, Any]:
     """From a raw frame's file to its displacement, step by step; the reference is prepared once before."""
     from rgbmidic import Tri3Mesh, read_test
-    from rgbmidic.correlation import Deformed, Reference, SolveOptions
+    from rgbmidic.correlation import Deformed, Reference, Start, track
     from rgbmidic.frames.series import open_frames
-    from rgbmidic.pipeline import Separator, Start, read_region, texture, track
+    from rgbmidic.pipeline import Separator, read_region, texture
     from rgbmidic.weights.threshold import light_weights
 
     imports = peak_memory()
@@ -181,7 +181,7 @@ def run_file(folder: Path, repeats: int) -> dict[str, Any]:
         lap("normalise, weights")
         deformed = Deformed.prepare(ready, weights, prefilter="binomial")
         lap("prefilter, spline")
-        solution = track(reference, deformed, start, SolveOptions(), search_radius=64.0)
+        solution = track(reference, deformed, start, settings.solver)
         lap("solve, uncertainty")
         return solution
 

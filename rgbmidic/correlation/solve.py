@@ -20,13 +20,11 @@ from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.step import Step, rigid_functions
 from rgbmidic.correlation.uncertainty import exact_std, functional_std
 from rgbmidic.errors import InputError
+from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["BRIGHTNESS", "SolveOptions", "solve"]
+__all__ = ["solve"]
 
-
-BRIGHTNESS = ("none", "global", "local")
-"""Choices of grey-level correction."""
 
 _LONGEST_STEP = 4.0
 """Longest motion of a node in one iteration, px."""
@@ -50,48 +48,13 @@ _SETTLED = 1e-3
 """Share of the weight that may still change for the passes to end."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolveOptions:
-    """How to solve.
-
-    Attributes
-    ----------
-    rigid
-        Rigid functions of the lights after the first: ``"none"``, ``"translation"`` or ``"translation+rotation"``.
-    brightness
-        Grey-level correction: ``"none"``; ``"global"``, a gain and offset per light; ``"local"``, gain and offset as
-        linear shape functions on the mesh (GLC-DIC of the paper, section 2.2).
-    statistics
-        Weight every light by the inverse variance of its own residual around each pixel, robustly.
-    curvature
-        Correct the nodal values for the curvature of the field that linear elements cannot follow. Without it the
-        linear field is the best fit and its nodes are off by what the correction would be, which then is part of
-        their uncertainty.
-    tolerance
-        The iteration stops when no measured node moves by more than this in px.
-    max_iterations
-        Iterations before the frame counts as not converged.
-    """
-
-    rigid: str = "none"
-    brightness: str = "none"
-    statistics: bool = True
-    curvature: bool = False
-    tolerance: float = 1e-3
-    max_iterations: int = 50
-
-    def __post_init__(self) -> None:
-        if self.brightness not in BRIGHTNESS:
-            raise InputError(f"unknown brightness {self.brightness!r}; allowed are {', '.join(BRIGHTNESS)}")
-        if not (self.tolerance > 0 and self.max_iterations >= 1):
-            raise InputError(
-                f"tolerance must be positive and max_iterations at least 1; given are {self.tolerance!r} and "
-                f"{self.max_iterations!r}"
-            )
-
-
 def solve(
-    reference: Reference, deformed: Deformed, initial: FloatArray, options: SolveOptions | None = None
+    reference: Reference,
+    deformed: Deformed,
+    initial: FloatArray,
+    options: SolverSettings,
+    *,
+    statistics: bool = True,
 ) -> Solution:
     """Find the displacement of the reference mesh that brings the deformed images onto the reference ones.
 
@@ -102,7 +65,9 @@ def solve(
     initial : ndarray, shape (N, 2)
         Displacement (u, v) in px to start from, within about half a speckle of the solution.
     options
-        See `SolveOptions`.
+        Rigid functions, grey-level correction, curvature, tolerance and iterations.
+    statistics
+        Weight every light by the inverse variance of its own residual around each pixel, robustly.
 
     Returns
     -------
@@ -124,8 +89,9 @@ def solve(
     run = _Run(
         reference=reference,
         deformed=deformed,
-        options=options or SolveOptions(),
-        functions=rigid_functions(reference.mesh.nodes, (options or SolveOptions()).rigid),
+        options=options,
+        statistics=statistics,
+        functions=rigid_functions(reference.mesh.nodes, options.rigid),
         displacement=initial.copy(),
     )
     return run.passes()
@@ -137,7 +103,8 @@ class _Run:
 
     reference: Reference
     deformed: Deformed
-    options: SolveOptions
+    options: SolverSettings
+    statistics: bool
     functions: FloatArray
     displacement: FloatArray
     rigid: FloatArray = field(init=False)
@@ -198,7 +165,7 @@ class _Run:
         return self._conclude(step)
 
     def _refining(self, number: int) -> bool:
-        refined = self.options.statistics or self.options.brightness != "none"
+        refined = self.statistics or self.options.brightness != "none"
         return refined and number <= self.returned + _REFINED[self.options.brightness]
 
     def _light_displacement(self, light: int) -> FloatArray:
@@ -245,7 +212,7 @@ class _Run:
             return
         if self.options.brightness != "none":
             self.values = comparison.brightness(self.options.brightness)
-        if self.options.statistics:
+        if self.statistics:
             self.factor, self.bend = comparison.precision()
 
     def _iterate(self, step: Step, tolerance: float) -> None:

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Reference, SolveOptions
+from rgbmidic.correlation import Deformed, Reference, Start, track
 from rgbmidic.errors import CalibrationError, ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames.series import open_frames
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import Separator, Start, measure, read_region, texture, track
+from rgbmidic.pipeline import Separator, measure, read_region, texture
 from rgbmidic.results.store import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray
@@ -171,7 +171,7 @@ def _each_light_alone(settings: TestSettings, mesh: Tri3Mesh) -> list[list[Float
         start = Start(displacement=fields[0])
         for stack in stacks[1:]:
             deformed = Deformed.prepare(stack, prefilter="binomial")
-            solution = track(reference, deformed, start, SolveOptions(), search_radius=64.0)
+            solution = track(reference, deformed, start, settings.solver)
             start = start.after(solution)
             fields.append(solution.displacement)
         singles.append(fields)

@@ -48,7 +48,7 @@ class Tri3Mesh:
         object.__setattr__(self, "elements", elements)
 
     @classmethod
-    def from_region(cls, region: Region, element_size: float = 25.0) -> Tri3Mesh:
+    def from_region(cls, region: Region, element_size: float) -> Tri3Mesh:
         """Mesh a region with triangles whose legs are about `element_size` px.
 
         A rectangle gets a regular mesh; other regions a Delaunay mesh that follows their outline and holes.

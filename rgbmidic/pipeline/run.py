@@ -7,7 +7,7 @@ its uncertainty, frame after frame, each kept as it finishes.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation import Deformed, Reference, Solution, SolveOptions, Status, solve
+from rgbmidic.correlation import Deformed, Reference, Start, Status, track
 from rgbmidic.correlation.brightness import brightness_change
-from rgbmidic.correlation.start import coarse_start, refine_start
 from rgbmidic.errors import FrameError, RegionError, RgbmidicError
 from rgbmidic.fields import fill
 from rgbmidic.frames.readers import read_frame, tells_camera
@@ -35,7 +34,7 @@ from rgbmidic.weights.threshold import light_weights
 if TYPE_CHECKING:
     from rgbmidic.weights.geometry import GeometryWeights
 
-__all__ = ["Start", "Weigher", "measure", "read_region", "texture", "track", "with_camera"]
+__all__ = ["Weigher", "measure", "read_region", "texture", "with_camera"]
 
 logger = logging.getLogger(__name__)
 
@@ -145,7 +144,7 @@ class _Prepared:
             region,
             weigher.reference(images),
             mesh=mesh,
-            prefilter=settings.solver.prefilter or "binomial",
+            prefilter=settings.solver.prefilter,
         )
         if not reference.pixel_weights.any():
             names = ", ".join(frames.name(index) for index in settings.frames.reference)
@@ -169,8 +168,8 @@ class _Prepared:
             weights = self.weigher.deformed(images, index)
             deformed = Deformed.prepare(texture(images, settings), weights, prefilter=reference.prefilter)
             start = Start(displacement=np.zeros((nodes, 2))) if settings.frames.reference == (index,) else last
-            radius = settings.solver.search_radius
-            solution = track(reference, deformed, start, _options(settings), search_radius=radius)
+            statistics = settings.weights.method == "statistics"
+            solution = track(reference, deformed, start, settings.solver, statistics=statistics)
             kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
             inputs = frames.hashes(index)
         except RgbmidicError as error:
@@ -198,85 +197,6 @@ def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> No
     for light, gain in zip(lights, brightness[:, 0], strict=True):
         if gain < _DARK:
             logger.warning("%s: %s gives %.0f %% of its light in the reference", name, light, 100 * gain)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Start:
-    """From where a frame starts.
-
-    Attributes
-    ----------
-    displacement : ndarray, shape (N, 2), or None
-        The last frame's displacement in px, gaps filled; None where there is none yet.
-    unmeasured : float
-        Share of the nodes that the last frame could not measure.
-    """
-
-    displacement: FloatArray | None
-    unmeasured: float = 0.0
-
-    def after(self, solution: Solution) -> Start:
-        """The start of the frame after `solution`: gaps get the displacement of the nearest measured node."""
-        from scipy.spatial import cKDTree
-
-        measured = solution.measured
-        if not measured.any():
-            return self
-        nearest = cKDTree(solution.nodes[measured]).query(solution.nodes)[1]
-        filled = np.where(measured[:, None], solution.displacement, solution.displacement[measured][nearest])
-        return Start(displacement=filled, unmeasured=solution.unmeasured_share)
-
-
-_LOSS = 0.01
-"""Share of the nodes whose loss each further start makes acceptable, half of it at the first: a few may really go."""
-
-
-def track(
-    reference: Reference, deformed: Deformed, start: Start, options: SolveOptions, *, search_radius: float
-) -> Solution:
-    """Solve one frame from the last frame's displacement, and from a search where that fails or loses nodes.
-
-    Parameters
-    ----------
-    reference, deformed
-        The two states.
-    start
-        The last frame's end; without a displacement the start is searched.
-    options
-        How to solve.
-    search_radius
-        Largest motion in px that a search looks for.
-    """
-    best: Solution | None = None
-    for number, initial in enumerate(_starts(reference, deformed, start.displacement, search_radius)):
-        trial = solve(reference, deformed, initial, options)
-        if best is None or (trial.status, trial.unmeasured_share) < (best.status, best.unmeasured_share):
-            best = trial
-        if best.status is Status.CONVERGED and best.unmeasured_share <= start.unmeasured + (number + 0.5) * _LOSS:
-            break
-    assert best is not None
-    return best
-
-
-def _starts(
-    reference: Reference, deformed: Deformed, last: FloatArray | None, search_radius: float
-) -> Iterator[FloatArray]:
-    """Displacements to start from, cheapest first, each made only when it is asked for."""
-    if last is not None:
-        yield last
-        yield refine_start(reference, deformed, last)
-    yield coarse_start(reference, deformed, search_radius)
-
-
-def _options(settings: TestSettings) -> SolveOptions:
-    return SolveOptions(
-        rigid=settings.solver.rigid,
-        brightness=settings.solver.brightness,
-        statistics=settings.weights.method == "statistics",
-        curvature=settings.solver.curvature,
-        tolerance=settings.solver.tolerance,
-        max_iterations=settings.solver.max_iterations,
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -352,7 +272,7 @@ def _find_threshold(
             region,
             blur=settings.weights.blur,
             element_size=settings.element_size,
-            prefilter=settings.solver.prefilter or "binomial",
+            prefilter=settings.solver.prefilter,
         )
     except RgbmidicError as error:
         logger.warning('weights.threshold = "auto": %s cannot be used: %s', frames.name(index), error)

@@ -17,6 +17,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields import at_pixels, high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import FloatImage
 from rgbmidic.weights.disturbed_zone import SetUpThreshold, set_up_threshold
 from rgbmidic.weights.threshold import blurred
@@ -35,7 +36,7 @@ def automatic_threshold(
     region: Region,
     *,
     blur: float = 10.0,
-    element_size: float = 25.0,
+    element_size: float = ELEMENT_SIZE,
     prefilter: str = "binomial",
 ) -> SetUpThreshold | None:
     """Threshold from the reference and one deformed state, or None where no light's reflection disturbs.

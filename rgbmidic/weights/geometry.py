@@ -96,7 +96,7 @@ class GeometryWeights:
                 scene,
                 element_size=settings.element_size,
                 demosaic=settings.illumination.demosaic,
-                prefilter=settings.solver.prefilter or "binomial",
+                prefilter=settings.solver.prefilter,
             ),
             surface=surface,
         )

@@ -26,7 +26,14 @@ from rgbmidic.lab.inspection.results import BLIND, ChannelFacts, Inspection, Lig
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_size
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Separator, read_region, with_camera
-from rgbmidic.settings import FrameSettings, IlluminationSettings, RegionSettings, SolverSettings, TestSettings
+from rgbmidic.settings import (
+    ELEMENT_SIZE,
+    FrameSettings,
+    IlluminationSettings,
+    RegionSettings,
+    SolverSettings,
+    TestSettings,
+)
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["inspect_files", "inspect_frame", "state_frames"]
@@ -93,10 +100,10 @@ def inspect_files(
             frames,
             calibration=known,
             region=place,
-            element_size=element_size or (test.element_size if test else 25.0),
+            element_size=element_size or (test.element_size if test else ELEMENT_SIZE),
             demosaic=stated.illumination.demosaic,
             normalise=stated.illumination.normalise,
-            prefilter=stated.solver.prefilter or "binomial",
+            prefilter=stated.solver.prefilter,
             name=" + ".join(path.name for path in paths),
         )
     except InputError as error:
@@ -108,7 +115,7 @@ def inspect_frame(
     *,
     calibration: Calibration | None = None,
     region: Region | Sequence[float] | None = None,
-    element_size: float = 25.0,
+    element_size: float = ELEMENT_SIZE,
     demosaic: str = "auto",
     normalise: float = 10.0,
     prefilter: Prefilter = "binomial",

@@ -156,7 +156,7 @@ def test_shape_functions_are_one_at_their_corner_and_sum_to_one():
 
 def test_gather_and_scatter_are_inverse_on_the_region():
     region = REGIONS["whole image"]
-    pixels = PixelMap.from_mesh(Tri3Mesh.from_region(region), region)
+    pixels = PixelMap.from_mesh(Tri3Mesh.from_region(region, 25), region)
     image = np.random.default_rng(0).normal(size=SHAPE).astype(np.float32)
     np.testing.assert_array_equal(pixels.scatter(pixels.gather(image)), image)
     np.testing.assert_array_equal(pixels.gather(np.stack([image, 2 * image]))[1], 2 * pixels.gather(image))
