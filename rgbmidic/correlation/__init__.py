@@ -1,7 +1,7 @@
 """The MIDIC solve: one displacement field from k weighted image pairs (paper, section 3.2)."""
 
 from rgbmidic.correlation.correlate import correlate
-from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.track import Start, track

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.correlation.images import as_light_stack
-from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import coarse_start

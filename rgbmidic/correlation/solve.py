@@ -3,28 +3,34 @@
 Minimised over the nodal displacement u and, where asked for, the rigid motions beta_j of the lights after the first:
 ``sum_j integral (g_j(x + u + R beta_j) - f_j(x))^2 p_j dx``. A rigid motion is linear in x, so it lies in the TRI3
 space: the light's own nodal displacement is ``u + R beta_j`` and its derivative is the light's Hessian times R.
-The gradient of the reference image stands for that of the deformed one, so the Hessian is constant within a pass;
-between passes the weights are brought back anew, and what does not match is taken out.
+The gradient of the reference image stands for that of the deformed one, so the Hessian is constant within a pass.
+
+One pass after the other: compare the states -> match -> weigh -> equations -> iterate; then conclude. Every step is a
+function from frozen states to a frozen state.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
-from rgbmidic.correlation.comparison import Comparison
-from rgbmidic.correlation.curvature import curvature_correction
-from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.curvature import CurvatureOffset, curvature_offset
+from rgbmidic.correlation.equations import Equations, rigid_functions
+from rgbmidic.correlation.grey_level import corrected_values
+from rgbmidic.correlation.matching import matching_elements, misfit
+from rgbmidic.correlation.node_status import Evidence, judge, lost_elements, one_sided_texture
+from rgbmidic.correlation.precision import Precision, learn_precision
+from rgbmidic.correlation.reference import Deformed, Reference
+from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
-from rgbmidic.correlation.step import Step, rigid_functions
-from rgbmidic.correlation.uncertainty import exact_std, functional_std
+from rgbmidic.correlation.uncertainty.nodal import nodal_std
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["solve"]
-
 
 _LONGEST_STEP = 4.0
 """Longest motion of a node in one iteration, px."""
@@ -35,17 +41,92 @@ _PASSES = 8
 _REFINED = {"none": 1, "global": 1, "local": 4}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _PASS_ITERATIONS = 12
-_LOST = 0.5
-"""Uncertainty (px) from which a node is lost: a position uncertain by half a pixel is not within reach of a match."""
-_MISFIT = 4.0
-"""Residual around a node, over the median, from which it is lost where elements near it do not match."""
-_WANDERING = 0.1
-"""Motion (px) in the last iteration of a pass from which a node is lost."""
+"""Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests)."""
 _PATIENCE = 5
+"""Iterations after which a tenth of the nodes may still move: they wander where nothing matches."""
 _STARTED = 0.25
 """Correlation coefficient at the start under which an element waits until its neighbours have brought it nearer."""
 _SETTLED = 1e-3
 """Share of the weight that may still change for the passes to end."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Problem:
+    """What is solved: two states, the options, and the rigid functions (2 N, m)."""
+
+    reference: Reference
+    deformed: Deformed
+    options: SolverSettings
+    statistics: bool
+    functions: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Estimate:
+    """The motion as far as it is known.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (N, 2)
+        px.
+    rigid : ndarray, shape (k, m)
+        Coefficients of each light's rigid functions.
+    increment : ndarray, shape (N,)
+        Motion of each node in the last iteration, px.
+    history : tuple of float
+        Largest such motion of a textured node in every iteration, px.
+    squares : ndarray, shape (k, 3)
+        Sums of w r^2, of w and of lost pixels before the last iteration.
+    """
+
+    displacement: FloatArray
+    rigid: FloatArray
+    increment: FloatArray
+    history: tuple[float, ...] = ()
+    squares: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Weighting:
+    """What the residual at an estimate says about elements, lights and grey levels.
+
+    Attributes
+    ----------
+    residual
+        At the estimate, with the weights brought back.
+    values : ndarray, shape (k, P), float32
+        Reference grey levels, corrected for brightness.
+    matched : ndarray, shape (E,), bool
+        Elements that take part.
+    precision
+        Of the lights; None: not learnt.
+    returned : int
+        Number of the pass after the last one that brought elements back.
+    """
+
+    residual: Residual
+    values: FloatImage
+    matched: BoolArray
+    precision: Precision | None = None
+    returned: int = 0
+
+    @property
+    def given(self) -> FloatImage:
+        """Pixel weights (k, P) without the precision of the lights."""
+        return self.residual.weights * np.repeat(self.matched, np.diff(self.residual.reference.pixels.offsets))
+
+    @property
+    def weights(self) -> FloatImage:
+        """Pixel weights (k, P) of the next pass."""
+        return self.given if self.precision is None else self.given * self.precision.factor
+
+
+class _UnsolvableError(Exception):
+    """Nothing can be measured: the reason, and how far the iteration came."""
+
+    def __init__(self, reason: str, history: tuple[float, ...] = ()) -> None:
+        super().__init__(reason)
+        self.history = history
 
 
 def solve(
@@ -86,268 +167,271 @@ def solve(
         )
     if initial.shape != reference.mesh.nodes.shape or not np.isfinite(initial).all():
         raise InputError(f"the initial displacement must be finite with shape {reference.mesh.nodes.shape}")
-    run = _Run(
+    problem = _Problem(
         reference=reference,
         deformed=deformed,
         options=options,
         statistics=statistics,
         functions=rigid_functions(reference.mesh.nodes, options.rigid),
-        displacement=initial.copy(),
     )
-    return run.passes()
+    try:
+        return _conclude(problem, *_passes(problem, _started(problem, initial)))
+    except _UnsolvableError as error:
+        return Solution.failed(reference.mesh, len(reference.images), str(error), error.history)
 
 
-@dataclass(slots=True, kw_only=True)
-class _Run:
-    """One solve under way: the two states, and what the passes change."""
+def _started(problem: _Problem, initial: FloatArray) -> _Estimate:
+    lights = len(problem.reference.images)
+    return _Estimate(
+        displacement=initial,
+        rigid=np.zeros((lights, problem.functions.shape[1])),
+        increment=np.zeros(len(initial)),
+        squares=np.zeros((lights, 3)),
+    )
 
-    reference: Reference
-    deformed: Deformed
-    options: SolverSettings
-    statistics: bool
-    functions: FloatArray
-    displacement: FloatArray
-    rigid: FloatArray = field(init=False)
-    values: FloatImage = field(init=False)
-    factor: FloatImage | None = None
-    bend: FloatImage | None = None
-    matched: BoolArray = field(init=False)
-    seen: Comparison = field(init=False)
-    history: list[float] = field(default_factory=list)
-    sums: FloatArray = field(init=False)
-    motion: FloatArray = field(init=False)
-    returned: int = 0
 
-    def __post_init__(self) -> None:
-        lights = len(self.reference.images)
-        self.rigid = np.zeros((lights, self.functions.shape[1]))
-        self.values = self.reference.values
-        self.matched = np.ones(len(self.reference.mesh.elements), dtype=bool)
-        self.sums = np.zeros((lights, 3))
-        self.motion = np.zeros(len(self.displacement))
+def _passes(problem: _Problem, estimate: _Estimate) -> tuple[_Estimate, Equations, _Weighting]:
+    """Passes until the weights have settled."""
+    tolerance = problem.options.tolerance
+    weighting = _first_weighting(problem, estimate)
+    equations: Equations | None = None
+    for number in range(_PASSES):
+        if equations is not None and _settled(weighting, equations) and not _refining(problem, weighting, number):
+            break
+        equations = _equations(problem, weighting, estimate)
+        reached = max(tolerance, _FIRST_PASS) if number == 0 else tolerance
+        estimate = _iterated(problem, equations, weighting.values, estimate, reached)
+        weighting = _next_weighting(problem, weighting, equations, estimate, number)
+    assert equations is not None
+    if estimate.history[-1] > tolerance:
+        estimate = _iterated(problem, equations, weighting.values, estimate, tolerance)
+        weighting = replace(weighting, residual=_compared(problem, weighting.values, estimate))
+    return estimate, equations, weighting
 
-    def passes(self) -> Solution:
-        """Passes until the weights have settled, then the result."""
-        step: Step | None = None
-        tolerance = self.options.tolerance
-        self.seen = self._compare()
-        self.matched = self.seen.matched(_STARTED)
-        if self.options.brightness != "none":
-            self.values = self.seen.brightness("global")
-        for number in range(_PASSES):
-            weights = self._weights()
-            if not weights.any():
-                return self._failed(self._nothing_left())
-            if self.functions.shape[1] and not weights[0].any():
-                return self._failed(
-                    "the first light sees nothing, and the rigid motions of the others are counted from it: "
-                    "put a light first that sees, or measure without rigid motions"
-                )
-            change = np.abs(weights - step.weights).sum() if step is not None else np.inf
-            if step is not None and change <= _SETTLED * weights.sum() and not self._refining(number):
-                break
-            try:
-                step = Step.build(
-                    self.reference, weights, self.functions, None if self.factor is None else self._given()
-                )
-            except RuntimeError as error:  # what SuperLU raises on a matrix that is singular in double precision
-                return self._failed(f"the equations cannot be solved: {error}")
-            if not step.measured.any():
-                return self._failed(self._nothing_left())
-            self._iterate(step, max(tolerance, _FIRST_PASS) if number == 0 else tolerance)
-            if not np.isfinite(self.displacement).all():
-                return self._failed("the iteration diverged")
-            self._learn(number, step)
-        assert step is not None
-        if self.history[-1] > tolerance:
-            self._iterate(step, tolerance)
-            self.seen = self._compare()
-        return self._conclude(step)
 
-    def _refining(self, number: int) -> bool:
-        refined = self.statistics or self.options.brightness != "none"
-        return refined and number <= self.returned + _REFINED[self.options.brightness]
+def _settled(weighting: _Weighting, equations: Equations) -> bool:
+    weights = weighting.weights
+    return bool(np.abs(weights - equations.weights).sum() <= _SETTLED * weights.sum()) and bool(weights.any())
 
-    def _light_displacement(self, light: int) -> FloatArray:
-        return np.asarray(self.displacement + (self.functions @ self.rigid[light]).reshape(-1, 2))
 
-    def _pull_back(self) -> FloatImage:
-        lights = range(len(self.values))
-        return np.stack([self.reference.pull_back(self.deformed, j, self._light_displacement(j)) for j in lights])
+def _refining(problem: _Problem, weighting: _Weighting, number: int) -> bool:
+    """Whether the residual of a pass still changes weights or grey levels."""
+    learns = problem.statistics or problem.options.brightness != "none"
+    return learns and number <= weighting.returned + _REFINED[problem.options.brightness]
 
-    def _weights(self) -> FloatImage:
-        """Pixel weights (k, P) of the next pass: those last brought back, where the images match."""
-        weights = self._given()
-        return weights if self.factor is None else weights * self.factor
 
-    def _given(self) -> FloatImage:
-        """Those weights without the precision of the lights."""
-        return self.seen.weights * np.repeat(self.matched, np.diff(self.reference.pixels.offsets))
+def _light_displacements(problem: _Problem, estimate: _Estimate) -> list[FloatArray]:
+    """Displacement (N, 2) of every light: the common one and its own rigid motion."""
+    return [estimate.displacement + (problem.functions @ rigid).reshape(-1, 2) for rigid in estimate.rigid]
 
-    def _compare(self) -> Comparison:
-        lights = range(len(self.values))
-        return Comparison(
-            reference=self.reference,
-            values=self.values,
-            warped=np.stack([self.reference.warp(self.deformed, j, self._light_displacement(j)) for j in lights]),
-            weights=self._pull_back(),
+
+def _compared(problem: _Problem, values: FloatImage, estimate: _Estimate) -> Residual:
+    return Residual.at(problem.reference, problem.deformed, values, _light_displacements(problem, estimate))
+
+
+def _first_weighting(problem: _Problem, estimate: _Estimate) -> _Weighting:
+    residual = _compared(problem, problem.reference.values, estimate)
+    return _Weighting(
+        residual=residual,
+        values=corrected_values(residual, "none" if problem.options.brightness == "none" else "global"),
+        matched=matching_elements(residual, _STARTED),
+    )
+
+
+def _next_weighting(
+    problem: _Problem, last: _Weighting, equations: Equations, estimate: _Estimate, number: int
+) -> _Weighting:
+    """What the displacement found by pass `number` says about matching, grey levels and precision."""
+    residual = _compared(problem, last.values, estimate)
+    matched = matching_elements(residual)
+    if not matched.all() or estimate.history[-1] > _FIRST_PASS:
+        exhausted = len(estimate.history) >= problem.options.max_iterations
+        motion = np.zeros_like(estimate.increment) if exhausted else estimate.increment
+        std = _std(residual, equations, last.precision, 2)
+        matched &= ~lost_elements(problem.reference.mesh, std, motion)
+    # where elements have come back, what was learnt from their wrong match must be learnt anew, and once more: in
+    # the pass that brings them back the residual is still that of a wrong match
+    returned = number + 1 if (matched & ~last.matched).any() else last.returned
+    weighting = replace(last, residual=residual, matched=matched, returned=returned)
+    if not _refining(problem, weighting, number + 1):
+        return weighting
+    return replace(
+        weighting,
+        values=corrected_values(residual, problem.options.brightness),
+        precision=learn_precision(residual) if problem.statistics else None,
+    )
+
+
+def _equations(problem: _Problem, weighting: _Weighting, estimate: _Estimate) -> Equations:
+    """The equations of the next pass.
+
+    Raises
+    ------
+    _UnsolvableError
+        Nothing is left to be measured.
+    """
+    weights, history = weighting.weights, estimate.history
+    if not weights.any():
+        raise _UnsolvableError(_nothing_left(weighting), history)
+    if problem.functions.shape[1] and not weights[0].any():
+        raise _UnsolvableError(
+            "the first light sees nothing, and the rigid motions of the others are counted from it: "
+            "put a light first that sees, or measure without rigid motions",
+            history,
         )
+    given = None if weighting.precision is None else weighting.given
+    try:
+        equations = Equations.build(problem.reference, weights, problem.functions, given)
+    except RuntimeError as error:  # what SuperLU raises on a matrix that is singular in double precision
+        raise _UnsolvableError(f"the equations cannot be solved: {error}", history) from None
+    if not equations.textured.any():
+        raise _UnsolvableError(_nothing_left(weighting), history)
+    return equations
 
-    def _learn(self, number: int, step: Step) -> None:
-        """What the displacement found says about matching, brightness and precision."""
-        comparison = self.seen = self._compare()
-        before = self.matched
-        self.matched = comparison.matched()
-        if not self.matched.all() or self.history[-1] > _FIRST_PASS:
-            # a node whose own pixels match nothing wanders, though its elements match as a whole
-            lost = self._std(comparison, step, 2).max(axis=1) > _LOST
-            if len(self.history) < self.options.max_iterations:
-                lost |= self.motion > _WANDERING
-            self.matched &= ~lost[self.reference.mesh.elements].any(axis=1)
-        # where elements have come back, what was learnt from their wrong match must be learnt anew, and once more: in
-        # the pass that brings them back the residual is still that of a wrong match
-        if (self.matched & ~before).any():
-            self.returned = number + 1
-        if number >= self.returned + _REFINED[self.options.brightness]:
-            return
-        if self.options.brightness != "none":
-            self.values = comparison.brightness(self.options.brightness)
-        if self.statistics:
-            self.factor, self.bend = comparison.precision()
 
-    def _iterate(self, step: Step, tolerance: float) -> None:
-        """Gauss-Newton iterations with one Hessian until no measured node moves by more than `tolerance` px."""
-        for turn in range(min(_PASS_ITERATIONS, self.options.max_iterations - len(self.history))):
-            right_side, rigid_side = self._right_sides(step)
-            motion, rigid = step.increment(right_side, rigid_side)
-            motion = motion.reshape(-1, 2)
-            length = np.hypot(*motion.T)
-            self.displacement += motion * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
-            self.motion = length
-            longest = float(length[step.measured].max())
-            if rigid.size:
-                shifts = rigid.reshape(self.rigid[1:].shape)
-                self.rigid[1:] += shifts
-                longest = max(longest, float(np.abs(self.functions @ shifts.T).max()))
-            self.history.append(longest)
-            if not np.isfinite(longest) or longest <= tolerance:
-                return
-            # a few nodes that wander where nothing matches must not keep the others waiting
-            if turn >= _PATIENCE and np.quantile(length[step.measured], 0.9) <= tolerance:
-                return
+def _nothing_left(weighting: _Weighting) -> str:
+    if not weighting.matched.all():
+        return "the images do not match anywhere in the region"
+    if not weighting.residual.weights.any():
+        return "no light sees the region: every weight is zero"
+    return "the images have no texture in the region"
 
-    def _right_sides(self, step: Step) -> tuple[FloatArray, FloatArray]:
-        """Right-hand sides of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
-        total = -(step.smoothness @ self.displacement.ravel())
-        rigid = []
-        for light, (values, weight) in enumerate(zip(self.values, step.weights, strict=True)):
-            displacement = self._light_displacement(light)
-            vector, self.sums[light] = self.reference.right_side(self.deformed, light, values, weight, displacement)
-            total += vector
-            if light:
-                rigid.append(self.functions.T @ vector)
-        return total, np.concatenate(rigid) if rigid else np.empty(0)
 
-    def _conclude(self, step: Step) -> Solution:
-        elements = self.reference.mesh.elements
-        displacement = self.displacement
-        bent = curvature_correction(self.reference, step, displacement)
-        std, strain_std = np.split(self._std(self.seen.without(bent.deviation), step, 5), [2], axis=1)
-        beside_mismatch = np.zeros(len(std), dtype=bool)
-        beside_mismatch[elements[~self.matched]] = True
-        misfit = self.seen.misfit(step.weights, step.measured)
-        lost = step.measured & ((std.max(axis=1) > _LOST) | (self._beside(beside_mismatch) & (misfit > _MISFIT)))
-        measured = step.measured & ~lost & ~step.blind(self.seen.noise_hessian)
-        if not measured.any():
-            return self._failed(
-                "the texture runs in one direction only: what lies along it cannot be measured"
-                if (step.measured & ~lost).any()
-                else "the images do not match anywhere in the region"
-            )
-        decorrelated = lost | (beside_mismatch & ~measured)
-        node_status = np.where(measured, NodeStatus.MEASURED, NodeStatus.NOT_SEEN).astype(np.uint8)
-        node_status[decorrelated] = NodeStatus.DECORRELATED
-        if self.options.curvature:
-            displacement = displacement - bent.displacement
-        else:
-            std, strain_std = np.hypot(std, bent.displacement), np.hypot(strain_std, bent.strain)
-        strain = self.reference.strain(displacement)
-        if self.options.curvature:
-            strain = strain - bent.one_sided
-        inner = measured & ~self._beside(~measured)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            residual = np.sqrt(self.sums[:, 0] / self.sums[:, 1])
-        last = float(self.motion[measured].max())
-        converged = last <= self.options.tolerance
-        return Solution(
-            nodes=self.reference.mesh.nodes,
-            elements=elements,
-            displacement=np.where(measured[:, None], displacement, np.nan),
-            displacement_std=np.where(measured[:, None], std, np.nan),
-            strain=np.where(inner[:, None], strain, np.nan),
-            strain_std=np.where(inner[:, None], strain_std, np.nan),
-            node_status=node_status,
-            light_share=step.light_share,
-            misfit=np.where(measured, misfit, np.nan),
-            status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
-            reason="" if converged else f"the last iteration still moved a node by {last:.3g} px",
-            rigid=self.rigid,
-            residual=residual,
-            weight_share=_shares(step.weights),
-            history=np.array(self.history),
+def _iterated(
+    problem: _Problem, equations: Equations, values: FloatImage, estimate: _Estimate, tolerance: float
+) -> _Estimate:
+    """Gauss-Newton iterations with one Hessian until no textured node moves by more than `tolerance` px."""
+    for turn in range(min(_PASS_ITERATIONS, problem.options.max_iterations - len(estimate.history))):
+        estimate = _stepped(problem, equations, values, estimate)
+        longest = estimate.history[-1]
+        if not np.isfinite(estimate.displacement).all():
+            raise _UnsolvableError("the iteration diverged", estimate.history)
+        # a few nodes that wander where nothing matches must not keep the others waiting
+        most = turn >= _PATIENCE and np.quantile(estimate.increment[equations.textured], 0.9) <= tolerance
+        if longest <= tolerance or most:
+            break
+    return estimate
+
+
+def _stepped(problem: _Problem, equations: Equations, values: FloatImage, estimate: _Estimate) -> _Estimate:
+    """One Gauss-Newton iteration."""
+    right_side, rigid_side, squares = _right_sides(problem, equations, values, estimate)
+    motion, shifts = equations.increment(right_side, rigid_side)
+    motion = motion.reshape(-1, 2)
+    length = np.hypot(*motion.T)
+    longest = float(length[equations.textured].max())
+    rigid = estimate.rigid.copy()
+    if shifts.size:
+        shifts = shifts.reshape(rigid[1:].shape)
+        rigid[1:] += shifts
+        longest = max(longest, float(np.abs(problem.functions @ shifts.T).max()))
+    bounded = motion * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
+    return _Estimate(
+        displacement=estimate.displacement + bounded,
+        rigid=rigid,
+        increment=length,
+        history=(*estimate.history, longest),
+        squares=squares,
+    )
+
+
+def _right_sides(
+    problem: _Problem, equations: Equations, values: FloatImage, estimate: _Estimate
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Right-hand sides of the nodes (2 N,) and of the rigid functions ((k - 1) m,), and each light's sums (k, 3)."""
+    total = -(equations.smoothness @ estimate.displacement.ravel())
+    squares, rigid = np.zeros_like(estimate.squares), []
+    for light, displacement in enumerate(_light_displacements(problem, estimate)):
+        vector, squares[light] = problem.reference.right_side(
+            problem.deformed, light, values[light], equations.weights[light], displacement
         )
+        total += vector
+        if light:
+            rigid.append(problem.functions.T @ vector)
+    return total, np.concatenate(rigid) if rigid else np.empty(0), squares
 
-    def _std(self, comparison: Comparison, step: Step, count: int) -> FloatArray:
-        """Standard uncertainty (N, count) of the first of u, v (px), exx, eyy, exy from the scores."""
-        reference = self.reference
-        scores = reference.equations.matrix(comparison.score_covariance(step.weights, int(step.measured.sum())))
-        std = functional_std(step.solve, scores, reference.probing, reference.functionals[:count], step.measured)
-        if count > 2:
-            near_hole = np.flatnonzero(step.measured & self._beside(self._beside(self._beside(~step.measured))))
-            std[near_hole, 2:] = exact_std(step.solve, scores, reference.functionals[2:count], near_hole)
-        return std * self._robust_loss(step)
 
-    def _robust_loss(self, step: Step) -> float:
-        """Factor on the uncertainty: a robust loss bends less than its weights say."""
-        if self.bend is None:
-            return 1.0
-        total = float(step.weights.sum(dtype=np.float64))
-        return total / max(float((step.weights * self.bend).sum(dtype=np.float64)), 0.1 * total)
+def _std(residual: Residual, equations: Equations, precision: Precision | None, quantities: int) -> FloatArray:
+    """Standard uncertainty (N, quantities) of the first of u, v (px), exx, eyy, exy."""
+    loss = 1.0 if precision is None else precision.robust_loss(equations.weights)
+    return nodal_std(residual, equations, quantities) * loss
 
-    def _beside(self, nodes: BoolArray) -> BoolArray:
-        """Nodes that share an element with one of `nodes`, shape (N,)."""
-        elements = self.reference.mesh.elements
-        beside = np.zeros(len(nodes), dtype=bool)
-        beside[elements[nodes[elements].any(axis=1)]] = True
-        return beside
 
-    def _nothing_left(self) -> str:
-        if not self.matched.all():
-            return "the images do not match anywhere in the region"
-        if not self.seen.weights.any():
-            return "no light sees the region: every weight is zero"
-        return "the images have no texture in the region"
+def _conclude(problem: _Problem, estimate: _Estimate, equations: Equations, weighting: _Weighting) -> Solution:
+    """The solution: what counts, how certain it is, in which unit."""
+    reference, options, mesh = problem.reference, problem.options, problem.reference.mesh
+    offset = curvature_offset(reference, equations, estimate.displacement)
+    std = _std(weighting.residual.without(offset.deviation), equations, weighting.precision, 5)
+    node_status, misfits = _judged(estimate, equations, weighting, std)
+    measured = node_status == NodeStatus.MEASURED
+    displacement, strain, std = _with_curvature(reference, estimate.displacement, std, offset, options.curvature)
+    inner = measured & ~mesh.beside(~measured)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        residual = np.sqrt(estimate.squares[:, 0] / estimate.squares[:, 1])
+    last = float(estimate.increment[measured].max())
+    converged = last <= options.tolerance
+    return Solution(
+        nodes=mesh.nodes,
+        elements=mesh.elements,
+        displacement=np.where(measured[:, None], displacement, np.nan),
+        displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
+        strain=np.where(inner[:, None], strain, np.nan),
+        strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
+        node_status=node_status,
+        light_share=equations.light_share,
+        misfit=np.where(measured, misfits, np.nan),
+        status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
+        reason="" if converged else f"the last iteration still moved a node by {last:.3g} px",
+        rigid=estimate.rigid,
+        residual=residual,
+        weight_share=_shares(equations.weights),
+        history=np.array(estimate.history),
+    )
 
-    def _failed(self, reason: str) -> Solution:
-        lights = len(self.values)
-        nothing = np.full(self.reference.mesh.nodes.shape, np.nan)
-        return Solution(
-            nodes=self.reference.mesh.nodes,
-            elements=self.reference.mesh.elements,
-            displacement=nothing,
-            displacement_std=nothing.copy(),
-            strain=np.full((len(nothing), 3), np.nan),
-            strain_std=np.full((len(nothing), 3), np.nan),
-            node_status=np.full(len(nothing), NodeStatus.NOT_SEEN, dtype=np.uint8),
-            light_share=np.zeros((len(nothing), lights)),
-            misfit=np.full(len(nothing), np.nan),
-            status=Status.FAILED,
-            reason=reason,
-            rigid=self.rigid,
-            residual=np.full(lights, np.nan),
-            weight_share=np.zeros(lights),
-            history=np.array(self.history),
+
+def _judged(
+    estimate: _Estimate, equations: Equations, weighting: _Weighting, std: FloatArray
+) -> tuple[npt.NDArray[np.uint8], FloatArray]:
+    """Status and misfit of every node (N,).
+
+    Raises
+    ------
+    _UnsolvableError
+        No node is measured.
+    """
+    mesh = weighting.residual.reference.mesh
+    mismatched = np.zeros(len(mesh.nodes), dtype=bool)
+    mismatched[mesh.elements[~weighting.matched]] = True
+    misfits = misfit(weighting.residual, equations.weights, equations.textured)
+    evidence = Evidence(
+        textured=equations.textured,
+        one_sided=one_sided_texture(equations, weighting.residual),
+        mismatched=mismatched,
+        near_mismatch=mesh.beside(mismatched),
+        std=std[:, :2],
+        misfit=misfits,
+    )
+    node_status = judge(evidence)
+    if not (node_status == NodeStatus.MEASURED).any():
+        one_sided = (evidence.one_sided & (node_status == NodeStatus.NOT_SEEN)).any()
+        raise _UnsolvableError(
+            "the texture runs in one direction only: what lies along it cannot be measured"
+            if one_sided
+            else "the images do not match anywhere in the region",
+            estimate.history,
         )
+    return node_status, misfits
+
+
+def _with_curvature(
+    reference: Reference, displacement: FloatArray, std: FloatArray, offset: CurvatureOffset, corrected: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Displacement, strain and standard uncertainty (N, 5), the curvature's offset taken off or part of the latter."""
+    if not corrected:
+        whole = np.concatenate([offset.displacement, offset.strain], axis=1)
+        return displacement, reference.strain(displacement), np.hypot(std, whole)
+    displacement = displacement - offset.displacement
+    return displacement, reference.strain(displacement) - offset.one_sided, std
 
 
 def _shares(weights: FloatImage) -> FloatArray:

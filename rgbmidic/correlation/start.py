@@ -13,7 +13,7 @@ import logging
 import cv2
 import numpy as np
 
-from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["coarse_start", "refine_start"]

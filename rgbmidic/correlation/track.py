@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import coarse_start, refine_start

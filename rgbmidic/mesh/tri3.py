@@ -81,6 +81,12 @@ class Tri3Mesh:
         sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
         return np.asarray(sums, dtype=np.float64)
 
+    def beside(self, nodes: BoolArray) -> BoolArray:
+        """Nodes (N,) that share an element with one of `nodes` (N,), these included."""
+        near = np.zeros(len(self.nodes), dtype=bool)
+        near[self.elements[nodes[self.elements].any(axis=1)]] = True
+        return near
+
     def element_gradient(self, values: FloatArray) -> FloatArray:
         """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2)."""
         return np.asarray(np.einsum("eac,ead->ecd", values[self.elements], self.shape_gradients()))

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.correlation import Deformed, Reference, Start, Status, track
-from rgbmidic.correlation.brightness import brightness_change
+from rgbmidic.correlation.light_levels import brightness_change
 from rgbmidic.errors import FrameError, RegionError, RgbmidicError
 from rgbmidic.fields import fill
 from rgbmidic.frames.readers import read_frame, tells_camera

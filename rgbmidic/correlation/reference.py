@@ -9,9 +9,13 @@ import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
 from rgbmidic._kernels.interpolation import sample_with_gradient
+from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
-from rgbmidic.correlation.system import NormalEquations
-from rgbmidic.correlation.uncertainty import Probing, displacement_functionals, strain_functionals
+from rgbmidic.correlation.uncertainty.propagation import (
+    NodeColouring,
+    displacement_functionals,
+    strain_functionals,
+)
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
@@ -50,7 +54,7 @@ class Reference:
 
     Attributes
     ----------
-    mesh, pixels, equations, probing
+    mesh, pixels, assembly, colouring
         TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
     functionals : tuple of csr_matrix, shape (N, 2 N)
         u, v, exx, eyy, exy at the nodes as linear functions of the unknowns.
@@ -63,8 +67,8 @@ class Reference:
 
     mesh: Tri3Mesh
     pixels: PixelMap
-    equations: NormalEquations
-    probing: Probing
+    assembly: Assembly
+    colouring: NodeColouring
     functionals: tuple[sp.csr_matrix, ...]
     images: FloatImage
     weights: FloatImage
@@ -101,8 +105,8 @@ class Reference:
         return cls(
             mesh=mesh,
             pixels=pixels,
-            equations=NormalEquations.from_mesh(mesh),
-            probing=Probing.from_mesh(mesh),
+            assembly=Assembly.from_mesh(mesh),
+            colouring=NodeColouring.from_mesh(mesh),
             functionals=(*displacement_functionals(len(mesh.nodes)), *strain_functionals(mesh)),
             images=ready,
             weights=usable,
@@ -160,7 +164,7 @@ class Reference:
             parts,
             sums,
         )
-        return self.equations.vector(parts), np.asarray(sums.sum(axis=0))
+        return self.assembly.vector(parts), np.asarray(sums.sum(axis=0))
 
     def _geometry(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray, AnyArray, AnyArray]:
         pixels = self.pixels
