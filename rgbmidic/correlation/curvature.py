@@ -50,7 +50,9 @@ class CurvatureOffset:
     deviation: FloatImage
 
 
-def curvature_offset(reference: Reference, equations: Equations, displacement: FloatArray) -> CurvatureOffset:
+def curvature_offset(
+    reference: Reference, equations: Equations, displacement: FloatArray, sound: BoolArray
+) -> CurvatureOffset:
     """Offsets of nodal displacement and strain; 0 where no curvature is known within a few elements.
 
     Parameters
@@ -61,8 +63,10 @@ def curvature_offset(reference: Reference, equations: Equations, displacement: F
         Of the last pass, with its weights and factors.
     displacement : ndarray, shape (N, 2)
         The solution, finite everywhere.
+    sound : ndarray, shape (N,), bool
+        Nodes whose displacement tells a curvature: seen, and not beside elements that do not match.
     """
-    curvature = _curvature(reference, displacement, equations.textured)
+    curvature = _curvature(reference, displacement, sound)
     mesh, pixels = reference.mesh, reference.pixels
     geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
     deviation, carried = np.empty((2, 2, pixels.rows.size), dtype=np.float32)

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 
 from rgbmidic._kernels.grid import block_sums
+from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.scores import displacing_share
-from rgbmidic.typing import BoolArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["Precision", "learn_precision"]
 
@@ -20,6 +21,8 @@ _RANGE = 8.0
 """Standard deviation (px) of the window in which the variance of the residual is estimated."""
 _COARSE = 4
 """Reduction of the grid on which that window is applied."""
+_LEAST_BEND = 0.1
+"""Least bend of the loss around a node, over that of its weights."""
 _TRUST = 0.75
 """Power of the inverse variance that makes the weight: under 1, for the variance is itself uncertain."""
 
@@ -39,10 +42,11 @@ class Precision:
     factor: FloatImage
     bend: FloatImage
 
-    def robust_loss(self, weights: FloatImage) -> float:
-        """Factor on the uncertainty with the solve's `weights` (k, P): a robust loss bends less than they say."""
-        total = float(weights.sum(dtype=np.float64))
-        return total / max(float((weights * self.bend).sum(dtype=np.float64)), 0.1 * total)
+    def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
+        """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less than they say."""
+        parts = weights, weights * self.bend
+        total, bent = (reference.mesh.to_nodes(reference.pixels.by_element(part.sum(axis=0))) for part in parts)
+        return np.divide(total, np.maximum(bent, _LEAST_BEND * total), out=np.ones_like(total), where=total > 0)
 
 
 def learn_precision(residual: Residual) -> Precision:

@@ -11,6 +11,7 @@ from rgbmidic._kernels.correlation import element_hessian, element_right_side, p
 from rgbmidic._kernels.interpolation import sample_with_gradient
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
+from rgbmidic.correlation.uncertainty.blocks import unfitted_share
 from rgbmidic.correlation.uncertainty.propagation import (
     NodeColouring,
     displacement_functionals,
@@ -60,6 +61,8 @@ class Reference:
         u, v, exx, eyy, exy at the nodes as linear functions of the unknowns.
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded.
+    unfitted : float
+        Share of the variance of a block's score that the fit leaves in the residual (`unfitted_share`).
     values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels, with the gradient in grey levels per px.
     prefilter : str
@@ -70,6 +73,7 @@ class Reference:
     assembly: Assembly
     colouring: NodeColouring
     functionals: tuple[sp.csr_matrix, ...]
+    unfitted: float
     images: FloatImage
     weights: FloatImage
     values: FloatImage
@@ -100,14 +104,15 @@ class Reference:
         ready, usable = _prepare(images, weights, prefilter)
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
             usable = usable * usable_pixels(region.mask, prefilter)
-        pixels = PixelMap.from_mesh(mesh, region)
+        pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
         samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
         return cls(
             mesh=mesh,
             pixels=pixels,
-            assembly=Assembly.from_mesh(mesh),
+            assembly=assembly,
             colouring=NodeColouring.from_mesh(mesh),
             functionals=(*displacement_functionals(len(mesh.nodes)), *strain_functionals(mesh)),
+            unfitted=unfitted_share(mesh, pixels, assembly),
             images=ready,
             weights=usable,
             values=samples[0],

@@ -234,7 +234,7 @@ def _first_weighting(problem: _Problem, estimate: _Estimate) -> _Weighting:
     return _Weighting(
         residual=residual,
         values=corrected_values(residual, "none" if problem.options.brightness == "none" else "global"),
-        matched=matching_elements(residual, _STARTED),
+        matched=matching_elements(residual, least=_STARTED),
     )
 
 
@@ -243,7 +243,7 @@ def _next_weighting(
 ) -> _Weighting:
     """What the displacement found by pass `number` says about matching, grey levels and precision."""
     residual = _compared(problem, last.values, estimate)
-    matched = matching_elements(residual)
+    matched = matching_elements(residual, last.precision)
     if not matched.all() or estimate.history[-1] > _FIRST_PASS:
         exhausted = len(estimate.history) >= problem.options.max_iterations
         motion = np.zeros_like(estimate.increment) if exhausted else estimate.increment
@@ -353,16 +353,19 @@ def _right_sides(
 
 def _std(residual: Residual, equations: Equations, precision: Precision | None, quantities: int) -> FloatArray:
     """Standard uncertainty (N, quantities) of the first of u, v (px), exx, eyy, exy."""
-    loss = 1.0 if precision is None else precision.robust_loss(equations.weights)
-    return nodal_std(residual, equations, quantities) * loss
+    std = nodal_std(residual, equations, quantities)
+    return std if precision is None else std * precision.robust_loss(residual.reference, equations.weights)[:, None]
 
 
 def _conclude(problem: _Problem, estimate: _Estimate, equations: Equations, weighting: _Weighting) -> Solution:
     """The solution: what counts, how certain it is, in which unit."""
     reference, options, mesh = problem.reference, problem.options, problem.reference.mesh
-    offset = curvature_offset(reference, equations, estimate.displacement)
+    mismatched = np.zeros(len(mesh.nodes), dtype=bool)
+    mismatched[mesh.elements[~weighting.matched]] = True
+    sound = equations.textured & ~mismatched
+    offset = curvature_offset(reference, equations, estimate.displacement, sound)
     std = _std(weighting.residual.without(offset.deviation), equations, weighting.precision, 5)
-    node_status, misfits = _judged(estimate, equations, weighting, std)
+    node_status, misfits = _judged(estimate, equations, weighting, mismatched, std)
     measured = node_status == NodeStatus.MEASURED
     displacement, strain, std = _with_curvature(reference, estimate.displacement, std, offset, options.curvature)
     inner = measured & ~mesh.beside(~measured)
@@ -390,7 +393,7 @@ def _conclude(problem: _Problem, estimate: _Estimate, equations: Equations, weig
 
 
 def _judged(
-    estimate: _Estimate, equations: Equations, weighting: _Weighting, std: FloatArray
+    estimate: _Estimate, equations: Equations, weighting: _Weighting, mismatched: BoolArray, std: FloatArray
 ) -> tuple[npt.NDArray[np.uint8], FloatArray]:
     """Status and misfit of every node (N,).
 
@@ -399,15 +402,12 @@ def _judged(
     _UnsolvableError
         No node is measured.
     """
-    mesh = weighting.residual.reference.mesh
-    mismatched = np.zeros(len(mesh.nodes), dtype=bool)
-    mismatched[mesh.elements[~weighting.matched]] = True
     misfits = misfit(weighting.residual, equations.weights, equations.textured)
     evidence = Evidence(
         textured=equations.textured,
         one_sided=one_sided_texture(equations, weighting.residual),
         mismatched=mismatched,
-        near_mismatch=mesh.beside(mismatched),
+        near_mismatch=weighting.residual.reference.mesh.beside(mismatched),
         std=std[:, :2],
         misfit=misfits,
     )

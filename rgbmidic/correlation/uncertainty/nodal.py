@@ -6,31 +6,29 @@ import numpy as np
 
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.correlation.uncertainty.propagation import exact_std, functional_std
+from rgbmidic.correlation.uncertainty.propagation import functional_std
 from rgbmidic.correlation.uncertainty.scores import score_covariance
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import FloatArray
 
 __all__ = ["nodal_std"]
-
-_REACH = 3
-"""Elements around a hole over which the columns of the nodes reach across it."""
 
 
 def nodal_std(residual: Residual, equations: Equations, quantities: int) -> FloatArray:
     """Standard uncertainty (N, quantities) of the first of u, v (px), exx, eyy, exy from the scores.
 
     The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs/uncertainty.md).
+    Displacement is told at the textured nodes, strain where all nodes around are textured, too.
     """
     reference, textured = residual.reference, equations.textured
-    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, int(textured.sum())))
-    std = functional_std(equations.solve, covariance, reference.colouring, reference.functionals[:quantities], textured)
-    if quantities > 2:
-        near_hole = np.flatnonzero(textured & _near(residual, ~textured))
-        std[near_hole, 2:] = exact_std(equations.solve, covariance, reference.functionals[2:quantities], near_hole)
-    return std
-
-
-def _near(residual: Residual, nodes: BoolArray) -> BoolArray:
-    for _ in range(_REACH):
-        nodes = residual.reference.mesh.beside(nodes)
-    return nodes
+    inner = textured & ~reference.mesh.beside(~textured)
+    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights))
+    return np.concatenate(
+        [
+            functional_std(equations.solve, covariance, reference.colouring, functionals, nodes)
+            for functionals, nodes in (
+                (reference.functionals[:2], textured),
+                (reference.functionals[2:quantities], inner),
+            )
+        ],
+        axis=1,
+    )

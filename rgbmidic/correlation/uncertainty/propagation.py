@@ -17,11 +17,9 @@ import scipy.sparse as sp
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NodeColouring", "displacement_functionals", "exact_std", "functional_std", "strain_functionals"]
+__all__ = ["NodeColouring", "displacement_functionals", "functional_std", "strain_functionals"]
 
 
-_CHUNK = 256
-"""Columns solved for at once."""
 _RINGS = 4
 """Nodes of one colour are at least this many edges apart."""
 
@@ -75,7 +73,7 @@ def functional_std(
     right_side_covariance: sp.csc_matrix,
     colouring: NodeColouring,
     functionals: Sequence[sp.csr_matrix],
-    measured: BoolArray,
+    nodes: BoolArray,
 ) -> FloatArray:
     """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
 
@@ -89,34 +87,18 @@ def functional_std(
         Of the mesh.
     functionals
         F matrices (N, 2 N); row n of each gives the quantity at node n, and is zero but for n and its neighbours.
-    measured : ndarray, shape (N,), bool
-        Nodes whose uncertainty is asked for; the columns of the others reach far and would spoil those of their colour.
+    nodes : ndarray, shape (N,), bool
+        Nodes whose uncertainty is asked for. The quantity must not touch a node that is hardly seen: such a column
+        reaches far and would spoil those of its colour.
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
-    members = sp.csr_matrix((measured * 1.0, (np.arange(count), colouring.colour)), shape=(count, colours))
+    members = sp.csr_matrix((nodes * 1.0, (np.arange(count), colouring.colour)), shape=(count, colours))
     variance = np.empty((count, len(functionals)))
     for i, functional in enumerate(functionals):
         columns = solve((functional.T @ members).toarray())
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
         variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
     return np.sqrt(np.maximum(variance, 0))
-
-
-def exact_std(
-    solve: Callable[[FloatArray], FloatArray],
-    right_side_covariance: sp.csc_matrix,
-    functionals: Sequence[sp.csr_matrix],
-    nodes: npt.NDArray[np.int64],
-) -> FloatArray:
-    """Standard uncertainty (n, F) as `functional_std`, each of the `nodes` with its own solve: beside a hole the
-    columns reach across it, where probing takes them for another node's."""
-    std = np.empty((len(nodes), len(functionals)))
-    for i, functional in enumerate(functionals):
-        for start in range(0, len(nodes), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            columns = solve(functional[nodes[part]].T.toarray())
-            std[part, i] = np.sqrt(np.maximum((columns * (right_side_covariance @ columns)).sum(axis=0), 0))
-    return std
 
 
 def displacement_functionals(nodes: int) -> list[sp.csr_matrix]:

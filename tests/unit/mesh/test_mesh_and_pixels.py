@@ -212,7 +212,7 @@ def test_too_small_regions_and_elements_are_refused():
     with pytest.raises(InputError, match="at least 4 px"):
         Tri3Mesh.from_region(REGIONS["rectangle"], float("nan"))
     with pytest.raises(RegionError, match="too small"):
-        Tri3Mesh.from_region(Region.from_rectangle((10, 10, 13, 60), SHAPE))
+        Tri3Mesh.from_region(Region.from_rectangle((10, 10, 13, 60), SHAPE), 25)
     line = np.zeros(SHAPE, dtype=bool)
     line[20, 10:60] = True
     with pytest.raises(RegionError, match="too small"):
