@@ -152,13 +152,13 @@ def run_file(folder: Path, repeats: int) -> dict[str, Any]:
     """From a raw frame's file to its displacement, step by step; the reference is prepared once before."""
     from rgbmidic import Tri3Mesh, read_test
     from rgbmidic.correlation import Deformed, Reference, Start, track
-    from rgbmidic.frames.series import open_frames
+    from rgbmidic.frames import open_series
     from rgbmidic.pipeline import Separator, read_region, texture
     from rgbmidic.weights.threshold import light_weights
 
     imports = peak_memory()
     settings = read_test(folder / "TEST.toml")
-    separator, frames = Separator.from_settings(settings), open_frames(settings.frames, settings.base)
+    separator, frames = Separator.from_settings(settings), open_series(settings.frames, settings.base)
     first = separator(frames.read(0))
     region = read_region(settings.region, first.shape)
     mesh = Tri3Mesh.from_region(region, settings.element_size)

@@ -16,7 +16,7 @@ import numpy as np
 from rgbmidic.correlation import Deformed, Reference, Start, track
 from rgbmidic.errors import CalibrationError, ResultError
 from rgbmidic.fields import at_nodes, field_rms
-from rgbmidic.frames.series import open_frames
+from rgbmidic.frames import open_series
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Separator, measure, read_region, texture
 from rgbmidic.results.store import Result
@@ -160,7 +160,7 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
 def _each_light_alone(settings: TestSettings, mesh: Tri3Mesh) -> list[list[FloatArray]]:
     """Displacement (N, 2) of every frame from each light's images alone, with the same solver."""
     separator = Separator.from_settings(settings)
-    frames = open_frames(settings.frames, settings.base)
+    frames = open_series(settings.frames, settings.base)
     images = [texture(separator(frames.read(index)), settings) for index in range(len(frames))]
     region = read_region(settings.region, images[0].shape[1:])
     singles = []

@@ -19,22 +19,20 @@ from rgbmidic.correlation import Deformed, Reference, Start, Status, track
 from rgbmidic.correlation.light_levels import brightness_change
 from rgbmidic.errors import FrameError, RegionError, RgbmidicError
 from rgbmidic.fields import fill
-from rgbmidic.frames.readers import read_frame, tells_camera
-from rgbmidic.frames.series import FrameSequence, list_frames, open_frames
-from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.frames import FrameSeries, open_series, read_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.normalise import normalise
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.separator import Separator, average
 from rgbmidic.results.store import FrameRecord, Result, ResultStore
-from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, WeightSettings
+from rgbmidic.settings import RegionSettings, TestSettings, WeightSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import light_weights
 
 if TYPE_CHECKING:
     from rgbmidic.weights.geometry import GeometryWeights
 
-__all__ = ["Weigher", "measure", "read_region", "texture", "with_camera"]
+__all__ = ["Weigher", "measure", "read_region", "texture"]
 
 logger = logging.getLogger(__name__)
 
@@ -93,21 +91,6 @@ def measure(
     return Result.open(out)
 
 
-def with_camera(frames: FrameSettings, first: Path, calibration: Calibration | None) -> FrameSettings:
-    """Frame settings with pattern and levels of the calibration where neither the file nor the settings tell them.
-
-    `first` is one of the files, which stands for all of them.
-    """
-    if calibration is None or tells_camera(first):
-        return frames
-    return replace(
-        frames,
-        cfa=frames.cfa or (calibration.cfa if frames.kind in (None, "bayer") else None),
-        black_level=calibration.black_level if frames.black_level is None else frames.black_level,
-        white_level=calibration.white_level if frames.white_level is None else frames.white_level,
-    )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Prepared:
     """A test with everything that its frames share.
@@ -121,7 +104,7 @@ class _Prepared:
     """
 
     settings: TestSettings
-    frames: FrameSequence
+    frames: FrameSeries
     separator: Separator
     weigher: Weigher
     images: IlluminationImages
@@ -131,8 +114,7 @@ class _Prepared:
     def from_settings(cls, settings: TestSettings) -> _Prepared:
         """Read calibration, reference frames and region."""
         separator = Separator.from_settings(settings)
-        first = list_frames(settings.frames.path[0], settings.base)[0]
-        frames = open_frames(with_camera(settings.frames, first, separator.calibration), settings.base)
+        frames = open_series(settings.frames, settings.base, separator.calibration)
         states = [frames.read(index) for index in settings.frames.reference]
         separator = separator.with_texture_of(states[0])
         images = average([separator(state) for state in states])
@@ -171,7 +153,7 @@ class _Prepared:
             statistics = settings.weights.method == "statistics"
             solution = track(reference, deformed, start, settings.solver, statistics=statistics)
             kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
-            inputs = frames.hashes(index)
+            inputs = frames.inputs(index)
         except RgbmidicError as error:
             logger.warning("frame %d (%s) failed: %s", index, frames.name(index), error)
             return FrameRecord.failed(str(error), nodes=nodes, lights=lights), last
@@ -226,7 +208,7 @@ class Weigher:
         settings: TestSettings,
         images: IlluminationImages,
         region: Region,
-        frames: FrameSequence,
+        frames: FrameSeries,
         separator: Separator,
     ) -> Weigher:
         """Read the scene that the settings name, or find the automatic threshold, if either is asked for."""
@@ -255,7 +237,7 @@ def _find_threshold(
     settings: TestSettings,
     images: IlluminationImages,
     region: Region,
-    frames: FrameSequence,
+    frames: FrameSeries,
     separator: Separator,
 ) -> float:
     """The automatic threshold from the first deformed frame, else the paper's; says which."""

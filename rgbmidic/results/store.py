@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from rgbmidic import __version__
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.frames.series import file_hash
+from rgbmidic.frames import file_hash
 from rgbmidic.results.record import FrameRecord, read_arrays, read_record, write_complete, write_record
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage

@@ -21,7 +21,7 @@ from rgbmidic.errors import (
     ResultError,
     RgbmidicError,
 )
-from rgbmidic.frames.series import file_hash
+from rgbmidic.frames import file_hash
 from rgbmidic.frames.writers import write_dng, write_tiff
 
 BAYER_RMS = 0.015

@@ -11,8 +11,8 @@ import numpy as np
 
 from rgbmidic.correlation import Solution, correlate
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.frames import open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.readers import read_frame
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import ReflectionAwareDemosaicer
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
@@ -25,7 +25,7 @@ from rgbmidic.lab.inspection.repeat import BayerRepeat, noise_difference
 from rgbmidic.lab.inspection.results import BLIND, ChannelFacts, Inspection, LightFacts, Spread
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_size
 from rgbmidic.mesh import Region
-from rgbmidic.pipeline import Separator, read_region, with_camera
+from rgbmidic.pipeline import Separator, read_region
 from rgbmidic.settings import (
     ELEMENT_SIZE,
     FrameSettings,
@@ -78,19 +78,7 @@ def inspect_files(
     file = calibration or (test.calibration_file if test else None)
     known = None if file is None else Calibration.read(file)
     paths = [Path(one) for one in files]
-    told = with_camera(stated.frames, paths[0], known)
-    frames = tuple(
-        read_frame(
-            path,
-            kind=told.kind,
-            cfa=told.cfa,
-            black_level=told.black_level,
-            white_level=told.white_level,
-            shape=told.shape,
-            dtype=told.dtype,
-        )
-        for path in paths
-    )
+    frames = tuple(open_source(path, stated.frames, known).read(0) for path in paths)
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     place = Region.from_rectangle(region, shape) if region is not None else None
     if place is None and test is not None:
