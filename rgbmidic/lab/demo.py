@@ -19,7 +19,7 @@ from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames.series import open_frames
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Separator, Start, measure, read_region, texture, track
-from rgbmidic.results.store import Result
+from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray
 
