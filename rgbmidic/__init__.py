@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rgbmidic.lab.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import Region, Tri3Mesh
     from rgbmidic.pipeline import measure
-    from rgbmidic.results.store import Result
+    from rgbmidic.results import Result
     from rgbmidic.settings import TestSettings, read_test
 
 __version__ = "0.1.0"
@@ -46,7 +46,7 @@ _HOMES = {
     "Inspection": "rgbmidic.lab.inspection",
     "NodeStatus": "rgbmidic.correlation",
     "Region": "rgbmidic.mesh",
-    "Result": "rgbmidic.results.store",
+    "Result": "rgbmidic.results",
     "RgbmidicError": "rgbmidic.errors",
     "Solution": "rgbmidic.correlation",
     "Status": "rgbmidic.correlation",

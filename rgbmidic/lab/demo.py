@@ -19,7 +19,7 @@ from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Separator, measure, read_region, texture
-from rgbmidic.results.store import Result
+from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray
 

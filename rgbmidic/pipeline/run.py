@@ -24,7 +24,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.normalise import normalise
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.separator import Separator, average
-from rgbmidic.results.store import FrameRecord, Result, ResultStore
+from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.settings import RegionSettings, TestSettings, WeightSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import light_weights

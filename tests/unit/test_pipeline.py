@@ -77,7 +77,6 @@ def test_raw_bayer_frames_give_the_true_displacement(bayer, bayer_result):
 def test_the_result_tells_where_it_comes_from(bayer, bayer_result):
     assert bayer_result.inputs == {str(path): file_hash(path) for path in bayer.frames}
     told = bayer_result.provenance
-    assert told["inputs"] == bayer_result.inputs
     assert told["calibration"]["sha256"] == file_hash(bayer.folder / "calibration.json")
     assert told["settings"]["mesh"]["element_size"] == 25
     assert told["finished"] >= told["created"]
