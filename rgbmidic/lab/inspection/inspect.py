@@ -25,13 +25,11 @@ from rgbmidic.lab.inspection.repeat import BayerRepeat, noise_difference
 from rgbmidic.lab.inspection.results import BLIND, ChannelFacts, Inspection, LightFacts, Spread
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_size
 from rgbmidic.mesh import Region
-from rgbmidic.pipeline import Separator, read_region
+from rgbmidic.pipeline import Separation, read_region
 from rgbmidic.settings import (
     ELEMENT_SIZE,
     FrameSettings,
-    IlluminationSettings,
     RegionSettings,
-    SolverSettings,
     TestSettings,
 )
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -141,7 +139,7 @@ def inspect_frame(
         The region is empty, outside the frame or too small for one element.
     """
     frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
-    seen = _Seen.prepare(frames, calibration, region, demosaic, normalise)
+    seen = _Seen.prepare(frames, calibration, region, demosaic)
     images, index, texture = seen.lights(), None, None
     channels = seen.channel_facts()
     if isinstance(first := seen.linear[0], LinearMosaic):
@@ -212,15 +210,9 @@ def _settings(frames: FrameSettings | None, test: TestSettings | None) -> TestSe
     """The test's settings with other frames, or default ones; their region is not used."""
     if test is not None:
         return replace(test, frames=frames or test.frames)
-    return _plain("auto", 10.0, frames)
-
-
-def _plain(demosaic: str, normalise: float, frames: FrameSettings | None = None) -> TestSettings:
     return TestSettings(
         frames=frames or FrameSettings(path=("frame",)),
         region=RegionSettings(rectangle=(0.0, 0.0, 1.0, 1.0)),
-        illumination=IlluminationSettings(demosaic=demosaic, normalise=normalise),
-        solver=SolverSettings(),
         calibration_file=Path("calibration.json"),
     )
 
@@ -233,7 +225,7 @@ class _Seen:
     linear: list[LinearMosaic | LinearChannels]
     channels: list[Channel]
     region: Region
-    separator: Separator
+    separation: Separation
     crosstalk: Crosstalk
     crosstalk_known: bool
     noise: NoiseModel
@@ -247,7 +239,6 @@ class _Seen:
         calibration: Calibration | None,
         region: Region | Sequence[float] | None,
         demosaic: str,
-        normalise: float,
     ) -> _Seen:
         known = calibration or Calibration()
         linear = [linearise(one, known.noise) for one in frames]
@@ -267,7 +258,7 @@ class _Seen:
             linear=linear,
             channels=channels,
             region=place,
-            separator=Separator(settings=_plain(demosaic, normalise), calibration=replace(known, crosstalk=crosstalk)),
+            separation=Separation(calibration=replace(known, crosstalk=crosstalk), demosaic=demosaic),
             crosstalk=crosstalk,
             crosstalk_known=single or known.crosstalk is not None,
             noise=known.noise or NoiseModel(gain=float("inf"), read_noise=typical),
@@ -277,14 +268,14 @@ class _Seen:
 
     def lights(self) -> IlluminationImages:
         """One image per light, as the test would have them."""
-        return self.separator(self.frames)
+        return self.separation(self.frames)
 
     def differences(self, random: np.random.Generator) -> tuple[FloatImage, FloatImage]:
         """What two states differ by (k, H, W), DN, though nothing has moved; and the part from camera noise."""
         first = self.linear[0]
         if isinstance(first, LinearMosaic):
             model = ReflectionAwareDemosaicer(crosstalk=self.crosstalk).reconstruct(first)
-            method = self.separator.settings.illumination.demosaic
+            method = self.separation.demosaic
             repeat = BayerRepeat(mosaic=first, model=model, crosstalk=self.crosstalk, method=method, noise=self.noise)
             return repeat.draw(random)
         full = [one for one in self.linear if isinstance(one, LinearChannels)]
