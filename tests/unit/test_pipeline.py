@@ -24,7 +24,7 @@ from rgbmidic.errors import (
     ResultError,
     RgbmidicError,
 )
-from rgbmidic.frames import file_hash
+from rgbmidic.frames import FrameSeries, file_hash
 from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.demosaic import reflection_aware
 from rgbmidic.pipeline import Plan, frame, measure_frame, separation
