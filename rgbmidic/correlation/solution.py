@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -91,7 +90,7 @@ class Solution:
     history: FloatArray
 
     @classmethod
-    def failed(cls, mesh: Tri3Mesh, lights: int, reason: str, history: Sequence[float] = ()) -> Solution:
+    def failed(cls, mesh: Tri3Mesh, lights: int, reason: str, history: FloatArray) -> Solution:
         """What is left where nothing can be measured: NaN everywhere, and the reason."""
         count = len(mesh.nodes)
         return cls(
@@ -109,7 +108,7 @@ class Solution:
             rigid=np.zeros((lights, 0)),
             residual=np.full(lights, np.nan),
             weight_share=np.zeros(lights),
-            history=np.array(history, dtype=np.float64),
+            history=history,
         )
 
     @property
