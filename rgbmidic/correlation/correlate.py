@@ -13,7 +13,7 @@ from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.correlation.solve import solve
-from rgbmidic.correlation.start import coarse_start
+from rgbmidic.correlation.track import Start, track
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.normalise import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -87,7 +87,7 @@ def correlate(
     second = Deformed.prepare(g, as_weights(deformed_weights, f.shape, "deformed_weights"), prefilter=solver.prefilter)
     start = initial_displacement(initial, len(mesh.nodes))
     if start is None:
-        start = coarse_start(first, second, solver.search_radius)
+        return track(first, second, Start(displacement=None), solver, statistics=statistics)
     return solve(first, second, start, solver, statistics=statistics)
 
 

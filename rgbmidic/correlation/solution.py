@@ -11,7 +11,10 @@ import numpy.typing as npt
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NodeStatus", "Solution", "Status"]
+__all__ = ["NO_MATCH", "NodeStatus", "Solution", "Status"]
+
+NO_MATCH = "the images do not match anywhere in the region"
+"""Reason of a frame in which nothing was found."""
 
 
 class Status(IntEnum):

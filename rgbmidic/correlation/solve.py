@@ -22,7 +22,7 @@ from rgbmidic.correlation.iteration import Estimate, Problem, UnsolvableError, c
 from rgbmidic.correlation.matching import misfit
 from rgbmidic.correlation.node_status import Evidence, judge, one_sided_texture
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.solution import NodeStatus, Solution, Status
+from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
 from rgbmidic.correlation.weighting import (
     FIRST_PASS,
     Weighting,
@@ -141,7 +141,7 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
 
 def _nothing_left(weighting: Weighting) -> str:
     if not weighting.matched.all():
-        return "the images do not match anywhere in the region"
+        return NO_MATCH
     if not weighting.residual.weights.any():
         return "no light sees the region: every weight is zero"
     return "the images have no texture in the region"
@@ -205,9 +205,7 @@ def _judged(
     if not (node_status == NodeStatus.MEASURED).any():
         one_sided = (evidence.one_sided & (node_status == NodeStatus.NOT_SEEN)).any()
         raise UnsolvableError(
-            "the texture runs in one direction only: what lies along it cannot be measured"
-            if one_sided
-            else "the images do not match anywhere in the region",
+            "the texture runs in one direction only: what lies along it cannot be measured" if one_sided else NO_MATCH,
             estimate,
         )
     return node_status, misfits

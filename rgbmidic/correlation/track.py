@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.solution import Solution, Status
+from rgbmidic.correlation.solution import NO_MATCH, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import coarse_start, refine_start
 from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import FloatArray
 
-__all__ = ["Start", "track"]
+__all__ = ["LARGEST_TURN", "Start", "track"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +43,8 @@ class Start:
         return Start(displacement=filled, unmeasured=solution.unmeasured_share)
 
 
+LARGEST_TURN = 8.0
+"""Turn (degrees) that the search for a start still finds with speckles of 3.5 px; coarser ones allow 12 (measured)."""
 _LOSS = 0.01
 """Share of the nodes whose loss each further start makes acceptable, half of it at the first: a few may really go."""
 
@@ -74,7 +76,17 @@ def track(
         if best.status is Status.CONVERGED and best.unmeasured_share <= start.unmeasured + (number + 0.5) * _LOSS:
             break
     assert best is not None
+    if best.reason == NO_MATCH:
+        return replace(best, reason=f"{NO_MATCH}; {_limits(options)}")
     return best
+
+
+def _limits(options: SolverSettings) -> str:
+    return (
+        f"looked for were motions up to search_radius = {options.search_radius:g} px and turns up to about "
+        f"{LARGEST_TURN:g} degrees, from rest and from the last frame measured: state a larger solver.search_radius, "
+        "or take frames in between"
+    )
 
 
 def _starts(
@@ -84,4 +96,5 @@ def _starts(
     if last is not None:
         yield last
         yield refine_start(reference, deformed, last)
+        yield coarse_start(reference, deformed, search_radius, last)
     yield coarse_start(reference, deformed, search_radius)
