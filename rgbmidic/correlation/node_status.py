@@ -66,18 +66,13 @@ class Rule:
 RULES = (
     Rule(
         status=NodeStatus.DECORRELATED,
-        because="its displacement is uncertain by half a pixel or more",
-        applies=lambda nodes: nodes.textured & (nodes.std.max(axis=1) > LOST),
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="elements near it do not match, and the residual around it is several times the usual one",
-        applies=lambda nodes: nodes.textured & nodes.near_mismatch & (nodes.misfit > _MISFIT),
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
         because="the elements around it do not match, and the others show too little",
         applies=lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured),
+    ),
+    Rule(
+        status=NodeStatus.NOT_SEEN,
+        because="no light sees enough texture around it",
+        applies=lambda nodes: ~nodes.textured,
     ),
     Rule(
         status=NodeStatus.NOT_SEEN,
@@ -85,9 +80,14 @@ RULES = (
         applies=lambda nodes: nodes.one_sided,
     ),
     Rule(
-        status=NodeStatus.NOT_SEEN,
-        because="no light sees enough texture around it",
-        applies=lambda nodes: ~nodes.textured,
+        status=NodeStatus.DECORRELATED,
+        because="its displacement is uncertain by half a pixel or more",
+        applies=lambda nodes: nodes.std.max(axis=1) > LOST,
+    ),
+    Rule(
+        status=NodeStatus.DECORRELATED,
+        because="elements near it do not match, and the residual around it is several times the usual one",
+        applies=lambda nodes: nodes.near_mismatch & (nodes.misfit > _MISFIT),
     ),
 )
 """In this order; a node to which none applies is measured."""
