@@ -11,11 +11,13 @@ from pathlib import Path
 
 from rgbmidic.correlation import Reference
 from rgbmidic.errors import FrameError, RegionError
+from rgbmidic.frames.data import shift_cfa
 from rgbmidic.frames.readers import read_frame, tells_camera
 from rgbmidic.frames.series import FrameSequence, list_frames, open_frames
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.raw_samples import check_texture, exposure_fault
 from rgbmidic.pipeline.separation import Separation, correlated
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.weights import LightWeights, prepare_weights
@@ -35,6 +37,8 @@ class Plan:
         The frames.
     separation
         From a raw frame to one image per light.
+    region
+        What is measured.
     weights
         How much each light counts.
     images
@@ -46,6 +50,7 @@ class Plan:
     settings: TestSettings
     series: FrameSequence
     separation: Separation
+    region: Region
     weights: LightWeights
     images: IlluminationImages
     reference: Reference
@@ -60,10 +65,15 @@ class Plan:
             The settings, the calibration, the region or the reference frames are not usable.
         """
         calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
-        first = list_frames(settings.frames.path[0], settings.base)[0]
-        series = open_frames(with_camera(settings.frames, first, calibration), settings.base)
+        start, *others = settings.frames.reference
+        files = list_frames(settings.frames.path[0], settings.base)
+        series = open_frames(with_camera(settings.frames, files[0], calibration), settings.base)
+        first = series.read(start)
+        if calibration is not None:
+            height, width = first[0].values.shape[-2:]
+            calibration = calibration.cropped(settings.frames.crop_origin, (height, width))
         separation = Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        images, separation = separation.reference(map(series.read, settings.frames.reference))
+        images, separation = separation.reference(first, map(series.read, others))
         region = read_region(settings.region, images.shape)
         mesh = Tri3Mesh.from_region(region, settings.element_size)
         weights = prepare_weights(
@@ -76,15 +86,16 @@ class Plan:
             mesh=mesh,
             prefilter=settings.solver.prefilter,
         )
+        names = ", ".join(map(series.name, settings.frames.reference))
         if not reference.pixel_weights.any():
-            names = ", ".join(map(series.name, settings.frames.reference))
-            raise FrameError(
-                f"no light sees the region in the reference ({names}): it is saturated, dark or excluded by the weights"
-            )
+            fault = exposure_fault(first, region.mask) or "it is saturated, dark or excluded by the weights"
+            raise FrameError(f"no light sees the region in the reference ({names}): {fault}")
+        check_texture(first, region.mask, names)
         return cls(
             settings=settings,
             series=series,
             separation=separation,
+            region=region,
             weights=weights,
             images=images,
             reference=reference,
@@ -98,9 +109,12 @@ def with_camera(frames: FrameSettings, first: Path, calibration: Calibration | N
     """
     if calibration is None or tells_camera(first):
         return frames
+    cfa = calibration.cfa if frames.kind in (None, "bayer") else None
+    if cfa is not None and frames.crop_origin is not None:
+        cfa = shift_cfa(cfa, *frames.crop_origin[::-1])
     return replace(
         frames,
-        cfa=frames.cfa or (calibration.cfa if frames.kind in (None, "bayer") else None),
+        cfa=frames.cfa or cfa,
         black_level=calibration.black_level if frames.black_level is None else frames.black_level,
         white_level=calibration.white_level if frames.white_level is None else frames.white_level,
     )
