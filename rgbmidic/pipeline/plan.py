@@ -18,7 +18,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.raw_samples import check_texture, exposure_fault
-from rgbmidic.pipeline.separation import Separation, correlated
+from rgbmidic.pipeline.separation import RawState, Separation, correlated
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.weights import LightWeights, prepare_weights
 
@@ -86,11 +86,7 @@ class Plan:
             mesh=mesh,
             prefilter=settings.solver.prefilter,
         )
-        names = ", ".join(map(series.name, settings.frames.reference))
-        if not reference.pixel_weights.any():
-            fault = exposure_fault(first, region.mask) or "it is saturated, dark or excluded by the weights"
-            raise FrameError(f"no light sees the region in the reference ({names}): {fault}")
-        check_texture(first, region.mask, names)
+        _check_seen(reference, first, region, ", ".join(map(series.name, settings.frames.reference)))
         return cls(
             settings=settings,
             series=series,
@@ -100,6 +96,14 @@ class Plan:
             images=images,
             reference=reference,
         )
+
+
+def _check_seen(reference: Reference, state: RawState, region: Region, names: str) -> None:
+    """Refuse a reference that no light sees or that shows no texture; `state` is its first."""
+    if not reference.pixel_weights.any():
+        fault = exposure_fault(state, region.mask) or "it is saturated, dark or excluded by the weights"
+        raise FrameError(f"no light sees the region in the reference ({names}): {fault}")
+    check_texture(state, region.mask, names)
 
 
 def with_camera(frames: FrameSettings, first: Path, calibration: Calibration | None) -> FrameSettings:
