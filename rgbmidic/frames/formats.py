@@ -9,7 +9,7 @@ from typing import Literal, NoReturn, Protocol
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, shift_cfa
 from rgbmidic.frames.headerless import HeaderlessFile, is_headerless
 from rgbmidic.frames.png import PngFile
 from rgbmidic.frames.source import FrameSource
@@ -120,11 +120,19 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
     if camera is not None and not source.tells_camera:
         stated = replace(
             stated,
-            cfa=stated.cfa or (camera.cfa if stated.kind in (None, "bayer") else None),
+            cfa=stated.cfa or (_pattern(camera, stated) if stated.kind in (None, "bayer") else None),
             black_level=camera.black_level if stated.black_level is None else stated.black_level,
             white_level=camera.white_level if stated.white_level is None else stated.white_level,
         )
     return source(path=path, stated=stated)
+
+
+def _pattern(camera: Camera, stated: FrameSettings) -> str | None:
+    """The camera's pattern at the first pixel of a frame that is cropped from the camera's."""
+    if camera.cfa is None or stated.crop_origin is None:
+        return camera.cfa
+    column, row = stated.crop_origin
+    return shift_cfa(camera.cfa, row, column)
 
 
 def read_frame(

@@ -7,6 +7,7 @@ brightness of the lights -> record.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from rgbmidic.correlation.light_levels import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.fields import fill
 from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.raw_samples import exposure_fault
 from rgbmidic.pipeline.separation import correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.typing import FloatArray, FloatImage
@@ -64,7 +66,8 @@ def measure_frame(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, St
 
 def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
-    images = plan.separation(plan.series.read(index))
+    state = plan.series.read(index)
+    images = plan.separation(state)
     if images.values.shape != reference.images.shape:
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     weights = plan.weights.deformed(images, index)
@@ -74,6 +77,8 @@ def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
     statistics = settings.weights.method == "statistics"
     solution = track(reference, deformed, start, settings.solver, statistics=statistics)
     if solution.status is Status.FAILED:
+        if fault := exposure_fault(state, plan.region.mask):
+            solution = replace(solution, reason=f"{fault} ({solution.reason})")
         logger.warning("frame %d (%s) cannot be measured: %s", index, name, solution.reason)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)

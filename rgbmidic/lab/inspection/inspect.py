@@ -78,6 +78,7 @@ def inspect_files(
     paths = [Path(one) for one in files]
     frames = tuple(open_source(path, stated.frames, known).read(0) for path in paths)
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
+    known = known and known.cropped(stated.frames.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
     if place is None and test is not None:
         place = read_region(test.region, shape)
