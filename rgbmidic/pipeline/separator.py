@@ -65,7 +65,7 @@ class Separator:
         noise = self.calibration.noise if self.calibration else None
         linear = [linearise(frame, noise) for frame in frames]
         if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
-            return _stack_monochrome([one for one in linear if isinstance(one, LinearChannels)])
+            return IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)])
         if len(linear) > 1:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
         crosstalk = self._crosstalk()
@@ -82,16 +82,6 @@ class Separator:
             what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
             raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
         return self.calibration.crosstalk
-
-
-def _stack_monochrome(series: list[LinearChannels]) -> IlluminationImages:
-    names = ("light",) if len(series) == 1 else tuple(f"light {i + 1}" for i in range(len(series)))
-    return IlluminationImages(
-        values=np.concatenate([one.values for one in series]),
-        valid=np.concatenate([one.valid for one in series]),
-        names=names,
-        full_scale=series[0].full_scale,
-    )
 
 
 def average(images: list[IlluminationImages]) -> IlluminationImages:
@@ -113,5 +103,4 @@ def average(images: list[IlluminationImages]) -> IlluminationImages:
         first,
         values=np.asarray(values, dtype=np.float32),
         valid=np.logical_and.reduce([one.valid for one in images]),
-        covariance=None if first.covariance is None else first.covariance / len(images),
     )

@@ -211,11 +211,10 @@ def _draw_trouble(axis: Axes, seen: Inspection) -> None:
 
 
 def _draw_std(figure: Figure, axis: Axes, bar: Axes, seen: Inspection) -> None:
-    """Predicted uncertainty of u and v, root mean square, linear inside each element."""
+    """Predicted uncertainty of u and v, linear inside each element."""
     from matplotlib.tri import Triangulation
 
-    std = np.sqrt((seen.std**2).mean(axis=1))
-    known = np.isfinite(std)
+    std, known = seen.std, np.isfinite(seen.std)
     axis.set_title("predicted uncertainty")
     axis.set_facecolor("0.85")
     _frame_axis(axis, seen, first=False)

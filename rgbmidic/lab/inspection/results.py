@@ -36,12 +36,11 @@ class Spread:
 
     @classmethod
     def of(cls, std: FloatArray) -> Spread:
-        """Of standard uncertainties (N, 2) of u and v; the root mean square of both at each node."""
-        both = np.sqrt((std**2).mean(axis=1))
-        both = both[np.isfinite(both)]
-        if not both.size:
+        """Of standard uncertainties (N,)."""
+        measured = std[np.isfinite(std)]
+        if not measured.size:
             return cls(median=float("nan"), q95=float("nan"))
-        return cls(median=float(np.median(both)), q95=float(np.quantile(both, 0.95)))
+        return cls(median=float(np.median(measured)), q95=float(np.quantile(measured, 0.95)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,10 +148,10 @@ class Inspection:
     nodes : ndarray, shape (N, 2), float64
         Of the mesh, (x, y) in px.
     elements : ndarray, shape (E, 3), int32
-    std : ndarray, shape (N, 2), float64
-        Predicted standard uncertainty of u and v, px, all lights together, camera noise and separation; NaN where no
-        light sees enough.
-    noise_std, sampling_std : ndarray, shape (N, 2), float64
+    std : ndarray, shape (N,), float64
+        Predicted standard uncertainty of u, and of v, px, all lights together, camera noise and separation; NaN where
+        no light sees enough.
+    noise_std, sampling_std : ndarray, shape (N,), float64
         The parts of it from camera noise, and from what the mosaic did not sample.
     greens : float
         Difference of the means of the two greens of a mosaic over their mean; 0 for other cameras.
@@ -182,7 +181,7 @@ class Inspection:
     @property
     def unmeasured(self) -> float:
         """Share of the nodes that cannot be measured."""
-        return float(np.isnan(self.std).any(axis=1).mean())
+        return float(np.isnan(self.std).mean())
 
     @property
     def findings(self) -> tuple[Finding, ...]:
