@@ -21,6 +21,7 @@ from rgbmidic import __version__
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
 from rgbmidic.results.store import Result
+from rgbmidic.settings import FrameSettings
 
 __all__ = ["app", "main"]
 
@@ -130,7 +131,7 @@ def demo(
 
     started = time.perf_counter()
     with _progress("demo") as progress:
-        rows = run_demo(out, _messages.print, progress)
+        rows = run_demo(out, _messages.print, _calibrate_demo, progress)
     write_figures(Result.open(out / "result"), out / "figures")
     table = Table(title="Displacement error against the exact truth, px (a sphere turning under moving reflections)")
     for heading in ("angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"):
@@ -141,6 +142,15 @@ def demo(
     console = Console(soft_wrap=True)
     console.print(table)
     console.print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")
+
+
+def _calibrate_demo(test: Path) -> None:
+    """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` finds it."""
+    from rgbmidic_calibration.jobs import calibrate_crosstalk
+
+    lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
+    calibration, _ = calibrate_crosstalk(lights, str(test / "dark"), FrameSettings(path=("captures",)))
+    calibration.write(test / "calibration.json")
 
 
 @app.command()
