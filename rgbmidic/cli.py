@@ -209,12 +209,11 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
-    from rgbmidic.lab.inspection import inspect_files, state_frames
-    from rgbmidic.lab.inspection import report as inspection
+    from rgbmidic.lab.inspection import inspect_files, report, state_frames
     from rgbmidic.settings import read_test
 
     if out is not None:
-        inspection.check_folder(out, overwrite=overwrite)
+        report.check_folder(out, overwrite=overwrite)
     settings = None if test is None else read_test(test)
     stated: dict[str, object] = {
         "kind": kind,
@@ -224,7 +223,7 @@ def inspect(
         "dtype": dtype,
     }
     stated["shape"] = tuple(int(one) for one in _numbers(shape, "--shape")) if shape else None
-    seen = inspect_files(
+    inspection = inspect_files(
         frames,
         test=settings,
         calibration=calibration,
@@ -233,14 +232,14 @@ def inspect(
         element_size=element_size,
     )
     if out is not None:
-        inspection.write_inspection(seen, out, overwrite=overwrite)
-    print(f"{seen.name}: {seen.kind}, {seen.region.shape[1]} x {seen.region.shape[0]} px\n")
-    _print_table("samples in the region, shares of the full scale", *inspection.channel_rows(seen))
-    _print_table("lights", *inspection.light_rows(seen))
-    known = "" if seen.noise_known else " (noise estimated, not calibrated)"
-    size = f"elements of {seen.element_size:g} px"
-    _print_table(f"standard uncertainty of u and v to expect{known}, px, {size}", *inspection.uncertainty_rows(seen))
-    for finding in seen.findings:
+        report.write_inspection(inspection, out, overwrite=overwrite)
+    print(f"{inspection.name}: {inspection.kind}, {inspection.region.shape[1]} x {inspection.region.shape[0]} px\n")
+    _print_table("samples in the region, shares of the full scale", *report.channel_rows(inspection))
+    _print_table("lights", *report.light_rows(inspection))
+    known = "" if inspection.noise_known else " (noise estimated, not calibrated)"
+    size = f"elements of {inspection.element_size:g} px"
+    _print_table(f"standard uncertainty of u and v to expect{known}, px, {size}", *report.uncertainty_rows(inspection))
+    for finding in inspection.findings:
         print(f"warning: {finding.text}")
     if out is not None:
         print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")
