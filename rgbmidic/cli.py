@@ -172,12 +172,13 @@ def plan(
     overwrite: Overwrite = False,
 ) -> None:
     """Where each lamp will reflect, what uncertainty to expect, and where the lamps would stand better."""
+    from rgbmidic.lab.output import check_folder
     from rgbmidic.lab.planning import report as planning
     from rgbmidic.lab.planning.lamps import propose_colours, propose_lamps
     from rgbmidic.lab.planning.plan import make_plan
     from rgbmidic.scene.scenefile import read_scene
 
-    planning.check_folder(out, overwrite=overwrite)
+    check_folder(out, planning.FILES, overwrite=overwrite)
     made = make_plan(read_scene(scene))
     proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
     planning.write_plan(made, proposals, out, overwrite=overwrite)
@@ -210,10 +211,11 @@ def inspect(
 ) -> None:
     """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
+    from rgbmidic.lab.output import check_folder
     from rgbmidic.settings import read_test
 
     if out is not None:
-        report.check_folder(out, overwrite=overwrite)
+        check_folder(out, report.FILES, overwrite=overwrite)
     settings = None if test is None else read_test(test)
     stated: dict[str, object] = {
         "kind": kind,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from textwrap import fill
@@ -11,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic import __version__
-from rgbmidic.errors import ResultError
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.lab.inspection import Inspection, Spread
+from rgbmidic.lab.output import check_folder, write_document
 from rgbmidic.report.figures import _STYLE, _finish_picture, _limits, save_figure
 from rgbmidic.typing import AnyArray, BoolArray
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "channel_rows",
-    "check_folder",
+    "FILES",
     "inspection_document",
     "inspection_figure",
     "light_rows",
@@ -32,18 +31,10 @@ __all__ = [
 ]
 
 FILES = ("inspection.json", "inspection.png")
+"""What `write_inspection` writes."""
 _BOX: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "none", "borderpad": 0.3}
 _PICTURE = 700
 """Longest side (px) of an image in the figure."""
-
-
-def check_folder(out: Path, *, overwrite: bool) -> None:
-    """Raise `ResultError` where an inspection would be overwritten."""
-    if out.exists() and not out.is_dir():
-        raise ResultError(f"{out} is a file; state a folder")
-    taken = [name for name in FILES if (out / name).exists()]
-    if taken and not overwrite:
-        raise ResultError(f"{out / taken[0]} is already there; state --overwrite or choose another folder")
 
 
 def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = False) -> None:
@@ -54,13 +45,8 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
     ResultError
         An inspection is already there, or the folder cannot be written.
     """
-    check_folder(out, overwrite=overwrite)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(inspection_document(inspection), indent=2, allow_nan=False)
-        (out / "inspection.json").write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ResultError(f"{out} cannot be written: {error.strerror or error}") from None
+    check_folder(out, FILES, overwrite=overwrite)
+    write_document(inspection_document(inspection), out / "inspection.json")
     save_figure(inspection_figure(inspection), out / "inspection.png")
 
 
