@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "channel_rows",
     "FILES",
+    "channel_rows",
     "inspection_document",
     "inspection_figure",
     "light_rows",

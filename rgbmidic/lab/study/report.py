@@ -39,7 +39,7 @@ def check_folder(out: Path | str, *, overwrite: bool = False) -> Path:
     try:
         if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not overwrite)):
             raise ResultError(
-                f"{out} already exists and is not empty; choose another folder, or overwrite it (overwrite=True, --overwrite)"
+                f"{out} is there and not empty; choose another folder, or overwrite it (overwrite=True, --overwrite)"
             )
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
