@@ -34,7 +34,7 @@ from rgbmidic.illumination.align import align
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.registration import Registration
-from rgbmidic.illumination.separate import separate, separate_reflections
+from rgbmidic.illumination.separate import DEMOSAICERS, separate
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -92,7 +92,7 @@ STUDIES = {
 
 @dataclass(frozen=True)
 class Contender:
-    """A way from the raw frame to the solve."""
+    """A way from the raw frame to the solve; a method that rgbmidic does not have is one of colour-demosaicing."""
 
     name: str
     method: str
@@ -107,15 +107,21 @@ class Contender:
         if isinstance(linear, LinearChannels):
             return unmix(linear, crosstalk)
         assert isinstance(linear, LinearMosaic)
-        return separate(linear, crosstalk, self.method)
+        if self.method in DEMOSAICERS:
+            return separate(linear, crosstalk, self.method)
+        import colour_demosaicing
+
+        demosaicer = getattr(colour_demosaicing, f"demosaicing_CFA_Bayer_{self.method}")
+        values = np.moveaxis(demosaicer(linear.values, linear.cfa), -1, 0)
+        valid = np.broadcast_to(~linear.saturated, values.shape)
+        return unmix(LinearChannels(values=values, valid=valid, full_scale=linear.full_scale), crosstalk)
 
 
 CONTENDERS = [
     Contender("Malvar + masks, no prefilter (the paper)", "malvar", prefilter="none", normalise=None, masks=True),
     Contender("bilinear", "bilinear"),
     Contender("Malvar", "malvar"),
-    Contender("Menon", "menon"),
-    Contender("band-limited", "band-limited"),
+    Contender("Menon", "Menon2007"),
     Contender("normalised mosaic", "normalised"),
     Contender("reflection-aware (default)", "reflection-aware"),
     Contender("ideal 3-CCD", "3-CCD"),
@@ -160,7 +166,7 @@ def painted(scene: Scene, paint: str) -> Scene:
     )
 
 
-def seen_in_colours(scene: Scene, state: State | None, share: float) -> Any:
+def coloured_images(scene: Scene, state: State | None, share: float) -> Any:
     """The lights' images; a `share` of each light's variance comes from a spray of its own."""
     images = render(scene, state)
     if share == 0:
@@ -178,7 +184,7 @@ def rendered(study: str, index: int, paint: str, seed: int, speckle: float) -> t
     """Scene, lights in both states without noise, and truth (2, H, W); rendered once for all contenders."""
     case = STUDIES[study][index]
     scene = painted(case.scene(size=case.size, seed=seed, droplet=speckle * PIXEL, **case.options), paint)
-    images = [seen_in_colours(scene, state, case.coloured) for state in (None, case.state)]
+    images = [coloured_images(scene, state, case.coloured) for state in (None, case.state)]
     # the first light's pixels are the frame of reference
     zoom = 1 + scene.lights[0].magnification
     (x, y), (rows, columns) = scene.camera.centre, scene.camera.shape
@@ -199,11 +205,11 @@ def measured(study: str, index: int, contender: Contender, *, paint: str, seed: 
     """Error of one contender on one case."""
     scene, first, second, exact = rendered(study, index, paint, seed, speckle)
     camera = replace(scene.camera, kind="rgb" if contender.method == "3-CCD" else "bayer")
-    seen = replace(scene, camera=camera)
-    frames = [record(i, camera, seen.lights, seed=1000 * seed + n) for n, i in enumerate((first, second))]
-    found = [contender.lights(frame, seen) for frame in frames]
-    image = (found[0].values - first)[:, 16:-16, 16:-16] / first.mean(axis=(1, 2), keepdims=True)
-    reference, deformed = (registered(images, scene) for images in found)
+    recorded = replace(scene, camera=camera)
+    frames = [record(i, camera, recorded.lights, seed=1000 * seed + n) for n, i in enumerate((first, second))]
+    separated = [contender.lights(frame, recorded) for frame in frames]
+    image = (separated[0].values - first)[:, 16:-16, 16:-16] / first.mean(axis=(1, 2), keepdims=True)
+    reference, deformed = (registered(images, scene) for images in separated)
     size = STUDIES[study][index].size
     margin = (size - 1 - (size - 17) // 25 * 25) // 2
     far = margin + (size - 17) // 25 * 25
@@ -273,7 +279,7 @@ def speed(sizes: tuple[int, ...] = (1024, 2048), repeats: int = 5) -> None:
     small = linearise(frame, patch.camera.noise)
     assert isinstance(small, LinearMosaic)
     crosstalk = patch.camera.true_crosstalk(patch.lights)
-    texture = separate_reflections(small, crosstalk).texture
+    texture = separate(small, crosstalk).texture
     ways: dict[str, Callable[[LinearMosaic], Any]] = {
         "reflection-aware, texture given": lambda mosaic: separate(mosaic, crosstalk, texture=texture),
         "reflection-aware, texture learnt": lambda mosaic: separate(mosaic, crosstalk),
@@ -336,7 +342,7 @@ def main() -> None:
     parser.add_argument("--paint", choices=("smooth", "sparkling"), default="smooth")
     parser.add_argument("--speckles", type=float, nargs="+", default=[4.2])
     parser.add_argument("--plates-only", action="store_true", help="leave the spheres out")
-    parser.add_argument("--methods", nargs="+", help="of DEMOSAICERS; the ideal 3-CCD is always there")
+    parser.add_argument("--methods", nargs="+", help="of CONTENDERS; the ideal 3-CCD is always there")
     parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
     if arguments.study == "speed":

@@ -12,7 +12,7 @@ import numpy as np
 from rgbmidic import correlate
 from rgbmidic.fields import at_nodes
 from rgbmidic.illumination.linearise import LinearMosaic, linearise
-from rgbmidic.illumination.separate import separate, separate_reflections
+from rgbmidic.illumination.separate import DEMOSAICERS, separate
 from rgbmidic.lab.virtual import plate_scene, record, render, strained_plate, truth
 
 scene = plate_scene(size=288, seed=5, gloss=1.5, glare="green", tilt_deg=(-8.6, 0.0))
@@ -29,14 +29,14 @@ for number, state in enumerate((None, moved)):
     assert isinstance(mosaic, LinearMosaic)
     pair.append(mosaic)
 
-found = separate_reflections(pair[0], crosstalk)
-index = np.median(found.reflection_index, axis=(1, 2))
-print(f"speckle {found.texture.diameter:.1f} px; reflection index of", end=" ")
+lights = separate(pair[0], crosstalk)
+index = np.median(lights.reflection_index, axis=(1, 2))
+print(f"speckle {lights.texture.diameter:.1f} px; reflection index of", end=" ")
 print(", ".join(f"{name} {value:.2f}" for name, value in zip(crosstalk.lights, index, strict=True)))
 
 exact, scatter = truth(scene, moved), {}
-for method in ("bilinear", "malvar", "menon", "band-limited", "normalised", "reflection-aware"):
-    reference, deformed = (separate(mosaic, crosstalk, method, texture=found.texture) for mosaic in pair)
+for method in DEMOSAICERS:
+    reference, deformed = (separate(mosaic, crosstalk, method, texture=lights.texture) for mosaic in pair)
     solution = correlate(reference.values, deformed.values, region=(19, 19, 269, 269), normalise=10.0)
     error = solution.displacement - at_nodes(exact, solution.nodes)
     scatter[method] = float(np.nanstd(error - np.nanmean(error, axis=0)))

@@ -20,6 +20,7 @@ from rich.table import Table
 from rgbmidic import __version__
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
+from rgbmidic.settings import FrameSettings
 
 __all__ = ["app", "main"]
 
@@ -129,7 +130,7 @@ def demo(
 
     started = time.perf_counter()
     with _progress("demo") as progress:
-        rows = run_demo(out, _messages.print, progress)
+        rows = run_demo(out, _messages.print, _calibrate_demo, progress)
     write_figures(Result.open(out / "result"), out / "figures")
     table = Table(title="Displacement error against the exact truth, px (a sphere turning under moving reflections)")
     for heading in ("angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"):
@@ -140,6 +141,15 @@ def demo(
     console = Console(soft_wrap=True)
     console.print(table)
     console.print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")
+
+
+def _calibrate_demo(test: Path) -> None:
+    """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` finds it."""
+    from rgbmidic_calibration.jobs import calibrate_crosstalk
+
+    lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
+    calibration, _ = calibrate_crosstalk(lights, str(test / "dark"), FrameSettings(path=("captures",)))
+    calibration.write(test / "calibration.json")
 
 
 @app.command()
@@ -161,12 +171,13 @@ def plan(
     overwrite: Overwrite = False,
 ) -> None:
     """Where each lamp will reflect, what uncertainty to expect, and where the lamps would stand better."""
+    from rgbmidic.lab.output import check_folder
     from rgbmidic.lab.planning import report as planning
     from rgbmidic.lab.planning.lamps import propose_colours, propose_lamps
     from rgbmidic.lab.planning.plan import make_plan
     from rgbmidic.scene.scenefile import read_scene
 
-    planning.check_folder(out, overwrite=overwrite)
+    check_folder(out, planning.FILES, overwrite=overwrite)
     made = make_plan(read_scene(scene))
     proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
     planning.write_plan(made, proposals, out, overwrite=overwrite)
@@ -198,12 +209,12 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
-    from rgbmidic.lab.inspection import inspect_files, state_frames
-    from rgbmidic.lab.inspection import report as inspection
+    from rgbmidic.lab.inspection import inspect_files, report, state_frames
+    from rgbmidic.lab.output import check_folder
     from rgbmidic.settings import read_test
 
     if out is not None:
-        inspection.check_folder(out, overwrite=overwrite)
+        check_folder(out, report.FILES, overwrite=overwrite)
     settings = None if test is None else read_test(test)
     stated: dict[str, object] = {
         "kind": kind,
@@ -213,7 +224,7 @@ def inspect(
         "dtype": dtype,
     }
     stated["shape"] = tuple(int(one) for one in _numbers(shape, "--shape")) if shape else None
-    seen = inspect_files(
+    inspection = inspect_files(
         frames,
         test=settings,
         calibration=calibration,
@@ -222,14 +233,14 @@ def inspect(
         element_size=element_size,
     )
     if out is not None:
-        inspection.write_inspection(seen, out, overwrite=overwrite)
-    print(f"{seen.name}: {seen.kind}, {seen.region.shape[1]} x {seen.region.shape[0]} px\n")
-    _print_table("samples in the region, shares of the full scale", *inspection.channel_rows(seen))
-    _print_table("lights", *inspection.light_rows(seen))
-    known = "" if seen.noise_known else " (noise estimated, not calibrated)"
-    size = f"elements of {seen.element_size:g} px"
-    _print_table(f"standard uncertainty of u and v to expect{known}, px, {size}", *inspection.uncertainty_rows(seen))
-    for finding in seen.findings:
+        report.write_inspection(inspection, out, overwrite=overwrite)
+    print(f"{inspection.name}: {inspection.kind}, {inspection.region.shape[1]} x {inspection.region.shape[0]} px\n")
+    _print_table("samples in the region, shares of the full scale", *report.channel_rows(inspection))
+    _print_table("lights", *report.light_rows(inspection))
+    known = "" if inspection.noise_known else " (noise estimated, not calibrated)"
+    size = f"elements of {inspection.element_size:g} px"
+    _print_table(f"standard uncertainty of u and v to expect{known}, px, {size}", *report.uncertainty_rows(inspection))
+    for finding in inspection.findings:
         print(f"warning: {finding.text}")
     if out is not None:
         print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")

@@ -111,7 +111,7 @@ class IlluminationSettings:
         the grey levels as they are.
     """
 
-    demosaic: str = "auto"
+    demosaic: Literal["auto", "reflection-aware", "malvar", "normalised"] = "auto"
     normalise: float = _bounded(10.0, at_least=0)
 
     def __post_init__(self) -> None:

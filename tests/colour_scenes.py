@@ -1,11 +1,14 @@
 """Quick synthetic colour frames for the demosaicing tests: exact texture, reflections as private sparkle."""
 
 import numpy as np
+from naive_demosaic import colour_by_colour
 from scipy.ndimage import gaussian_filter
 
 from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import LinearMosaic, NoiseModel
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.separate import DEMOSAICERS, separate
+from rgbmidic.illumination.unmix import unmix
 
 A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 CROSSTALK = Crosstalk(matrix=A, lights=("red", "green", "blue"))
@@ -49,6 +52,21 @@ def mosaic_of(lights, *, cfa="RGGB", seed=0, noise=NOISE, full_scale=FULL_SCALE)
         values = values + rng.normal(size=values.shape) * np.sqrt(noise.variance(values))
     values = np.minimum(values, full_scale).astype(np.float32)
     return LinearMosaic(values=values, saturated=values >= full_scale, cfa=cfa, full_scale=full_scale, noise=noise)
+
+
+def separated(mosaic, method):
+    """The lights by one of `DEMOSAICERS`, by a method of colour-demosaicing, or "colour by colour"."""
+    if method in DEMOSAICERS:
+        return separate(mosaic, CROSSTALK, method)
+    if method == "colour by colour":
+        values = colour_by_colour(mosaic.values.astype(float), mosaic.cfa)
+    else:
+        import colour_demosaicing
+
+        channels = getattr(colour_demosaicing, f"demosaicing_CFA_Bayer_{method}")(mosaic.values, mosaic.cfa)
+        values = np.moveaxis(channels, -1, 0)
+    valid = np.ones(values.shape, dtype=bool)
+    return unmix(LinearChannels(values=values, valid=valid, full_scale=mosaic.full_scale), CROSSTALK)
 
 
 def error(images, lights, margin=8):

@@ -8,7 +8,7 @@ of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
 import numpy as np
 from numba import njit, prange
 
-__all__ = ["PAD", "bilinear", "malvar", "pad_mosaic"]
+__all__ = ["PAD", "malvar", "pad_mosaic"]
 
 PAD = 2
 """Pixels added on every side by `pad_mosaic`."""
@@ -34,28 +34,6 @@ def pad_mosaic(values, invalid, out):
             right = _mirror(columns + side, columns)
             out[i, side] = np.nan if invalid[source, left] else values[source, left]
             out[i, columns + PAD + side] = np.nan if invalid[source, right] else values[source, right]
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def bilinear(padded, red_row, red_column, out):
-    """Average of the nearest samples of each channel; fills (3, H, W) `out`."""
-    rows, columns = out.shape[1:]
-    for i in prange(rows):
-        above, here, below = padded[i + 1], padded[i + 2], padded[i + 3]
-        in_red_row = i % 2 == red_row
-        own = 0 if in_red_row else 2
-        own_start = red_column if in_red_row else 1 - red_column
-        own_out, green_out, other_out = out[own, i], out[1, i], out[2 - own, i]
-        for j in range(own_start, columns, 2):
-            c = j + PAD
-            own_out[j] = here[c]
-            green_out[j] = 0.25 * (above[c] + below[c] + here[c - 1] + here[c + 1])
-            other_out[j] = 0.25 * (above[c - 1] + above[c + 1] + below[c - 1] + below[c + 1])
-        for j in range(1 - own_start, columns, 2):
-            c = j + PAD
-            own_out[j] = 0.5 * (here[c - 1] + here[c + 1])
-            green_out[j] = here[c]
-            other_out[j] = 0.5 * (above[c] + below[c])
 
 
 @njit(cache=True, parallel=True, nogil=True)

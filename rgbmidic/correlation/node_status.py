@@ -14,7 +14,7 @@ from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["RULES", "Evidence", "Rule", "judge", "lost_elements", "one_sided_texture"]
+__all__ = ["LOST", "RULES", "Evidence", "Rule", "judge", "lost_elements", "one_sided_texture"]
 
 LOST = 0.5
 """Uncertainty (px) from which a node is lost: a position uncertain by half a pixel is not within reach of a match."""

@@ -11,7 +11,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.typing import FloatArray
 
-__all__ = ["BAYER_PATTERNS", "ChannelFrame", "Mosaic", "cfa_channels", "shift_cfa"]
+__all__ = ["BAYER_PATTERNS", "ChannelFrame", "Mosaic", "cfa_channels", "sampled_channels", "shift_cfa"]
 
 
 def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
@@ -36,6 +36,12 @@ def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
     if name not in BAYER_PATTERNS:
         raise InputError(f"unknown colour filter array {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
     return np.array(["RGB".index(letter) for letter in name], dtype=np.intp).reshape(2, 2)
+
+
+def sampled_channels(cfa: str, shape: tuple[int, ...]) -> npt.NDArray[np.intp]:
+    """Channel index (H, W) that a mosaic of `shape` samples at each pixel."""
+    rows, columns = shape
+    return np.tile(cfa_channels(cfa), (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
 
 
 def shift_cfa(cfa: str, rows: int, columns: int) -> str:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic._kernels import texture as kernels
 from rgbmidic.illumination.linearise import NoiseModel
@@ -25,6 +26,7 @@ __all__ = [
     "ColourFactors",
     "Moments",
     "colour_factors",
+    "enlarged",
     "gather_moments",
     "learn_texture",
     "local_means",
@@ -135,7 +137,15 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     return Moments(mean=mean, contrast=contrast, own=own, shared=shared, greens=greens, noise=variance, red=red)
 
 
+def enlarged(grid: npt.NDArray[np.floating], block: int, shape: tuple[int, ...]) -> FloatImage:
+    """A grid (n, h, w) of blocks interpolated to the pixels (n, H, W) of a frame of `shape` (H, W)."""
+    size = (grid.shape[2] * block, grid.shape[1] * block)
+    whole = [cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) for layer in grid]
+    return np.stack([layer[: shape[0], : shape[1]] for layer in whole])
+
+
 def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
+    """Local mean (3, h, w) of each channel of a mosaic, NaN where not known, on a grid of `MEAN_BLOCK` px."""
     shape = (3, *(-(-side // MEAN_BLOCK) for side in values.shape))
     sums, counts = np.empty(shape), np.empty(shape)
     kernels.block_sums(values, *red, MEAN_BLOCK, sums, counts)

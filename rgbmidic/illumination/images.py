@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.illumination.linearise import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatImage
 
 __all__ = ["REFLECTING", "IlluminationImages"]
 
@@ -31,22 +33,18 @@ class IlluminationImages:
         The lights' names.
     full_scale : float
         Grey level of a just saturated camera sample (DN above black).
-    covariance : ndarray, shape (k, k), float64, or None
-        Covariance of the camera noise of the k values at one pixel (DN squared), at the median grey level of the
-        images; None where the camera noise is not known.
     reflection_index : ndarray, shape (k, H, W), float32, or None
         Share of a light that is not diffuse, from a single frame: 0 where its contrast is that of the light with the
         most contrast there, towards 1 in its reflection; None where the separation does not tell.
     texture : TextureModel or None
-        The speckle's autocorrelation that the separation took, to be shared by all frames of a test; None where it
-        needs none.
+        The speckle's autocorrelation as the separation took it: hand it on to the other frames of a test; None where
+        the separation does not use it.
     """
 
     values: FloatImage
     valid: BoolArray
     names: tuple[str, ...]
     full_scale: float
-    covariance: FloatArray | None = None
     reflection_index: FloatImage | None = None
     texture: TextureModel | None = None
 
@@ -59,6 +57,24 @@ class IlluminationImages:
             raise InputError(f"{len(values)} illumination images cannot carry the {len(self.names)} names {self.names}")
         object.__setattr__(self, "values", np.where(valid, values, np.float32(np.nan)))
         object.__setattr__(self, "valid", valid)
+
+    @classmethod
+    def in_succession(cls, frames: Sequence[LinearChannels]) -> IlluminationImages:
+        """Lights fired one after the other before a monochrome camera, from one frame (1, H, W) of each.
+
+        Raises
+        ------
+        InputError
+            The frames have different shapes.
+        """
+        if len(shapes := {frame.values.shape for frame in frames}) > 1:
+            raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")
+        return cls(
+            values=np.concatenate([frame.values for frame in frames]),
+            valid=np.concatenate([frame.valid for frame in frames]),
+            names=("light",) if len(frames) == 1 else tuple(f"light {i + 1}" for i in range(len(frames))),
+            full_scale=frames[0].full_scale,
+        )
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -69,14 +69,11 @@ class LinearChannels:
         False where a saturated sample took part in the value.
     full_scale : float
         White level minus mean black level (DN).
-    noise : NoiseModel or None
-        Camera noise of one raw sample.
     """
 
     values: FloatImage
     valid: BoolArray
     full_scale: float
-    noise: NoiseModel | None = None
 
 
 def linearise(frame: Mosaic | ChannelFrame, noise: NoiseModel | None = None) -> LinearMosaic | LinearChannels:
@@ -87,13 +84,13 @@ def linearise(frame: Mosaic | ChannelFrame, noise: NoiseModel | None = None) -> 
     frame
         Raw frame; a `Mosaic` gives a `LinearMosaic`, a `ChannelFrame` gives `LinearChannels`.
     noise
-        Camera noise to carry along.
+        Camera noise for a `LinearMosaic` to carry along, whose separation uses it.
     """
     full_scale = frame.white_level - float(frame.black_level.mean())
     saturated = frame.values >= frame.white_level
     if isinstance(frame, ChannelFrame):
         values = frame.values.astype(np.float32) - frame.black_level.astype(np.float32)[:, None, None]
-        return LinearChannels(values=values, valid=~saturated, full_scale=full_scale, noise=noise)
+        return LinearChannels(values=values, valid=~saturated, full_scale=full_scale)
     values = frame.values.astype(np.float32)
     for row in (0, 1):
         for column in (0, 1):

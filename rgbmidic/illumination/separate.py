@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.kriging import TILE
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors
+from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, enlarged
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic import (
-    BandLimitedDemosaicer,
-    BilinearDemosaicer,
     Demosaicer,
     MalvarDemosaicer,
-    MenonDemosaicer,
     NormalisedMosaic,
     Reconstruction,
     ReflectionAwareDemosaicer,
@@ -29,76 +24,14 @@ from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = [
-    "DEFAULT_METHOD",
-    "DEMOSAICERS",
-    "Separated",
-    "Separator",
-    "separate",
-    "separate_reflections",
-]
+__all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "reconstructed_lights", "separate"]
 
-
-Separator = Callable[[LinearMosaic, Crosstalk, TextureModel | None], IlluminationImages]
-"""A method that gives the lights from the mosaic; one that does not model the texture ignores it."""
 
 DEFAULT_METHOD = "reflection-aware"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Separated:
-    """The lights of one frame with what their separation found out.
-
-    Attributes
-    ----------
-    images : IlluminationImages
-        What the solve should correlate, each light divided by its local mean.
-    variance : (k, H, W) float32
-        Variance of the error of the values that comes from what a pixel did not sample, and from noise (DN²).
-    texture : TextureModel
-        The speckle's autocorrelation: hand it on to the other frames of the test.
-    """
-
-    images: IlluminationImages
-    variance: FloatImage
-    texture: TextureModel
-
-    @property
-    def reflection_index(self) -> FloatImage:
-        """That of the images, which this method always tells."""
-        assert self.images.reflection_index is not None
-        return self.images.reflection_index
-
-
-def separate_reflections(
-    mosaic: LinearMosaic, crosstalk: Crosstalk, *, texture: TextureModel | None = None
-) -> Separated:
-    """Lights, reflection index and variance of one raw frame by the reflection-aware method.
-
-    Parameters
-    ----------
-    mosaic
-        The linearised frame, at least 64 x 64 px.
-    crosstalk
-        Which camera channel sees how much of which light, shape (3, k).
-    texture
-        The speckle's autocorrelation, from another frame of the test; None learns it from this one.
-
-    Raises
-    ------
-    InputError
-        The frame is too small, or the crosstalk matrix is not for three camera channels.
-    """
-    _check_channels(crosstalk)
-    found = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture).reconstruct(mosaic)
-    shape = mosaic.values.shape
-    spread = _tiles(found.factors.spread, found.table.index.shape)
-    error = np.moveaxis(found.table.variance[found.table.index], -1, 0) * spread**2
-    return Separated(
-        images=_lights(found, crosstalk),
-        variance=_enlarged(np.tensordot(crosstalk.unmixing**2, error, axes=1), TILE, shape),
-        texture=found.texture,
-    )
+_BY_CHANNEL: dict[str, Demosaicer] = {"malvar": MalvarDemosaicer(), "normalised": NormalisedMosaic()}
+"""Methods that know nothing of lights: demosaic, then unmix."""
+DEMOSAICERS = (DEFAULT_METHOD, *_BY_CHANNEL)
+"""The methods by the name they have in the configuration, where ``"auto"`` means the one that suits the frame."""
 
 
 def separate(
@@ -128,7 +61,17 @@ def separate(
     """
     method = _chosen(method, mosaic)
     _check_channels(crosstalk)
-    return DEMOSAICERS[method](mosaic, crosstalk, texture)
+    if method == DEFAULT_METHOD:
+        demosaicer = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)
+        return reconstructed_lights(demosaicer.reconstruct(mosaic), crosstalk)
+    return unmix(_BY_CHANNEL[method](mosaic), crosstalk)
+
+
+def reconstructed_lights(reconstruction: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:
+    """The lights of a frame, and their reflection index, from what the reflection-aware method made of its channels."""
+    images = unmix(reconstruction.channels, crosstalk)
+    index = _reflection_index(reconstruction.factors, reconstruction.mean, crosstalk)
+    return replace(images, reflection_index=enlarged(index, BLOCK, images.shape), texture=reconstruction.texture)
 
 
 def _chosen(method: str, mosaic: LinearMosaic) -> str:
@@ -136,7 +79,7 @@ def _chosen(method: str, mosaic: LinearMosaic) -> str:
     if method == "auto":
         return DEFAULT_METHOD if min(mosaic.values.shape) >= SMALLEST_FRAME else "malvar"
     if method not in DEMOSAICERS:
-        raise InputError(f"unknown demosaicing method {method!r}; allowed are {', '.join(DEMOSAICERS)}")
+        raise InputError(f"unknown demosaicing method {method!r}; allowed are auto, {', '.join(DEMOSAICERS)}")
     return method
 
 
@@ -147,35 +90,6 @@ def _check_channels(crosstalk: Crosstalk) -> None:
         )
 
 
-def _channelwise(demosaicer: Demosaicer) -> Separator:
-    def separator(mosaic: LinearMosaic, crosstalk: Crosstalk, texture: TextureModel | None) -> IlluminationImages:
-        return unmix(demosaicer(mosaic), crosstalk)
-
-    return separator
-
-
-def _reflection_aware(mosaic: LinearMosaic, crosstalk: Crosstalk, texture: TextureModel | None) -> IlluminationImages:
-    return _lights(ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture).reconstruct(mosaic), crosstalk)
-
-
-DEMOSAICERS: dict[str, Separator] = {
-    "reflection-aware": _reflection_aware,
-    "malvar": _channelwise(MalvarDemosaicer()),
-    "menon": _channelwise(MenonDemosaicer()),
-    "band-limited": _channelwise(BandLimitedDemosaicer()),
-    "normalised": _channelwise(NormalisedMosaic()),
-    "bilinear": _channelwise(BilinearDemosaicer()),
-}
-"""The methods by the name they have in the configuration."""
-
-
-def _lights(found: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:
-    images = unmix(found.channels, crosstalk)
-    index = _enlarged(_reflection_index(found.factors, found.mean, crosstalk), BLOCK, images.shape)
-    noise = None if found.noise is None else crosstalk.unmixing @ found.noise @ crosstalk.unmixing.T
-    return replace(images, covariance=noise, reflection_index=index, texture=found.texture)
-
-
 def _reflection_index(factors: ColourFactors, mean: FloatImage, crosstalk: Crosstalk) -> FloatArray:
     """Index (k, h, w) on the blocks' grid: how much less contrast a light has than the best one."""
     height, width = factors.slope.shape[1:]
@@ -184,17 +98,5 @@ def _reflection_index(factors: ColourFactors, mean: FloatImage, crosstalk: Cross
     light = np.tensordot(crosstalk.unmixing, level, axes=1)
     contrast = np.divide(slope, light, out=np.zeros_like(slope), where=light > 1e-3 * light.max())
     best = contrast.max(axis=0)
-    share = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)
-    return np.asarray(1 - np.clip(share, 0, 1))
-
-
-def _tiles(grid: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    size = (shape[1], shape[0])
-    return np.stack([cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in grid])
-
-
-def _enlarged(grid: FloatArray, block: int, shape: tuple[int, ...]) -> FloatImage:
-    """A grid of blocks (n, h, w) interpolated to the pixels of a frame of `shape`."""
-    size = (grid.shape[2] * block, grid.shape[1] * block)
-    whole = [cv2.resize(one.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) for one in grid]
-    return np.stack([one[: shape[0], : shape[1]] for one in whole])
+    relative = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)
+    return np.asarray(1 - np.clip(relative, 0, 1))

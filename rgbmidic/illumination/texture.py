@@ -108,6 +108,14 @@ class TextureModel:
         gaussians = np.exp(-0.5 * (r / np.asarray(self.widths)) ** 2)
         return np.asarray(gaussians @ np.asarray(self.weights) + self.offset)
 
+    def spectrum(self, frequency: npt.ArrayLike) -> FloatArray:
+        """Power spectrum (px^2) at distances from frequency 0 in cycles per px, without the offset."""
+        f = np.asarray(frequency, dtype=np.float64)[..., None]
+        # a Gaussian's transform; of widths of 0.6 px and more hardly anything folds back
+        widths = np.asarray(self.widths)
+        gaussians = 2 * np.pi * widths**2 * np.exp(-2 * (np.pi * widths * f) ** 2)
+        return np.asarray(gaussians @ np.asarray(self.weights))
+
     @cached_property
     def diameter(self) -> float:
         """Speckle size in px: the full width at half maximum of the autocorrelation."""
@@ -158,11 +166,11 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     best = float(np.max(correlations))
     distance = np.hypot(*LAGS.T)
     if best < COLOURED:
-        seen = counts[:, :3] > 0
-        r = np.broadcast_to(distance[:, None], seen.shape)[seen]
+        met = counts[:, :3] > 0
+        r = np.broadcast_to(distance[:, None], met.shape)[met]
         # one colour's samples are two pixels apart and tell nothing of what is finer
         coarse = WIDTHS[WIDTHS > 1]
-        return _mixture(r, sums[:, :3][seen] / counts[:, :3][seen], best, widths=coarse, private=1.0)
+        return _mixture(r, sums[:, :3][met] / counts[:, :3][met], best, widths=coarse, private=1.0)
     pairs = counts[:, 3:] * correlations
     adjacent, diagonal = pairs[:, 0] + pairs[:, 2], pairs[:, 1]
     parity = LAGS.sum(axis=1) % 2 == 1
@@ -206,12 +214,12 @@ def _mixture(
         small_offset = np.append(np.zeros(len(widths)), OFFSET_PENALTY)
         system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
         wanted = np.concatenate([np.zeros(r.size), [1e3, 0.0, 0.0]])
-    found = nnls(system, wanted)[0]
-    total = found[:-1].sum() - found[-1]
-    if not total > 0.1 * found[:-1].sum():
+    solution = nnls(system, wanted)[0]
+    total = solution[:-1].sum() - solution[-1]
+    if not total > 0.1 * solution[:-1].sum():
         return TextureModel.of_speckle(4.0)
-    kept = found[:-1] > 0
-    weights = found[:-1][kept] / total
+    kept = solution[:-1] > 0
+    weights = solution[:-1][kept] / total
     return TextureModel(
         weights=tuple(weights.tolist()),
         widths=tuple(widths[kept].tolist()),

@@ -10,7 +10,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearChannels
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.typing import FloatImage
 
 __all__ = ["NEGLIGIBLE", "unmix"]
 
@@ -39,8 +39,7 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
     Returns
     -------
     IlluminationImages
-        (k, H, W); invalid where any channel with a non-negligible coefficient is. The covariance, where the camera
-        noise is known, is ``A^-1 diag(variance of a raw sample at the channel's median) A^-T``.
+        (k, H, W); invalid where any channel with a non-negligible coefficient is.
 
     Raises
     ------
@@ -80,7 +79,6 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
         valid=valid.reshape(lights, *shape),
         names=crosstalk.lights,
         full_scale=channels.full_scale,
-        covariance=_covariance(channels, matrix),
     )
 
 
@@ -94,12 +92,3 @@ def _unmixing_grid(crosstalk: Crosstalk, shape: tuple[int, ...], step: int) -> F
         )
     y, x = (step * np.arange((side - 1) // step + 2) for side in shape)
     return crosstalk.unmixing_at(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
-
-
-def _covariance(channels: LinearChannels, matrix: FloatArray) -> FloatArray | None:
-    if channels.noise is None:
-        return None
-    # A coarse grid is plenty for a median and spares a full sort of every frame.
-    sample, valid = channels.values[:, ::7, ::5], channels.valid[:, ::7, ::5]
-    levels = [np.median(v[ok]) if ok.any() else channels.full_scale for v, ok in zip(sample, valid, strict=True)]
-    return np.asarray((matrix * channels.noise.variance(np.array(levels))) @ matrix.T)

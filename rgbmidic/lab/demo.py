@@ -5,24 +5,24 @@ It goes the way a laboratory goes: raw frames and calibration captures on disk, 
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Reference, Start, track
-from rgbmidic.errors import CalibrationError, ResultError
+from rgbmidic.correlation import correlate
+from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
-from rgbmidic.frames import open_series
+from rgbmidic.frames import list_frames, read_frame
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.linearise import LinearMosaic, linearise
+from rgbmidic.illumination.separate import separate
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import Separation, correlated, measure, read_region
+from rgbmidic.pipeline import measure
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["DemoRow", "run_demo"]
 
@@ -83,7 +83,12 @@ class DemoRow:
     measured: float
 
 
-def run_demo(out: Path, say: Say, progress: Callable[[int, int, str], None] | None = None) -> list[DemoRow]:
+def run_demo(
+    out: Path,
+    say: Say,
+    calibrate: Callable[[Path], None],
+    progress: Callable[[int, int, str], None] | None = None,
+) -> list[DemoRow]:
     """Make the virtual test in `out`/test, calibrate it, measure it into `out`/result, and compare.
 
     Parameters
@@ -92,6 +97,8 @@ def run_demo(out: Path, say: Say, progress: Callable[[int, int, str], None] | No
         Folder; it must be empty or not exist.
     say
         Called with a line about each step.
+    calibrate
+        Called with the folder of the virtual test; writes calibration.json from the captures there.
     progress
         Called with frames done, their total and a line.
 
@@ -117,7 +124,7 @@ def run_demo(out: Path, say: Say, progress: Callable[[int, int, str], None] | No
     settings_file = write_dataset(scene, test, progress)
     (test / "calibration.json").rename(test / "true_calibration.json")
     say("calibration: rgbmidic-calibrate crosstalk, from the captures with one light on at a time")
-    _calibrate(test)
+    calibrate(test)
     settings = read_test(settings_file)
     say(f"measurement: rgbmidic run {settings_file} --out {out / 'result'}")
     result = measure(settings, out / "result", progress=progress)
@@ -125,25 +132,15 @@ def run_demo(out: Path, say: Say, progress: Callable[[int, int, str], None] | No
     return _compare(settings, result)
 
 
-def _calibrate(test: Path) -> None:
-    """Run the calibration command on the captures, as a user would."""
-    lights = [argument for name in ("red", "green", "blue") for argument in ("--light", f"{name}=light_{name}/*.dng")]
-    command = [sys.executable, "-m", "rgbmidic_calibration", "crosstalk", "--dark", "dark/*.dng", *lights]
-    done = subprocess.run(
-        [*command, "--out", "calibration.json"], cwd=test, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise CalibrationError(f"rgbmidic-calibrate failed: {done.stderr.strip() or done.stdout.strip()}")
-
-
 def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
     with np.load(settings.base / "truth.npz") as archive:
         truth, angles = archive["displacement"].astype(np.float64), archive["angle_deg"]
     mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-    singles = _each_light_alone(settings, mesh)
+    images = _separated(settings)
     rows = []
     for index in range(1, len(result)):
         field = np.stack([result.u[index], result.v[index]], axis=1)
+        alone = [_one_light(images[0][light], images[index][light], settings) for light in range(len(images[0]))]
         std = np.stack([result.u_std[index], result.v_std[index]], axis=1)
         rows.append(
             DemoRow(
@@ -151,33 +148,35 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
                 rms_px=field_rms(mesh, field, truth[index]),
                 nodal_px=_rms(field - at_nodes(truth[index], mesh.nodes)),
                 predicted_px=_rms(std),
-                single_px=tuple(field_rms(mesh, single[index], truth[index]) for single in singles),
+                single_px=tuple(field_rms(mesh, single, truth[index]) for single in alone),
                 measured=float(np.isfinite(field[:, 0]).mean()),
             )
         )
     return rows
 
 
-def _each_light_alone(settings: TestSettings, mesh: Tri3Mesh) -> list[list[FloatArray]]:
-    """Displacement (N, 2) of every frame from each light's images alone, with the same solver."""
+def _separated(settings: TestSettings) -> list[FloatImage]:
+    """The lights (k, H, W) of every frame."""
     assert settings.calibration_file is not None
-    separation = Separation(calibration=Calibration.read(settings.calibration_file))
-    frames = open_series(settings.frames, settings.base)
-    images = [correlated(separation(frames.read(index)), settings.illumination) for index in range(len(frames))]
-    region = read_region(settings.region, images[0].shape[1:])
-    singles = []
-    for light in range(len(images[0])):
-        stacks = [image[light : light + 1] for image in images]
-        reference = Reference.prepare(stacks[0], region, mesh=mesh, prefilter="binomial")
-        fields = [np.zeros((len(mesh.nodes), 2))]
-        start = Start(displacement=fields[0])
-        for stack in stacks[1:]:
-            deformed = Deformed.prepare(stack, prefilter="binomial")
-            solution = track(reference, deformed, start, settings.solver)
-            start = start.after(solution)
-            fields.append(solution.displacement)
-        singles.append(fields)
-    return singles
+    calibration = Calibration.read(settings.calibration_file)
+    assert calibration.crosstalk is not None
+    images = []
+    for path in list_frames(settings.frames.path[0], settings.base):
+        mosaic = linearise(read_frame(path), calibration.noise)
+        assert isinstance(mosaic, LinearMosaic)
+        images.append(separate(mosaic, calibration.crosstalk).values)
+    return images
+
+
+def _one_light(reference: FloatImage, deformed: FloatImage, settings: TestSettings) -> FloatArray:
+    """Displacement (N, 2) from one light's images, with the same solver."""
+    return correlate(
+        reference,
+        deformed,
+        region=settings.region.rectangle,
+        element_size=settings.element_size,
+        normalise=settings.illumination.normalise,
+    ).displacement
 
 
 def _rms(values: FloatArray) -> float:

@@ -53,7 +53,7 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
     if out.exists() and not (overwrite and out.is_file()):
-        raise ResultError(f"{out} already exists; give another name or --overwrite it")
+        raise ResultError(f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)")
     if not out.parent.is_dir():
         raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
     write_complete(out, lambda file: _WRITERS[to](result, file))

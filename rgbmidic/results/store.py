@@ -185,7 +185,9 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
     if (path / _PROVENANCE).exists():
         read_provenance(path)  # refuses foreign files of this name
         if not overwrite:
-            raise ResultError(f"{path} already holds a result; give another folder or --overwrite it")
+            raise ResultError(
+                f"{path} already holds a result; choose another folder, or overwrite it (overwrite=True, --overwrite)"
+            )
     elif foreign := [name for name in (_MESH, _REFERENCE, _FRAMES) if (path / name).exists()]:
         raise ResultError(f"{path} holds a {foreign[0]} that is not of a result; give another folder")
     try:

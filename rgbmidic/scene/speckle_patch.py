@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.render import PLATE
-from rgbmidic.frames.data import cfa_channels, shift_cfa
+from rgbmidic.frames.data import sampled_channels, shift_cfa
 from rgbmidic.illumination.linearise import LinearMosaic
 from rgbmidic.illumination.separate import separate
 from rgbmidic.scene.scene import Scene
@@ -94,7 +94,7 @@ def mosaic_disturbances(scene: Scene, texture: FloatArray, demosaic: str) -> tup
         along both), in units of each light's mean; lights of equal brightness.
     """
     camera, crosstalk = scene.camera, scene.camera.true_crosstalk(scene.lights)
-    colours = _colours(camera.cfa, len(texture))
+    colours = sampled_channels(camera.cfa, texture.shape)
     level = _LEVEL * camera.full_scale
     samples = level * crosstalk.matrix.sum(axis=1)[colours] * texture
 
@@ -135,14 +135,9 @@ def _trace(
     phases = []
     for rows, columns in np.ndindex(2, 2):
         name = shift_cfa(cfa, rows, columns)
-        phases.append(lights(level * matrix.sum(axis=1)[_colours(name, len(texture))] * texture, name) / level)
+        phases.append(lights(level * matrix.sum(axis=1)[sampled_channels(name, texture.shape)] * texture, name) / level)
     parts = [np.tensordot(np.array(signs) / 4, phases, axes=1) for signs in _CARRIERS]
     return np.stack([cross_spectra(part) for part in parts])
-
-
-def _colours(cfa: str, size: int) -> npt.NDArray[np.intp]:
-    """Index (n, n) of the colour of every sample."""
-    return np.tile(cfa_channels(cfa), (size // 2, size // 2))
 
 
 def cross_spectra(fields: FloatArray) -> FloatArray:

@@ -6,13 +6,11 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from rgbmidic._kernels.demosaic import PAD, pad_mosaic
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
-from rgbmidic.typing import FloatImage
 
-__all__ = ["Demosaicer", "check_mosaic", "padded_mosaic", "red_position"]
+__all__ = ["Demosaicer", "check_mosaic", "red_position"]
 
 
 @runtime_checkable
@@ -42,11 +40,3 @@ def red_position(cfa: str) -> tuple[int, int]:
     """Row and column of red in the 2x2 cell of a Bayer pattern."""
     row, column = np.argwhere(cfa_channels(cfa) == 0)[0]
     return int(row), int(column)
-
-
-def padded_mosaic(mosaic: LinearMosaic) -> FloatImage:
-    """The mosaic (H + 4, W + 4), mirrored about its border pixels, NaN where saturated."""
-    rows, columns = mosaic.values.shape
-    padded = np.empty((rows + 2 * PAD, columns + 2 * PAD), dtype=np.float32)
-    pad_mosaic(np.ascontiguousarray(mosaic.values, dtype=np.float32), np.asarray(mosaic.saturated, bool), padded)
-    return padded

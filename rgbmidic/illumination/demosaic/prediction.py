@@ -45,18 +45,12 @@ class FilterTable:
         Row of `taps` for each tile.
     taps : (T, 2, n, size², 16) float32
         As `rgbmidic._kernels.kriging.predict` takes them.
-    variance : (T, n) float64
-        Variance of the prediction's error, in units of the channel's own, mean over the phases.
-    noise : (T, n, n) float64
-        Covariance of the camera noise in the predictions, mean over the phases.
     size : int
         Side of the square of samples.
     """
 
     index: npt.NDArray[np.int32]
     taps: FloatImage
-    variance: FloatArray
-    noise: FloatArray
     size: int = SIZE
 
 
@@ -87,26 +81,22 @@ def prediction_filters(
     code = (level[0] * 1000 + level[1]) * 1000 + level[2]
     _, first, index = np.unique(code, return_index=True, return_inverse=True)
     share = 1 / (1 + 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE))
-    taps, variance, covariance = _solved(share, np.asarray(noise, dtype=np.float64), texture, cfa, size)
+    taps = _solved(share, np.asarray(noise, dtype=np.float64), texture, cfa, size)
     lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
     return FilterTable(
         index=index.reshape(level.shape[1:]).astype(np.int32),
         taps=lanes.astype(np.float32),
-        variance=variance,
-        noise=covariance,
         size=size,
     )
 
 
-def _solved(
-    share: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Filters (T, 4, 3, size²), error variances (T, 3) and noise covariances (T, 3, 3) for shares (T, 3)."""
-    common, coarse, fine = _covariances(texture, size)
-    private = texture.private * coarse + (1 - texture.private) * fine
+def _solved(share: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int) -> FloatArray:
+    """Filters (T, 4, 3, size²) for shares (T, 3) of the common texture."""
+    common, fine = _covariances(texture, size)
+    # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
+    private = texture.private * common + (1 - texture.private) * fine
     centre, count = size * size // 2, len(share)
     taps = np.empty((count, 4, 3, size * size))
-    variance, covariance = np.zeros((count, 3)), np.zeros((count, 3, 3))
     for phase, channel in enumerate(_channels_around(cfa, size)):
         root, own = np.sqrt(share[:, channel]), np.sqrt(1 - share[:, channel])
         same = channel[:, None] == channel[None]
@@ -117,20 +107,16 @@ def _solved(
         wanted += (1 - share)[:, None] * (mine * private[:, centre, None])
         solution = np.linalg.solve(samples, wanted)
         taps[:, phase] = solution.transpose(0, 2, 1)
-        prior = share * common[centre, centre] + (1 - share) * private[centre, centre]
-        variance += (prior - (solution * wanted).sum(axis=1)) / 4
-        covariance += solution.transpose(0, 2, 1) @ (noise[channel][:, None] * solution) / 4
-    return taps, variance, covariance
+    return taps
 
 
 @lru_cache(maxsize=64)
-def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Covariance between the samples of the square: of the texture, of coarse and of fine private contrast."""
+def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, FloatArray]:
+    """Covariance between the samples of the square: of the texture, and of the sparkle of a reflection."""
     offset = np.arange(size) - size // 2
     points = np.stack(np.meshgrid(offset, offset, indexing="ij"), -1).reshape(-1, 2)
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    common = texture(apart) + OFFSET_VARIANCE
-    return common, common, np.exp(-(apart**2) / (4 * SPARKLE_VARIANCE))
+    return texture(apart) + OFFSET_VARIANCE, np.exp(-(apart**2) / (4 * SPARKLE_VARIANCE))
 
 
 def _channels_around(cfa: str, size: int) -> list[npt.NDArray[np.intp]]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from rgbmidic._kernels.kriging import TILE, fill_unknown, predict
 from rgbmidic.errors import InputError
-from rgbmidic.frames.data import cfa_channels
+from rgbmidic.frames.data import sampled_channels
 from rgbmidic.illumination.colour_factors import (
     BLOCK,
     MEAN_BLOCK,
@@ -56,18 +56,12 @@ class Reconstruction:
         How each channel sees the texture, on a grid of 8 px.
     mean : (3, h, w) float32
         Local mean of each channel on a grid of 4 px.
-    table : FilterTable
-        The filters used, and the variance of their error.
-    noise : (3, 3) float64 or None
-        Covariance of the camera noise of the channels at a pixel (DN²), typical of the frame.
     """
 
     channels: LinearChannels
     texture: TextureModel
     factors: ColourFactors
     mean: FloatImage
-    table: FilterTable
-    noise: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,15 +109,8 @@ class ReflectionAwareDemosaicer:
         table = _filters(factors, texture, mosaic.cfa)
         out, unknown = _predict(moments, factors, table, damaged=damaged)
         valid = _validity(saturated, unknown, mosaic.cfa) if damaged else np.ones(out.shape, dtype=bool)
-        channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale, noise=mosaic.noise)
-        return Reconstruction(
-            channels=channels,
-            texture=texture,
-            factors=factors,
-            mean=moments.mean,
-            table=table,
-            noise=None if mosaic.noise is None else _noise(factors, table),
-        )
+        channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
+        return Reconstruction(channels=channels, texture=texture, factors=factors, mean=moments.mean)
 
 
 def _filters(factors: ColourFactors, texture: TextureModel, cfa: str) -> FilterTable:
@@ -159,17 +146,8 @@ def _predict(
 
 def _validity(saturated: BoolArray, unknown: BoolArray, cfa: str) -> BoolArray:
     """A channel is not known within a pixel of its own saturated samples, none where the texture is not known."""
-    cell = cfa_channels(cfa)
-    rows, columns = saturated.shape
-    site = np.tile(cell, (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
+    site = sampled_channels(cfa, saturated.shape)
     near = np.ones((3, 3), np.uint8)
     wide = cv2.dilate(unknown.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     own = [cv2.dilate((saturated & (site == c)).astype(np.uint8), near).astype(bool) for c in range(3)]
     return np.stack([~(mask | wide) for mask in own])
-
-
-def _noise(factors: ColourFactors, table: FilterTable) -> FloatArray:
-    """Covariance (3, 3) of the camera noise at a typical pixel, DN²."""
-    typical = np.bincount(table.index.ravel()).argmax()
-    spread = np.median(factors.spread, axis=(1, 2))
-    return np.asarray(table.noise[typical] * np.outer(spread, spread))

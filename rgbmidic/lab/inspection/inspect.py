@@ -5,39 +5,35 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import Solution, correlate
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames import open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import ReflectionAwareDemosaicer
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel, linearise
-from rgbmidic.illumination.normalise import local_mean
-from rgbmidic.illumination.separate import separate_reflections
+from rgbmidic.illumination.normalise import DARK, local_mean
+from rgbmidic.illumination.separate import DEFAULT_METHOD, reconstructed_lights, separate
+from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
-from rgbmidic.lab.inspection.repeat import BayerRepeat, noise_difference
+from rgbmidic.lab.inspection.disturbances import Disturbances
+from rgbmidic.lab.inspection.prediction import Prediction, predict
 from rgbmidic.lab.inspection.results import BLIND, ChannelFacts, Inspection, LightFacts, Spread
-from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_size
-from rgbmidic.mesh import Region
-from rgbmidic.pipeline import Separation, read_region
-from rgbmidic.settings import (
-    ELEMENT_SIZE,
-    FrameSettings,
-    RegionSettings,
-    TestSettings,
-)
+from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline import read_region
+from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["inspect_files", "inspect_frame", "state_frames"]
 
-Frames = tuple[Mosaic | ChannelFrame, ...]
-Prefilter = Literal["none", "binomial", "gaussian"]
+Linear = Sequence[LinearMosaic | LinearChannels]
 
 CONTRAST_WIDTH = (10.0, 40.0)
 """Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
@@ -72,13 +68,13 @@ def inspect_files(
     RgbmidicError
         A file is missing, damaged or contradicts what is stated; the frame cannot be inspected.
     """
-    stated = _settings(frame or (test.frames if test else None), test)
-    file = calibration or (test.calibration_file if test else None)
-    known = None if file is None else Calibration.read(file)
-    paths = [Path(one) for one in files]
-    frames = tuple(open_source(path, stated.frames, known).read(0) for path in paths)
+    stated = frame or (test.frames if test else FrameSettings(path=("frame",)))
+    calibrated = calibration or (test.calibration_file if test else None)
+    known = None if calibrated is None else Calibration.read(calibrated)
+    paths = [Path(file) for file in files]
+    frames = tuple(open_source(path, stated, known).read(0) for path in paths)
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
-    known = known and known.cropped(stated.frames.crop_origin, shape)
+    known = known and known.cropped(stated.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
     if place is None and test is not None:
         place = read_region(test.region, shape)
@@ -88,9 +84,8 @@ def inspect_files(
             calibration=known,
             region=place,
             element_size=element_size or (test.element_size if test else ELEMENT_SIZE),
-            demosaic=stated.illumination.demosaic,
-            normalise=stated.illumination.normalise,
-            prefilter=stated.solver.prefilter,
+            demosaic=test.illumination.demosaic if test else "auto",
+            prefilter=test.solver.prefilter if test else "binomial",
             name=" + ".join(path.name for path in paths),
         )
     except InputError as error:
@@ -104,15 +99,14 @@ def inspect_frame(
     region: Region | Sequence[float] | None = None,
     element_size: float = ELEMENT_SIZE,
     demosaic: str = "auto",
-    normalise: float = 10.0,
-    prefilter: Prefilter = "binomial",
+    prefilter: str = "binomial",
     name: str = "frame",
     seed: int = 0,
 ) -> Inspection:
     """What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect.
 
-    The uncertainty is predicted by letting the solver measure a simulated repeat of the frame: the frame's lights, and
-    the same with what a second, moved exposure would get wrong (`rgbmidic.lab.inspection.repeat`).
+    The uncertainty is predicted in closed form (`rgbmidic.lab.inspection.prediction`) from the speckle, the contrast
+    of the lights and what separating a frame like this one gets wrong.
 
     Parameters
     ----------
@@ -125,12 +119,12 @@ def inspect_frame(
         What will be measured; None: the whole frame.
     element_size
         Side of the elements in px.
-    demosaic, normalise, prefilter
+    demosaic, prefilter
         As in TEST.toml.
     name
         Of the frame, for reports.
     seed
-        Of the simulated repeat.
+        Of what is drawn for the prediction.
 
     Raises
     ------
@@ -140,49 +134,56 @@ def inspect_frame(
         The region is empty, outside the frame or too small for one element.
     """
     frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
-    seen = _Seen.prepare(frames, calibration, region, demosaic)
-    images, index, texture = seen.lights(), None, None
-    channels = seen.channel_facts()
-    if isinstance(first := seen.linear[0], LinearMosaic):
-        found = separate_reflections(first, seen.crosstalk)
-        index, texture = found.reflection_index, found.texture
-    contrast = _local_contrast(images, _contrast_window(channels))
+    known = calibration or Calibration()
+    linear = [linearise(shot, known.noise) for shot in frames]
+    _check_frames(linear)
+    shape = linear[0].values.shape[-2:]
+    if not isinstance(region, Region):
+        region = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1) if region is None else region, shape)
+    mesh, channels = Tri3Mesh.from_region(region, element_size), channels_of(linear)
+    _check_light(channels, region.mask)
+    samples = _Samples.of(channels, region.mask, known.noise, linear[0].full_scale)
+    crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
+    separated = _separated(linear, crosstalk, demosaic, samples.noise, np.random.default_rng(seed))
+    images = separated.images if known.registration is None else align(separated.images, known.registration)
+    level, contrast = _level_and_contrast(images, _contrast_window(samples.facts))
+    index = separated.images.reflection_index
     if index is None and len(contrast) > 1:
         index = np.asarray(1 - contrast / np.maximum(contrast.max(axis=0), 1e-6), dtype=np.float32)
-    whole, noise = seen.differences(np.random.default_rng(seed))
-
-    smoothing: dict[str, Any] = {"prefilter": prefilter, "normalise": normalise or None, "curvature": True}
-
-    def predicted(change: FloatImage, light: slice = slice(None)) -> Solution:
-        pair = images.values[light], (images.values + change)[light]
-        return correlate(*pair, region=seen.region, element_size=element_size, initial=(0.0, 0.0), **smoothing)
-
-    together = predicted(whole)
-    std = together.displacement_std
-    many = len(images.names) > 1
-    alone = [predicted(whole, slice(j, j + 1)).displacement_std if many else std for j in range(len(images.names))]
-    sampled = isinstance(first, LinearMosaic)
+    texture = separated.images.texture
+    prediction = Prediction.unknown(len(mesh.nodes), len(images.names))
+    if (autocorrelation := texture or samples.texture) is not None:
+        prediction = predict(
+            mesh,
+            region,
+            contrast=contrast,
+            level=level,
+            disturbances=separated.disturbances,
+            texture=autocorrelation,
+            prefilter=prefilter,
+        )
+    single = not isinstance(linear[0], LinearMosaic) and len(linear[0].values) == 1
     return Inspection(
         name=name,
-        kind="bayer" if sampled else ("rgb" if len(seen.linear[0].values) == 3 else "monochrome"),
-        channels=channels,
-        lights=_light_facts(images, contrast, index, alone, seen.region.mask),
+        kind="bayer" if isinstance(linear[0], LinearMosaic) else "monochrome" if single else "rgb",
+        channels=samples.facts,
+        lights=_light_facts(images, contrast, index, prediction.alone, region.mask),
         images=images,
         reflection_index=index,
-        saturated=np.logical_or.reduce([channel.saturated for channel in seen.channels]),
-        region=seen.region.mask,
-        hidden=_hidden(contrast, seen.region.mask),
+        saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
+        region=region.mask,
+        hidden=_hidden(contrast, region.mask),
         texture=texture,
-        noise=seen.noise,
-        noise_known=seen.noise_known,
-        crosstalk_known=seen.crosstalk_known,
+        noise=samples.noise,
+        noise_known=known.noise is not None,
+        crosstalk_known=single or known.crosstalk is not None,
         element_size=element_size,
-        nodes=together.nodes,
-        elements=together.elements,
-        std=std,
-        noise_std=predicted(noise).displacement_std if sampled else std,
-        sampling_std=predicted(whole - noise).displacement_std if sampled else 0 * std,
-        greens=_greens(first) if isinstance(first, LinearMosaic) else 0.0,
+        nodes=mesh.nodes,
+        elements=mesh.elements,
+        std=prediction.std,
+        noise_std=prediction.noise,
+        sampling_std=prediction.mosaic,
+        greens=_greens(linear[0]) if isinstance(linear[0], LinearMosaic) else 0.0,
     )
 
 
@@ -207,116 +208,77 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
     return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
 
 
-def _settings(frames: FrameSettings | None, test: TestSettings | None) -> TestSettings:
-    """The test's settings with other frames, or default ones; their region is not used."""
-    if test is not None:
-        return replace(test, frames=frames or test.frames)
-    return TestSettings(
-        frames=frames or FrameSettings(path=("frame",)),
-        region=RegionSettings(rectangle=(0.0, 0.0, 1.0, 1.0)),
-        calibration_file=Path("calibration.json"),
-    )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Seen:
-    """A frame made ready: linearised, with the crosstalk and noise it is looked at with."""
+class _Samples:
+    """What the samples of the channels tell: figures, the camera noise, and the autocorrelation of the speckle."""
 
-    frames: Frames
-    linear: list[LinearMosaic | LinearChannels]
-    channels: list[Channel]
-    region: Region
-    separation: Separation
-    crosstalk: Crosstalk
-    crosstalk_known: bool
+    facts: tuple[ChannelFacts, ...]
     noise: NoiseModel
-    noise_known: bool
-    estimates: tuple[float, ...]
+    texture: TextureModel | None
 
     @classmethod
-    def prepare(
-        cls,
-        frames: Frames,
-        calibration: Calibration | None,
-        region: Region | Sequence[float] | None,
-        demosaic: str,
-    ) -> _Seen:
-        known = calibration or Calibration()
-        linear = [linearise(one, known.noise) for one in frames]
-        shape = linear[0].values.shape[-2:]
-        _check_frames(linear)
-        place = region if isinstance(region, Region) else Region.from_rectangle(_rectangle(region, shape), shape)
-        channels = channels_of(linear)
-        _check_light(channels, place.mask)
-        single = not isinstance(linear[0], LinearMosaic) and len(linear[0].values) == 1
-        crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
-        estimates = [] if known.noise else noise_estimate(channels, place.mask)
-        typical = (
-            float(np.sqrt(np.nanmean(np.square(estimates)))) if estimates and not np.isnan(estimates).all() else 0.0
-        )
-        return cls(
-            frames=frames,
-            linear=linear,
-            channels=channels,
-            region=place,
-            separation=Separation(calibration=replace(known, crosstalk=crosstalk), demosaic=demosaic),
-            crosstalk=crosstalk,
-            crosstalk_known=single or known.crosstalk is not None,
-            noise=known.noise or NoiseModel(gain=float("inf"), read_noise=typical),
-            noise_known=known.noise is not None,
-            estimates=tuple(estimates),
-        )
-
-    def lights(self) -> IlluminationImages:
-        """One image per light, as the test would have them."""
-        return self.separation(self.frames)
-
-    def differences(self, random: np.random.Generator) -> tuple[FloatImage, FloatImage]:
-        """What two states differ by (k, H, W), DN, though nothing has moved; and the part from camera noise."""
-        first = self.linear[0]
-        if isinstance(first, LinearMosaic):
-            model = ReflectionAwareDemosaicer(crosstalk=self.crosstalk).reconstruct(first)
-            method = self.separation.demosaic
-            repeat = BayerRepeat(mosaic=first, model=model, crosstalk=self.crosstalk, method=method, noise=self.noise)
-            return repeat.draw(random)
-        full = [one for one in self.linear if isinstance(one, LinearChannels)]
-        noise = noise_difference(full, self.noise, self._unmixed, random)
-        return noise, noise
-
-    def _unmixed(self, frames: Sequence[LinearChannels]) -> IlluminationImages:
-        if len(frames[0].values) == 3:
-            return unmix(frames[0], self.crosstalk)
-        return IlluminationImages(
-            values=np.concatenate([one.values for one in frames]),
-            valid=np.concatenate([one.valid for one in frames]),
-            names=tuple(map(str, range(len(frames)))),
-            full_scale=frames[0].full_scale,
-        )
-
-    def channel_facts(self) -> tuple[ChannelFacts, ...]:
-        """Figures of the samples of each channel."""
-        full_scale, facts = self.linear[0].full_scale, []
-        for number, channel in enumerate(self.channels):
-            samples = channel.values[self.region.mask & np.isfinite(channel.values)] / full_scale
+    def of(
+        cls, channels: list[Channel], inside: BoolArray, calibrated: NoiseModel | None, full_scale: float
+    ) -> _Samples:
+        """Of the samples inside the region; `calibrated` is the noise where it is known."""
+        textures = [speckle_texture(channel, inside, calibrated) for channel in channels]
+        estimates = noise_estimate(channels, inside) if calibrated is None else []
+        known = [estimate for estimate in estimates if np.isfinite(estimate)]
+        typical = float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
+        noise = calibrated or NoiseModel(gain=float("inf"), read_noise=typical)
+        facts = []
+        for number, channel in enumerate(channels):
+            samples = channel.values[inside & np.isfinite(channel.values)] / full_scale
             low, high = np.quantile(samples, [0.05, 0.95])
-            level = float(samples.mean())
-            calibrated = float(np.sqrt(self.noise.variance(np.array(level * full_scale))))
+            level, texture = float(samples.mean()), textures[number]
             facts.append(
                 ChannelFacts(
                     name=channel.name,
                     mean=level,
                     low=float(low),
                     high=float(high),
-                    saturated=float(channel.saturated[self.region.mask].sum() / samples.size),
-                    speckle_px=speckle_size(channel, self.region.mask, self.noise if self.noise_known else None),
-                    noise_dn=calibrated if self.noise_known else self.estimates[number],
+                    saturated=float(channel.saturated[inside].sum() / samples.size),
+                    speckle_px=float("nan") if texture is None else texture.diameter,
+                    noise_dn=estimates[number]
+                    if estimates
+                    else float(noise.variance(np.array(level * full_scale))) ** 0.5,
                 )
             )
-        return tuple(facts)
+        sharpest = sorted((texture for texture in textures if texture), key=lambda texture: texture.diameter)
+        return cls(facts=tuple(facts), noise=noise, texture=sharpest[len(sharpest) // 2] if sharpest else None)
 
 
-def _check_frames(linear: list[LinearMosaic | LinearChannels]) -> None:
-    shapes = {one.values.shape for one in linear}
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Separated:
+    """The lights of a frame, and what their separation gets wrong."""
+
+    images: IlluminationImages
+    disturbances: Disturbances
+
+
+def _separated(
+    linear: Linear, crosstalk: Crosstalk, method: str, noise: NoiseModel, random: np.random.Generator
+) -> _Separated:
+    """Separate a state as the test would; reflection index and speckle of a mosaic are those of the default method."""
+    first = linear[0]
+    if isinstance(first, LinearMosaic):
+        model = ReflectionAwareDemosaicer(crosstalk=crosstalk).reconstruct(first)
+        images = reconstructed_lights(model, crosstalk)
+        if method not in ("auto", DEFAULT_METHOD):
+            other = separate(first, crosstalk, method)
+            images = replace(other, reflection_index=images.reflection_index, texture=images.texture)
+        disturbances = Disturbances.of_mosaic(first, model, crosstalk, method, noise, random)
+        return _Separated(images=images, disturbances=disturbances)
+    full = [frame for frame in linear if isinstance(frame, LinearChannels)]
+
+    def lights(frames: Sequence[LinearChannels]) -> IlluminationImages:
+        return IlluminationImages.in_succession(frames) if len(frames[0].values) == 1 else unmix(frames[0], crosstalk)
+
+    return _Separated(images=lights(full), disturbances=Disturbances.of_channels(full, lights, noise, random))
+
+
+def _check_frames(linear: Linear) -> None:
+    shapes = {frame.values.shape for frame in linear}
     if len(shapes) > 1:
         raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")
     if len(linear) > 1 and (isinstance(linear[0], LinearMosaic) or len(linear[0].values) > 1):
@@ -330,32 +292,29 @@ def _check_frames(linear: list[LinearMosaic | LinearChannels]) -> None:
 
 def _check_light(channels: list[Channel], inside: BoolArray) -> None:
     samples = [channel.values[inside & np.isfinite(channel.values)] for channel in channels]
-    if not all(one.size for one in samples):
+    if not all(values.size for values in samples):
         raise InputError("the region holds no sample of some channel: it must be larger than a cell of the pattern")
-    if all(channel.saturated[inside].sum() == one.size for channel, one in zip(channels, samples, strict=True)):
+    if all(channel.saturated[inside].sum() == values.size for channel, values in zip(channels, samples, strict=True)):
         raise InputError("every sample of the region is saturated: there is nothing to inspect")
-    if all(float(np.ptp(one)) == 0 for one in samples):
+    if all(float(np.ptp(values)) == 0 for values in samples):
         raise InputError("every channel of the region is constant: there is nothing to inspect")
-
-
-def _rectangle(region: Sequence[float] | None, shape: tuple[int, ...]) -> Sequence[float]:
-    return (0, 0, shape[1] - 1, shape[0] - 1) if region is None else region
 
 
 def _contrast_window(channels: tuple[ChannelFacts, ...]) -> float:
     """Standard deviation (px) of a window that holds many speckles."""
-    sizes = [one.speckle_px for one in channels if np.isfinite(one.speckle_px)]
+    sizes = [channel.speckle_px for channel in channels if np.isfinite(channel.speckle_px)]
     return float(np.clip(2.5 * np.median(sizes) if sizes else 0.0, *CONTRAST_WIDTH))
 
 
-def _local_contrast(images: IlluminationImages, window: float) -> FloatImage:
-    """Local standard deviation over the local mean (k, H, W); 0 where a light is dark or unknown."""
-    out = np.zeros_like(images.values)
-    for image, target in zip(images.values, out, strict=True):
-        mean, square = local_mean(image, window), local_mean(image**2, window)
-        lit = np.isfinite(image) & (mean > 0.01 * images.full_scale)
-        target[lit] = np.sqrt(np.maximum(square[lit] - mean[lit] ** 2, 0)) / mean[lit]
-    return out
+def _level_and_contrast(images: IlluminationImages, window: float) -> tuple[FloatImage, FloatImage]:
+    """Local mean of each light (k, H, W), and its local standard deviation over it, 0 where it is dark or unknown."""
+    level, contrast = np.zeros((2, *images.values.shape), dtype=np.float32)
+    for image, mean, relative in zip(images.values, level, contrast, strict=True):
+        mean[:] = np.nan_to_num(local_mean(image, window))
+        lit = np.isfinite(image) & (mean > DARK * images.full_scale)
+        square = local_mean(image**2, window)
+        relative[lit] = np.sqrt(np.maximum(square[lit] - mean[lit] ** 2, 0)) / mean[lit]
+    return level, contrast
 
 
 def _hidden(contrast: FloatImage, inside: BoolArray) -> BoolArray:
@@ -367,7 +326,7 @@ def _light_facts(
     images: IlluminationImages,
     contrast: FloatImage,
     index: FloatImage | None,
-    alone: list[FloatArray],
+    alone: Sequence[FloatArray],
     inside: BoolArray,
 ) -> tuple[LightFacts, ...]:
     facts = []

@@ -36,12 +36,11 @@ class Spread:
 
     @classmethod
     def of(cls, std: FloatArray) -> Spread:
-        """Of standard uncertainties (N, 2) of u and v; the root mean square of both at each node."""
-        both = np.sqrt((std**2).mean(axis=1))
-        both = both[np.isfinite(both)]
-        if not both.size:
+        """Of standard uncertainties (N,)."""
+        measured = std[np.isfinite(std)]
+        if not measured.size:
             return cls(median=float("nan"), q95=float("nan"))
-        return cls(median=float(np.median(both)), q95=float(np.quantile(both, 0.95)))
+        return cls(median=float(np.median(measured)), q95=float(np.quantile(measured, 0.95)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,10 +148,10 @@ class Inspection:
     nodes : ndarray, shape (N, 2), float64
         Of the mesh, (x, y) in px.
     elements : ndarray, shape (E, 3), int32
-    std : ndarray, shape (N, 2), float64
-        Predicted standard uncertainty of u and v, px, all lights together, camera noise and separation; NaN where no
-        light sees enough.
-    noise_std, sampling_std : ndarray, shape (N, 2), float64
+    std : ndarray, shape (N,), float64
+        Predicted standard uncertainty of u, and of v, px, all lights together, camera noise and separation; NaN where
+        no light sees enough.
+    noise_std, sampling_std : ndarray, shape (N,), float64
         The parts of it from camera noise, and from what the mosaic did not sample.
     greens : float
         Difference of the means of the two greens of a mosaic over their mean; 0 for other cameras.
@@ -182,7 +181,7 @@ class Inspection:
     @property
     def unmeasured(self) -> float:
         """Share of the nodes that cannot be measured."""
-        return float(np.isnan(self.std).any(axis=1).mean())
+        return float(np.isnan(self.std).mean())
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -192,37 +191,37 @@ class Inspection:
     @property
     def speckle_px(self) -> float:
         """Speckle size: the median over the channels; px, NaN where there is no texture."""
-        sizes = [one.speckle_px for one in self.channels if np.isfinite(one.speckle_px)]
+        sizes = [channel.speckle_px for channel in self.channels if np.isfinite(channel.speckle_px)]
         return float(np.median(sizes)) if sizes else float("nan")
 
 
-def findings(seen: Inspection) -> Iterator[Finding]:
+def findings(inspection: Inspection) -> Iterator[Finding]:
     """Warnings that an inspection gives rise to."""
-    yield from _of_set_up(seen)
-    yield from _of_exposure(seen)
-    yield from _of_speckle(seen)
-    yield from _of_field(seen)
+    yield from _of_set_up(inspection)
+    yield from _of_exposure(inspection)
+    yield from _of_speckle(inspection)
+    yield from _of_field(inspection)
 
 
-def _of_set_up(seen: Inspection) -> Iterator[Finding]:
-    if seen.greens > GREENS:
+def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
+    if inspection.greens > GREENS:
         yield Finding(
             code="pattern",
-            text=f"the two greens of the pattern differ by {seen.greens:.0%}: check cfa, they are one colour",
+            text=f"the two greens of the pattern differ by {inspection.greens:.0%}: check cfa, they are one colour",
         )
-    if not seen.crosstalk_known:
+    if not inspection.crosstalk_known:
         yield Finding(
             code="crosstalk unknown",
             text="no crosstalk calibration: the camera's channels stand for the lights, and a reflection of one light "
             "shows in the others too; rgbmidic-calibrate crosstalk",
         )
-    if not seen.noise_known:
+    if not inspection.noise_known:
         yield Finding(
             code="noise unknown",
             text="no noise calibration: noise and the uncertainty from it are estimated from the frame, up to a few "
             "times too high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
         )
-    for light in seen.lights:
+    for light in inspection.lights:
         if light.negative > NEGATIVE:
             yield Finding(
                 code="negative light",
@@ -231,24 +230,24 @@ def _of_set_up(seen: Inspection) -> Iterator[Finding]:
             )
 
 
-def _of_exposure(seen: Inspection) -> Iterator[Finding]:
-    for one in seen.channels:
-        if one.saturated > SATURATED:
+def _of_exposure(inspection: Inspection) -> Iterator[Finding]:
+    for channel in inspection.channels:
+        if channel.saturated > SATURATED:
             yield Finding(
                 code="saturated",
-                text=f"channel {one.name}: {one.saturated:.1%} of the samples are saturated and will not be measured; "
-                "less exposure, or another place of the lamp",
+                text=f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be "
+                "measured; less exposure, or another place of the lamp",
             )
-        if one.high < DARK:
+        if channel.high < DARK:
             yield Finding(
                 code="dark",
-                text=f"channel {one.name} is dark: 95 % of its samples are below {one.high:.1%} of the full scale; "
-                "more light or exposure",
+                text=f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full "
+                "scale; more light or exposure",
             )
 
 
-def _of_speckle(seen: Inspection) -> Iterator[Finding]:
-    texture, size = seen.texture, seen.speckle_px
+def _of_speckle(inspection: Inspection) -> Iterator[Finding]:
+    texture, size = inspection.texture, inspection.speckle_px
     if texture is not None and (texture.private > 0.5 or texture.correlation < COLOURED):
         yield Finding(
             code="coloured",
@@ -264,26 +263,26 @@ def _of_speckle(seen: Inspection) -> Iterator[Finding]:
         )
     if np.isnan(size):
         yield Finding(code="no texture", text="no speckle is seen: its autocorrelation has no width")
-    elif seen.element_size < COARSE * size:
+    elif inspection.element_size < COARSE * size:
         yield Finding(
             code="coarse speckle",
-            text=f"speckles of {size:.1f} px are coarse for elements of {seen.element_size:g} px: at least {COARSE:g} "
-            f"per side, so element_size = {np.ceil(COARSE * size):.0f} or finer speckle",
+            text=f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px: at least "
+            f"{COARSE:g} per side, so element_size = {np.ceil(COARSE * size):.0f} or finer speckle",
         )
 
 
-def _of_field(seen: Inspection) -> Iterator[Finding]:
-    hidden = float(seen.hidden[seen.region].mean())
+def _of_field(inspection: Inspection) -> Iterator[Finding]:
+    hidden = float(inspection.hidden[inspection.region].mean())
     if hidden > HIDDEN:
-        what = "no light shows" if len(seen.lights) > 1 else "the light does not show"
+        what = "no light shows" if len(inspection.lights) > 1 else "the light does not show"
         yield Finding(
             code="hidden",
             text=f"{what} the texture on {hidden:.1%} of the region: "
             + (
                 "all lights reflect or saturate there, or there is no paint"
-                if len(seen.lights) > 1
+                if len(inspection.lights) > 1
                 else "it reflects or saturates there, or there is no paint"
             ),
         )
-    if seen.unmeasured > 0:
-        yield Finding(code="not measured", text=f"{seen.unmeasured:.1%} of the nodes will not be measured")
+    if inspection.unmeasured > 0:
+        yield Finding(code="not measured", text=f"{inspection.unmeasured:.1%} of the nodes will not be measured")

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from rgbmidic.frames.data import cfa_channels
+from rgbmidic.frames.data import sampled_channels
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.normalise import local_mean
+from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Channel", "channels_of", "noise_estimate", "speckle_size"]
+__all__ = ["Channel", "channels_of", "noise_estimate", "speckle_texture"]
 
 
 MEAN_WIDTH = 20.0
@@ -50,26 +51,27 @@ class Channel:
 
 def channels_of(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
     """The channels of a frame, or of the frames of lights fired in succession."""
-    found: list[Channel] = []
+    channels: list[Channel] = []
     for frame in frames:
         if isinstance(frame, LinearMosaic):
-            rows, columns = frame.values.shape
-            site = np.tile(cfa_channels(frame.cfa), (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
+            site = sampled_channels(frame.cfa, frame.values.shape)
             for colour, name in enumerate("RGB"):
                 own = site == colour
                 values = np.where(own, frame.values, np.float32(np.nan))
-                found.append(Channel(name=name, values=values, saturated=frame.saturated & own, step=2))
+                channels.append(Channel(name=name, values=values, saturated=frame.saturated & own, step=2))
             continue
         names = "RGB" if len(frame.values) == 3 else "M"
         for name, values, valid in zip(names, frame.values, frame.valid, strict=True):
-            found.append(Channel(name=name, values=values, saturated=~valid, step=1))
+            channels.append(Channel(name=name, values=values, saturated=~valid, step=1))
     if len(frames) > 1:
-        return [Channel(name=f"M{i + 1}", values=c.values, saturated=c.saturated, step=1) for i, c in enumerate(found)]
-    return found
+        return [
+            Channel(name=f"M{i + 1}", values=c.values, saturated=c.saturated, step=1) for i, c in enumerate(channels)
+        ]
+    return channels
 
 
-def speckle_size(channel: Channel, inside: BoolArray, noise: NoiseModel | None) -> float:
-    """Full width at half maximum (px) of the autocorrelation of a channel's contrast; NaN where there is no texture.
+def speckle_texture(channel: Channel, inside: BoolArray, noise: NoiseModel | None) -> TextureModel | None:
+    """The autocorrelation of a channel's contrast; None where there is no texture, or no end of it within `FARTHEST`.
 
     The contrast is the sample over the local mean, less 1. Products of samples of this channel alone enter, so that
     demosaicing has no part in it. The noise is a peak at distance 0, where its variance is subtracted; with unknown
@@ -83,46 +85,50 @@ def speckle_size(channel: Channel, inside: BoolArray, noise: NoiseModel | None) 
     Shape, Motion and Deformation Measurements, Springer 2009, section 5 (speckle size from the autocorrelation).
     """
     mean = _mean(channel)
-    known = np.isfinite(channel.values) & ~channel.saturated & inside & (mean > 0)
-    if known.sum() < 64:
-        return float("nan")
-    contrast = np.where(known, channel.values / np.where(known, mean, np.float32(1)) - 1, np.float32(0))
-    distance, product, count = _autocorrelation(contrast, known)
+    usable = np.isfinite(channel.values) & ~channel.saturated & inside & (mean > 0)
+    if usable.sum() < 64:
+        return None
+    contrast = np.where(usable, channel.values / np.where(usable, mean, np.float32(1)) - 1, np.float32(0))
+    distance, product, count = _autocorrelation(contrast, usable)
     at_zero = distance == 0
     if noise is not None:
-        product[at_zero] -= float((noise.variance(mean[known]) / mean[known] ** 2).mean())
+        product[at_zero] -= float((noise.variance(mean[usable]) / mean[usable] ** 2).mean())
     kept = (count > 0.05 * count.max()) & (~at_zero if noise is None else True)
     narrowest = 0.0 if noise is not None else channel.step / 2  # nothing tells narrower ones from noise
-    return _width(distance[kept], product[kept], np.asarray(_WIDTHS[narrowest < _WIDTHS], dtype=np.float64))
+    return _fitted(distance[kept], product[kept], np.asarray(_WIDTHS[narrowest < _WIDTHS], dtype=np.float64))
 
 
-def _autocorrelation(contrast: FloatImage, known: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _autocorrelation(contrast: FloatImage, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Distances (px) up to `FARTHEST`, the mean product of samples so far apart, and how many there are."""
     from scipy.fft import irfft2, next_fast_len, rfft2
 
     size = [next_fast_len(side + FARTHEST + 1, real=True) for side in contrast.shape]
     sums, pairs = (
-        irfft2(np.abs(rfft2(one, s=size)) ** 2, s=size) for one in (contrast.astype(np.float64), known.astype(float))
+        irfft2(np.abs(rfft2(image, s=size)) ** 2, s=size)
+        for image in (contrast.astype(np.float64), usable.astype(float))
     )
     lag = np.arange(-FARTHEST, FARTHEST + 1)
     square = np.minimum(lag[:, None] ** 2 + lag**2, FARTHEST**2 + 1)
     totals, counts = (
-        np.bincount(square.ravel(), weights=one[np.ix_(lag, lag)].ravel())[:-1] for one in (sums, np.round(pairs))
+        np.bincount(square.ravel(), weights=image[np.ix_(lag, lag)].ravel())[:-1] for image in (sums, np.round(pairs))
     )
-    seen = np.flatnonzero(counts > 0)
-    return np.sqrt(seen.astype(np.float64)), np.asarray(totals[seen] / counts[seen]), counts[seen].astype(np.float64)
+    met = np.flatnonzero(counts > 0)
+    return np.sqrt(met.astype(np.float64)), np.asarray(totals[met] / counts[met]), counts[met].astype(np.float64)
 
 
-def _width(distance: FloatArray, product: FloatArray, widths: FloatArray) -> float:
-    """Full width at half maximum of ``sum w exp(-r^2/2s^2) - c`` with w, c >= 0, fitted to the products."""
+def _fitted(distance: FloatArray, product: FloatArray, widths: FloatArray) -> TextureModel | None:
+    """``sum w exp(-r^2/2s^2) - c`` with w, c >= 0, fitted to the products."""
     importance = 1 / (1 + distance)
     system = np.column_stack([np.exp(-0.5 * (distance[:, None] / widths) ** 2), -np.ones(distance.size)])
     scale = float(np.abs(product).max()) or 1.0
-    fitted = nnls(system * importance[:, None], product / scale * importance)[0]
-    r = np.arange(0, FARTHEST, 0.01)
-    curve = np.exp(-0.5 * (r[:, None] / widths) ** 2) @ fitted[:-1] - fitted[-1]
-    below = np.flatnonzero(curve < curve[0] / 2)
-    return float(2 * r[below[0]]) if curve[0] > 0 and below.size else float("nan")
+    solution = nnls(system * importance[:, None], product / scale * importance)[0]
+    total, kept = solution[:-1].sum() - solution[-1], solution[:-1] > 0
+    if not total > 0:
+        return None
+    weights = solution[:-1][kept] / total
+    offset = min(1 - float(weights.sum()), 0.0)
+    model = TextureModel(weights=tuple(weights.tolist()), widths=tuple(widths[kept].tolist()), offset=offset)
+    return model if model.diameter < 2 * FARTHEST else None
 
 
 def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
@@ -147,9 +153,9 @@ def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
         lattice = inside & np.isfinite(channel.values) & ~channel.saturated
         phases = [(p, q) for p in range(channel.step) for q in range(channel.step)]
         left = [_unpredicted(image, lattice, phase, channel.step) for phase in phases]
-        found = np.concatenate([one for one in left if one.size] or [np.full(1, np.nan)])
+        rest = np.concatenate([part for part in left if part.size] or [np.full(1, np.nan)])
         level = float(np.nanmean(mean[lattice])) if lattice.any() else float("nan")
-        estimates.append(1.4826 * float(np.median(np.abs(found))) * level)
+        estimates.append(1.4826 * float(np.median(np.abs(rest))) * level)
     return estimates
 
 
@@ -170,7 +176,7 @@ def _unpredicted(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], 
         return np.empty(0, dtype=np.float32)
     # the sample itself takes no part in the choice; dark places would be flattest, but have less photon noise
     others = np.delete(patches, 12, axis=1)
-    patches, others = (one[others.mean(axis=1) >= 0] for one in (patches, others))
+    patches, others = (part[others.mean(axis=1) >= 0] for part in (patches, others))
     if len(patches) < 100:
         return np.empty(0, dtype=np.float32)
     spread = others.std(axis=1)

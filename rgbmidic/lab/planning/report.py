@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic import __version__
-from rgbmidic.errors import ResultError
+from rgbmidic.lab.output import check_folder, write_document
 from rgbmidic.lab.planning.lamps import Proposal
 from rgbmidic.lab.planning.plan import Outlook, Plan
 from rgbmidic.report.figures import _LIGHT_COLOURS, _STYLE, save_figure
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "check_folder",
+    "FILES",
     "lamp_rows",
     "plan_document",
     "plan_figure",
@@ -35,13 +34,7 @@ __all__ = [
 ]
 
 FILES = ("plan.json", "plan.png")
-
-
-def check_folder(out: Path, *, overwrite: bool) -> None:
-    """Raise `ResultError` where a plan would be overwritten."""
-    taken = [name for name in FILES if (out / name).exists()]
-    if taken and not overwrite:
-        raise ResultError(f"{out / taken[0]} is already there; state --overwrite or choose another folder")
+"""What `write_plan` writes."""
 
 
 def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwrite: bool = False) -> None:
@@ -61,13 +54,8 @@ def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwri
     ResultError
         A plan is already there, or the folder cannot be written.
     """
-    check_folder(out, overwrite=overwrite)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(plan_document(plan, proposals), indent=2, allow_nan=False)
-        (out / "plan.json").write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ResultError(f"{out} cannot be written: {error.strerror or error}") from None
+    check_folder(out, FILES, overwrite=overwrite)
+    write_document(plan_document(plan, proposals), out / "plan.json")
     save_figure(plan_figure(plan, proposals), out / "plan.png")
 
 

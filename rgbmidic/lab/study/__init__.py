@@ -13,11 +13,10 @@ from rgbmidic.lab.study.perturbation import (
     residual_percent,
 )
 from rgbmidic.lab.study.topography import (
-    Roughness,
     detrend,
     local_slope,
     paint_classes,
-    roughness,
+    rms_slope,
     slope_uncertainty,
     wrinkle_spacing,
 )
@@ -36,7 +35,6 @@ __all__ = [
     "Measurement",
     "Method",
     "PaperStudy",
-    "Roughness",
     "SceneStudy",
     "SetUpThreshold",
     "area_means",
@@ -52,7 +50,7 @@ __all__ = [
     "perturbation",
     "pixel_levels",
     "residual_percent",
-    "roughness",
+    "rms_slope",
     "run_paper_study",
     "set_up_threshold",
     "slope_uncertainty",

@@ -114,11 +114,6 @@ class Cause:
     inside: FloatArray
     outside: FloatArray
 
-    @property
-    def ratio(self) -> FloatArray:
-        """P in the reflection over P far from it."""
-        return self.inside / self.outside
-
 
 def find_causes(
     angles: Sequence[float] = (0.333, 1.0, 8.0),

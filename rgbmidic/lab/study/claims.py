@@ -396,8 +396,8 @@ def _of_specimen(study: PaperStudy) -> list[Claim]:
         _plate(
             "Fig. 11",
             "slopes up to 15°, with an uncertainty of 0.23° for heights good to 0.1 um",
-            f"99.9th percentile {steepest:.1f}° (rms {relief.white.rms_slope_deg:.1f}° on white, "
-            f"{relief.black.rms_slope_deg:.1f}° on black); uncertainty {relief.slope_std:.2f}°",
+            f"99.9th percentile {steepest:.1f}° (rms {relief.white_deg:.1f}° on white, "
+            f"{relief.black_deg:.1f}° on black); uncertainty {relief.slope_std:.2f}°",
             "in part",
             f"The paint has 6° rms and 15° at its steepest; central differences at a pitch of {relief.pitch:g} um show "
             "three quarters of the slope of waves 25 um long, so that slopes read from such a map, the paper's "

@@ -186,10 +186,6 @@ class PaperStudy:
     noise: NoiseOfLights
     causes: tuple[Cause, ...]
 
-    def scene(self, name: str) -> SceneStudy | None:
-        """The scene of that name, where it was run."""
-        return next((scene for scene in self.scenes if scene.bench.name == name), None)
-
 
 def run_paper_study(
     angles: Sequence[float] = ANGLES,

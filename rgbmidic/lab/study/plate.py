@@ -10,11 +10,10 @@ import numpy.typing as npt
 from rgbmidic.lab.study.bench import DSLR, study_paint
 from rgbmidic.lab.study.goniometry import Goniometry, goniometry, pixel_levels
 from rgbmidic.lab.study.topography import (
-    Roughness,
     detrend,
     local_slope,
     paint_classes,
-    roughness,
+    rms_slope,
     slope_uncertainty,
     wrinkle_spacing,
 )
@@ -57,8 +56,8 @@ class Topography:
         Distance between the points, um.
     slope_std
         Standard uncertainty of the slope, degrees.
-    white, black
-        Roughness of the two paints; heights in um.
+    white_deg, black_deg
+        Root mean square slope of the two paints.
     spacing
         Distance between wrinkles and its standard uncertainty, um.
     """
@@ -68,8 +67,8 @@ class Topography:
     slope: FloatArray
     pitch: float
     slope_std: float
-    white: Roughness
-    black: Roughness
+    white_deg: float
+    black_deg: float
     spacing: tuple[float, float]
 
     @classmethod
@@ -96,8 +95,8 @@ class Topography:
             slope=local_slope(flat, pitch),
             pitch=pitch,
             slope_std=slope_uncertainty(height_std, pitch),
-            white=roughness(flat, white & known, pitch, height_std=height_std, cutoff=20 * pitch),
-            black=roughness(flat, ~white & known, pitch, height_std=height_std, cutoff=20 * pitch),
+            white_deg=rms_slope(flat, white & known, pitch, height_std=height_std),
+            black_deg=rms_slope(flat, ~white & known, pitch, height_std=height_std),
             spacing=wrinkle_spacing(flat, pitch, longest=12 * pitch),
         )
 

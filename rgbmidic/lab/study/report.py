@@ -38,7 +38,9 @@ def check_folder(out: Path | str, *, overwrite: bool = False) -> Path:
     out = Path(out)
     try:
         if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not overwrite)):
-            raise ResultError(f"{out} already exists and is not empty; give another folder or --overwrite it")
+            raise ResultError(
+                f"{out} is there and not empty; choose another folder, or overwrite it (overwrite=True, --overwrite)"
+            )
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ResultError(f"{out} cannot be made: {error.strerror or error}") from None

@@ -1,4 +1,4 @@
-"""Topography of a speckle: form taken off, local slopes, roughness of the two paints, distance between wrinkles.
+"""Topography of a speckle: form taken off, local slopes, distance between wrinkles.
 
 Paper, section 2.4: a height map of the painted surface and its intensity map, from a confocal sensor.
 """
@@ -6,7 +6,6 @@ Paper, section 2.4: a height map of the painted surface and its intensity map, f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
@@ -16,34 +15,13 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Roughness", "detrend", "local_slope", "paint_classes", "roughness", "slope_uncertainty", "wrinkle_spacing"]
+__all__ = ["detrend", "local_slope", "paint_classes", "rms_slope", "slope_uncertainty", "wrinkle_spacing"]
 
 
 _OCTAVE = 0.1
 """Standard deviation, in the logarithm of the frequency, of the window that smooths the spectrum."""
 _BLOCKS = 3
 """The map is cut into this many blocks along each side to find the uncertainty of the spacing."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Roughness:
-    """Roughness of one paint.
-
-    Attributes
-    ----------
-    share
-        Of the map's points.
-    rms, mean
-        Root mean square (Sq) and mean absolute (Sa) height about the local mean, in the unit of the map.
-    rms_slope_deg, steepest_deg
-        Root mean square local slope, measurement noise taken off, and its 99th percentile as measured.
-    """
-
-    share: float
-    rms: float
-    mean: float
-    rms_slope_deg: float
-    steepest_deg: float
 
 
 def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
@@ -106,10 +84,8 @@ def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
     return np.asarray(known & (grey > level))
 
 
-def roughness(
-    height: npt.ArrayLike, where: BoolArray, pitch: float, *, height_std: float = 0.0, cutoff: float = 0.1
-) -> Roughness:
-    """Roughness of one paint.
+def rms_slope(height: npt.ArrayLike, where: BoolArray, pitch: float, *, height_std: float = 0.0) -> float:
+    """Root mean square local slope of one paint in degrees, measurement noise taken off.
 
     Parameters
     ----------
@@ -120,30 +96,21 @@ def roughness(
     pitch
         Distance between the points, in the unit of the height.
     height_std
-        Standard uncertainty of a height; its share of the rms slope is taken off.
-    cutoff
-        Waves longer than this belong to the relief of the droplets, not to the roughness: a Gaussian profile filter
-        (ISO 16610-21) over this paint alone takes them off.
+        Standard uncertainty of a height; its share of the slope is taken off.
+
+    Raises
+    ------
+    InputError
+        No measured height lies on the paint, with its neighbours.
     """
     values = _as_map(height)
-    used = where & np.isfinite(values)
-    if not used.any():
+    used = (where & np.isfinite(values)).astype(np.uint8)
+    slope = local_slope(values, pitch)[cv2.erode(used, np.ones((3, 3), np.uint8), borderValue=0).astype(bool)]
+    slope = slope[np.isfinite(slope)]
+    if not slope.size:
         raise InputError("no measured height lies on this paint")
-    rough = (values - _waviness(values, used, cutoff / pitch))[used]
-    slope = local_slope(values, pitch)
-    inside = slope[cv2.erode(used.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0).astype(bool)]
-    inside = inside[np.isfinite(inside)]
-    square, steepest = float("nan"), float("nan")
-    if inside.size:
-        square = float((np.tan(np.radians(inside)) ** 2).mean() - height_std**2 / pitch**2)
-        steepest = float(np.percentile(inside, 99))
-    return Roughness(
-        share=float(used.mean()),
-        rms=float(np.sqrt((rough**2).mean())),
-        mean=float(np.abs(rough).mean()),
-        rms_slope_deg=math.degrees(math.atan(math.sqrt(max(square, 0)))) if inside.size else float("nan"),
-        steepest_deg=steepest,
-    )
+    square = float((np.tan(np.radians(slope)) ** 2).mean() - height_std**2 / pitch**2)
+    return math.degrees(math.atan(math.sqrt(max(square, 0))))
 
 
 def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.06) -> tuple[float, float]:
@@ -190,14 +157,6 @@ def _as_map(values: npt.ArrayLike) -> FloatArray:
     if array.ndim != 2 or min(array.shape) < 3:
         raise InputError(f"a map has at least 3 x 3 points in two dimensions, not shape {array.shape}")
     return array
-
-
-def _waviness(values: FloatArray, used: BoolArray, cutoff: float) -> FloatArray:
-    """Gaussian profile filter with a cut-off in points: a wave of that length keeps half its height."""
-    sigma = cutoff * math.sqrt(math.log(2) / 2) / math.pi
-    weight = cv2.GaussianBlur(used.astype(np.float64), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-    total = cv2.GaussianBlur(np.where(used, values, 0.0), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(total / np.maximum(weight, 1e-9))
 
 
 def _ring_spectrum(values: FloatArray, pitch: float, longest: float) -> tuple[FloatArray, FloatArray]:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.calibration import Crosstalk
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
 from rgbmidic.illumination.separate import DEMOSAICERS, separate
 from rgbmidic.illumination.unmix import NEGLIGIBLE, unmix
 
@@ -15,10 +15,10 @@ A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 LIGHTS = ("red", "green", "blue")
 
 
-def channels_of(lights, matrix, valid=None, noise=None):
+def channels_of(lights, matrix, valid=None):
     values = np.tensordot(matrix, lights, axes=1)
     valid = np.ones(values.shape, bool) if valid is None else valid
-    return LinearChannels(values=values.astype(np.float32), valid=valid, full_scale=4000.0, noise=noise)
+    return LinearChannels(values=values.astype(np.float32), valid=valid, full_scale=4000.0)
 
 
 @settings(deadline=None, max_examples=40)
@@ -58,18 +58,6 @@ def test_a_channel_without_any_value_adds_nothing_to_the_lights_that_hardly_need
     images = unmix(values, Crosstalk(matrix=matrix, lights=LIGHTS))
     assert images.valid[:, 1, 2].tolist() == [False, True, True]
     np.testing.assert_allclose(images.values[1:, 1, 2], [110, 100], rtol=1e-5)
-
-
-def test_covariance_predicts_the_scatter_of_unmixed_noise():
-    rng = np.random.default_rng(5)
-    noise = NoiseModel(gain=4.0, read_noise=3.0)
-    clean = np.tensordot(A, np.array([400.0, 900.0, 1500.0]), axes=1)[:, None, None]
-    noisy = clean + np.sqrt(noise.variance(clean)) * rng.standard_normal((3, 400, 400))
-    channels = LinearChannels(
-        values=noisy.astype(np.float32), valid=np.ones(noisy.shape, bool), full_scale=4000.0, noise=noise
-    )
-    images = unmix(channels, Crosstalk(matrix=A, lights=LIGHTS))
-    np.testing.assert_allclose(images.covariance, np.cov(images.values.reshape(3, -1)), rtol=0.05, atol=2)
 
 
 def test_wrong_number_of_channels_is_an_error():

@@ -89,7 +89,7 @@ def test_nothing_is_overwritten_unless_asked(made, tmp_path):
     assert (tmp_path / "plan" / "plan.png").stat().st_size > 10_000
     write_plan(plan, {}, tmp_path / "plan", overwrite=True)
     (tmp_path / "file").write_text("x")
-    with pytest.raises(ResultError, match="cannot be written"):
+    with pytest.raises(ResultError, match="is a file"):
         write_plan(plan, {}, tmp_path / "file")
 
 

@@ -1,0 +1,175 @@
+"""Displacement uncertainty expected from one frame, in closed form: nothing is solved.
+
+As in `rgbmidic.scene.forecast` the covariance of the nodes is ``M^-1 S M^-1``, with M the Hessian of the weighted sum
+over the lights and S the covariance of its right-hand side. M follows from the speckle's autocorrelation and the
+contrast of each light; S from the `Disturbances` of two states, each convolved with a kernel whose transfer function is
+the root of the spectrum of the speckle's gradient. Every light counts with the inverse variance of its residual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import scipy.sparse as sp
+
+from rgbmidic.correlation.assembly import Assembly, factorise
+from rgbmidic.correlation.equations import SEEN
+from rgbmidic.correlation.images import PREFILTERS, apply_prefilter
+from rgbmidic.correlation.node_status import LOST
+from rgbmidic.correlation.uncertainty.propagation import NodeColouring, displacement_functionals, functional_std
+from rgbmidic.illumination.normalise import local_mean
+from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.lab.inspection.disturbances import Disturbances
+from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = ["Prediction", "nodal_std", "predict"]
+
+
+_GRID, _REACH = 64, 16
+"""Frequencies on which the kernel is computed, and the distance (px) to which it is kept: speckle's gradients are
+correlated over a speckle or two."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """Standard uncertainty of u, and of v, at the nodes (N,), px; NaN where a node is not measured.
+
+    Attributes
+    ----------
+    std
+        Of all lights together.
+    noise, mosaic
+        The parts of it from camera noise, and from what the mosaic did not sample.
+    alone : tuple of ndarray
+        Of every light alone.
+    """
+
+    std: FloatArray
+    noise: FloatArray
+    mosaic: FloatArray
+    alone: tuple[FloatArray, ...]
+
+    @classmethod
+    def unknown(cls, nodes: int, lights: int) -> Prediction:
+        """That nothing is measured: there is no texture."""
+        nothing = np.full(nodes, np.nan)
+        return cls(std=nothing, noise=nothing, mosaic=nothing, alone=(nothing,) * lights)
+
+
+def predict(
+    mesh: Tri3Mesh,
+    region: Region,
+    *,
+    contrast: FloatImage,
+    level: FloatImage,
+    disturbances: Disturbances,
+    texture: TextureModel,
+    prefilter: str,
+) -> Prediction:
+    """What a second state of a frame is expected to be measured with.
+
+    Parameters
+    ----------
+    mesh, region
+        What is measured.
+    contrast, level : ndarray, shape (k, H, W)
+        Local standard deviation of each light in units of its local mean, 0 where the light is not known; and that
+        mean, DN.
+    disturbances
+        Of one state, DN; those of the other are as large and independent.
+    texture
+        The speckle's autocorrelation.
+    prefilter
+        Of the solve (`rgbmidic.correlation.images.PREFILTERS`).
+    """
+    relative = disturbances.map(lambda images: np.divide(images, level, out=np.zeros_like(images), where=contrast > 0))
+    own = contrast**2 - _smooth(relative.variance, region.mask, mesh.size)
+    contrast = np.sqrt(np.maximum(own, 0) * (contrast > 0))
+    residual = relative.map(lambda images: _each(images, lambda image: apply_prefilter(image, prefilter))).variance
+    variance = _smooth(residual, region.mask, mesh.size)
+    pull = np.divide(contrast, variance, out=np.zeros_like(contrast), where=variance > 0)
+    energy, kernel = _gradient(texture, prefilter)
+    scores = relative.map(
+        lambda images: _each(images, lambda image: np.asarray(cv2.filter2D(image, -1, kernel), dtype=np.float32))
+    )
+    pixels = PixelMap.from_mesh(mesh, region)
+
+    def std(pull: FloatImage, *parts: FloatImage) -> FloatArray:
+        """Of lights that pull so much, from some of the draws (n, k, H, W)."""
+        square = sum(((pull * part).sum(axis=1) ** 2).mean(axis=0) for part in parts if len(part))
+        score = 2 * _smooth(np.asarray(square, dtype=np.float32)[None], region.mask, mesh.size)[0]
+        information = energy * (pull * contrast).sum(axis=0)
+        return nodal_std(mesh, _element_means(information, pixels), _element_means(score, pixels))
+
+    noise, mosaic = scores.noise[None], scores.mosaic
+    each = [np.where(np.arange(len(pull))[:, None, None] == light, pull, 0) for light in range(len(pull))]
+    return Prediction(
+        std=std(pull, noise, mosaic),
+        noise=std(pull, noise),
+        mosaic=std(pull, mosaic) if len(mosaic) else np.zeros(len(mesh.nodes)),
+        alone=tuple(std(alone, noise, mosaic) for alone in each),
+    )
+
+
+def nodal_std(mesh: Tri3Mesh, information: FloatArray, score: FloatArray) -> FloatArray:
+    """Standard uncertainty (N,) of a displacement component at the nodes, px; NaN where they see too little.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    information, score : ndarray, shape (E,)
+        Per pixel of each element: of the Hessian, and of the variance of the right-hand side.
+    """
+    area = mesh.to_nodes(mesh.areas)
+    density = mesh.to_nodes(information * mesh.areas) / area
+    seen = density > SEEN * np.median(density[density > 0]) if (density > 0).any() else np.zeros(len(density), bool)
+    if not seen.any():
+        return np.full(len(density), np.nan)
+    assembly = Assembly.from_mesh(mesh)
+    mass = ((1 + np.eye(3)) / 12)[..., None] * np.array([1.0, 0.0, 1.0])
+
+    def assembled(values: FloatArray) -> sp.csc_matrix:
+        return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
+
+    # elements that no light sees must not make the system singular
+    solve = factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
+    along_x = displacement_functionals(len(density))[:1]
+    std = functional_std(solve, assembled(score), NodeColouring.from_mesh(mesh), along_x, seen)[:, 0]
+    return np.where(seen & (std < LOST), std, np.nan)
+
+
+def _gradient(texture: TextureModel, prefilter: str) -> tuple[float, FloatImage]:
+    """Mean square (px^-2) of the texture's gradient along a direction after the prefilter; and the kernel that turns a
+    disturbance into one whose square, per pixel, is the variance of the right-hand side."""
+    frequency = np.fft.fftfreq(_GRID)
+    taps = PREFILTERS[prefilter]
+    place = np.arange(len(taps)) - len(taps) // 2
+    line = (taps @ np.cos(2 * np.pi * place[:, None] * frequency)) ** 2
+    filtered = np.outer(line, line)
+    radius = np.hypot(frequency[:, None], frequency)
+    gradient = (2 * np.pi * radius) ** 2 / 2 * texture.spectrum(radius)
+    kernel = np.fft.fftshift(np.fft.ifft2(np.sqrt(gradient) * filtered).real)
+    near = slice(_GRID // 2 - _REACH, _GRID // 2 + _REACH + 1)
+    return float((gradient * filtered).mean()), kernel[near, near].astype(np.float32)
+
+
+def _each(images: FloatImage, change: Callable[[FloatImage], FloatImage]) -> FloatImage:
+    """Every image (H, W) of a stack (..., H, W) changed."""
+    flat = [change(image) for image in images.reshape(-1, *images.shape[-2:])]
+    return np.array(flat, dtype=np.float32).reshape(images.shape)
+
+
+def _smooth(images: FloatImage, inside: BoolArray, width: float) -> FloatImage:
+    """Local means of images (n, H, W) over what lies inside the region, over about an element and its neighbours."""
+    return np.stack([np.nan_to_num(local_mean(np.where(inside, image, np.float32(np.nan)), width)) for image in images])
+
+
+def _element_means(image: FloatImage, pixels: PixelMap) -> FloatArray:
+    """Mean (E,) of an image (H, W) over the pixels of each element; 0 for one without pixels."""
+    total = np.concatenate([[0.0], np.cumsum(pixels.gather(image), dtype=np.float64)])[pixels.offsets]
+    return np.asarray(np.diff(total) / np.maximum(np.diff(pixels.offsets), 1))
