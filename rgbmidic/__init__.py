@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rgbmidic.correlation import NodeStatus, Solution, Status, correlate
     from rgbmidic.errors import RgbmidicError
-    from rgbmidic.frames.readers import read_frame
+    from rgbmidic.frames import read_frame
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.lab.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import Region, Tri3Mesh
@@ -55,7 +55,7 @@ _HOMES = {
     "correlate": "rgbmidic.correlation",
     "inspect_frame": "rgbmidic.lab.inspection",
     "measure": "rgbmidic.pipeline",
-    "read_frame": "rgbmidic.frames.readers",
+    "read_frame": "rgbmidic.frames",
     "read_test": "rgbmidic.settings",
 }
 

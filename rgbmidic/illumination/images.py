@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["REFLECTING", "IlluminationImages"]
@@ -36,6 +37,9 @@ class IlluminationImages:
     reflection_index : ndarray, shape (k, H, W), float32, or None
         Share of a light that is not diffuse, from a single frame: 0 where its contrast is that of the light with the
         most contrast there, towards 1 in its reflection; None where the separation does not tell.
+    texture : TextureModel or None
+        The speckle's autocorrelation that the separation took, to be shared by all frames of a test; None where it
+        needs none.
     """
 
     values: FloatImage
@@ -44,6 +48,7 @@ class IlluminationImages:
     full_scale: float
     covariance: FloatArray | None = None
     reflection_index: FloatImage | None = None
+    texture: TextureModel | None = None
 
     def __post_init__(self) -> None:
         values = np.ascontiguousarray(self.values, dtype=np.float32)

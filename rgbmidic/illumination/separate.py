@@ -10,7 +10,7 @@ import numpy as np
 
 from rgbmidic._kernels.kriging import TILE
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, gather_moments, learn_texture
+from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic import (
     BandLimitedDemosaicer,
@@ -22,7 +22,6 @@ from rgbmidic.illumination.demosaic import (
     Reconstruction,
     ReflectionAwareDemosaicer,
 )
-from rgbmidic.illumination.demosaic.base import red_position
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearMosaic
@@ -35,7 +34,6 @@ __all__ = [
     "DEMOSAICERS",
     "Separated",
     "Separator",
-    "frame_texture",
     "separate",
     "separate_reflections",
 ]
@@ -133,21 +131,6 @@ def separate(
     return DEMOSAICERS[method](mosaic, crosstalk, texture)
 
 
-def frame_texture(mosaic: LinearMosaic, method: str = DEFAULT_METHOD) -> TextureModel | None:
-    """The speckle's autocorrelation as a frame shows it, for `separate` of all frames of a test; None if the method
-    does not use it.
-
-    Raises
-    ------
-    InputError
-        Unknown method.
-    """
-    if _chosen(method, mosaic) != "reflection-aware" or min(mosaic.values.shape) < SMALLEST_FRAME:
-        return None
-    values = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
-    return learn_texture(gather_moments(values, red_position(mosaic.cfa), mosaic.noise))
-
-
 def _chosen(method: str, mosaic: LinearMosaic) -> str:
     """The method meant, "auto" resolved."""
     if method == "auto":
@@ -190,7 +173,7 @@ def _lights(found: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:
     images = unmix(found.channels, crosstalk)
     index = _enlarged(_reflection_index(found.factors, found.mean, crosstalk), BLOCK, images.shape)
     noise = None if found.noise is None else crosstalk.unmixing @ found.noise @ crosstalk.unmixing.T
-    return replace(images, covariance=noise, reflection_index=index)
+    return replace(images, covariance=noise, reflection_index=index, texture=found.texture)
 
 
 def _reflection_index(factors: ColourFactors, mean: FloatImage, crosstalk: Crosstalk) -> FloatArray:

@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Reference, SolveOptions
+from rgbmidic.correlation import Deformed, Reference, Start, track
 from rgbmidic.errors import CalibrationError, ResultError
 from rgbmidic.fields import at_nodes, field_rms
-from rgbmidic.frames.series import open_frames
+from rgbmidic.frames import open_series
+from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import Separator, Start, measure, read_region, texture, track
+from rgbmidic.pipeline import Separation, correlated, measure, read_region
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray
@@ -159,9 +160,10 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
 
 def _each_light_alone(settings: TestSettings, mesh: Tri3Mesh) -> list[list[FloatArray]]:
     """Displacement (N, 2) of every frame from each light's images alone, with the same solver."""
-    separator = Separator.from_settings(settings)
-    frames = open_frames(settings.frames, settings.base)
-    images = [texture(separator(frames.read(index)), settings) for index in range(len(frames))]
+    assert settings.calibration_file is not None
+    separation = Separation(calibration=Calibration.read(settings.calibration_file))
+    frames = open_series(settings.frames, settings.base)
+    images = [correlated(separation(frames.read(index)), settings.illumination) for index in range(len(frames))]
     region = read_region(settings.region, images[0].shape[1:])
     singles = []
     for light in range(len(images[0])):
@@ -171,7 +173,7 @@ def _each_light_alone(settings: TestSettings, mesh: Tri3Mesh) -> list[list[Float
         start = Start(displacement=fields[0])
         for stack in stacks[1:]:
             deformed = Deformed.prepare(stack, prefilter="binomial")
-            solution = track(reference, deformed, start, SolveOptions(), search_radius=64.0)
+            solution = track(reference, deformed, start, settings.solver)
             start = start.after(solution)
             fields.append(solution.displacement)
         singles.append(fields)

@@ -118,7 +118,7 @@ def residual_figure(result: Result) -> Figure:
 
 
 def convergence_figure(result: Result) -> Figure:
-    """Largest motion of a node in each iteration, one line per deformed frame, with the tolerance where it is known."""
+    """Largest motion of a measured node in each iteration, a line per deformed frame, and the tolerance if known."""
     shown = shown_frames(result)
     frames = shown[:: math.ceil(len(shown) / _MOST_LINES)]
 
@@ -131,7 +131,7 @@ def convergence_figure(result: Result) -> Figure:
         if (tolerance := result.setting("solver", "tolerance")) is not None:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
         axis.set_yscale("log")
-        finish_plot(axis, "iteration", "largest motion of a node (px)")
+        finish_plot(axis, "iteration", "largest motion of a measured node (px)")
         if len(frames) <= _MANY_FRAMES:
             figure.legend(loc="outside right upper")
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from rgbmidic import __version__
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.frames.series import file_hash
+from rgbmidic.frames import file_hash
 from rgbmidic.results.files import read_arrays, read_json, write_arrays, write_json, writing
 from rgbmidic.results.lock import release_lock, take_lock
 from rgbmidic.results.quantities import QUANTITIES, SHARED

@@ -11,8 +11,8 @@ import numpy as np
 
 from rgbmidic.correlation import Solution, correlate
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.frames import open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.readers import read_frame
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import ReflectionAwareDemosaicer
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
@@ -25,8 +25,13 @@ from rgbmidic.lab.inspection.repeat import BayerRepeat, noise_difference
 from rgbmidic.lab.inspection.results import BLIND, ChannelFacts, Inspection, LightFacts, Spread
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_size
 from rgbmidic.mesh import Region
-from rgbmidic.pipeline import Separator, read_region, with_camera
-from rgbmidic.settings import FrameSettings, IlluminationSettings, RegionSettings, SolverSettings, TestSettings
+from rgbmidic.pipeline import Separation, read_region
+from rgbmidic.settings import (
+    ELEMENT_SIZE,
+    FrameSettings,
+    RegionSettings,
+    TestSettings,
+)
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["inspect_files", "inspect_frame", "state_frames"]
@@ -71,19 +76,7 @@ def inspect_files(
     file = calibration or (test.calibration_file if test else None)
     known = None if file is None else Calibration.read(file)
     paths = [Path(one) for one in files]
-    told = with_camera(stated.frames, paths[0], known)
-    frames = tuple(
-        read_frame(
-            path,
-            kind=told.kind,
-            cfa=told.cfa,
-            black_level=told.black_level,
-            white_level=told.white_level,
-            shape=told.shape,
-            dtype=told.dtype,
-        )
-        for path in paths
-    )
+    frames = tuple(open_source(path, stated.frames, known).read(0) for path in paths)
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     place = Region.from_rectangle(region, shape) if region is not None else None
     if place is None and test is not None:
@@ -93,10 +86,10 @@ def inspect_files(
             frames,
             calibration=known,
             region=place,
-            element_size=element_size or (test.element_size if test else 25.0),
+            element_size=element_size or (test.element_size if test else ELEMENT_SIZE),
             demosaic=stated.illumination.demosaic,
             normalise=stated.illumination.normalise,
-            prefilter=stated.solver.prefilter or "binomial",
+            prefilter=stated.solver.prefilter,
             name=" + ".join(path.name for path in paths),
         )
     except InputError as error:
@@ -108,7 +101,7 @@ def inspect_frame(
     *,
     calibration: Calibration | None = None,
     region: Region | Sequence[float] | None = None,
-    element_size: float = 25.0,
+    element_size: float = ELEMENT_SIZE,
     demosaic: str = "auto",
     normalise: float = 10.0,
     prefilter: Prefilter = "binomial",
@@ -146,7 +139,7 @@ def inspect_frame(
         The region is empty, outside the frame or too small for one element.
     """
     frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
-    seen = _Seen.prepare(frames, calibration, region, demosaic, normalise)
+    seen = _Seen.prepare(frames, calibration, region, demosaic)
     images, index, texture = seen.lights(), None, None
     channels = seen.channel_facts()
     if isinstance(first := seen.linear[0], LinearMosaic):
@@ -217,15 +210,9 @@ def _settings(frames: FrameSettings | None, test: TestSettings | None) -> TestSe
     """The test's settings with other frames, or default ones; their region is not used."""
     if test is not None:
         return replace(test, frames=frames or test.frames)
-    return _plain("auto", 10.0, frames)
-
-
-def _plain(demosaic: str, normalise: float, frames: FrameSettings | None = None) -> TestSettings:
     return TestSettings(
         frames=frames or FrameSettings(path=("frame",)),
         region=RegionSettings(rectangle=(0.0, 0.0, 1.0, 1.0)),
-        illumination=IlluminationSettings(demosaic=demosaic, normalise=normalise),
-        solver=SolverSettings(),
         calibration_file=Path("calibration.json"),
     )
 
@@ -238,7 +225,7 @@ class _Seen:
     linear: list[LinearMosaic | LinearChannels]
     channels: list[Channel]
     region: Region
-    separator: Separator
+    separation: Separation
     crosstalk: Crosstalk
     crosstalk_known: bool
     noise: NoiseModel
@@ -252,7 +239,6 @@ class _Seen:
         calibration: Calibration | None,
         region: Region | Sequence[float] | None,
         demosaic: str,
-        normalise: float,
     ) -> _Seen:
         known = calibration or Calibration()
         linear = [linearise(one, known.noise) for one in frames]
@@ -272,7 +258,7 @@ class _Seen:
             linear=linear,
             channels=channels,
             region=place,
-            separator=Separator(settings=_plain(demosaic, normalise), calibration=replace(known, crosstalk=crosstalk)),
+            separation=Separation(calibration=replace(known, crosstalk=crosstalk), demosaic=demosaic),
             crosstalk=crosstalk,
             crosstalk_known=single or known.crosstalk is not None,
             noise=known.noise or NoiseModel(gain=float("inf"), read_noise=typical),
@@ -282,14 +268,14 @@ class _Seen:
 
     def lights(self) -> IlluminationImages:
         """One image per light, as the test would have them."""
-        return self.separator(self.frames)
+        return self.separation(self.frames)
 
     def differences(self, random: np.random.Generator) -> tuple[FloatImage, FloatImage]:
         """What two states differ by (k, H, W), DN, though nothing has moved; and the part from camera noise."""
         first = self.linear[0]
         if isinstance(first, LinearMosaic):
             model = ReflectionAwareDemosaicer(crosstalk=self.crosstalk).reconstruct(first)
-            method = self.separator.settings.illumination.demosaic
+            method = self.separation.demosaic
             repeat = BayerRepeat(mosaic=first, model=model, crosstalk=self.crosstalk, method=method, noise=self.noise)
             return repeat.draw(random)
         full = [one for one in self.linear if isinstance(one, LinearChannels)]

@@ -19,6 +19,7 @@ from rgbmidic.lab.study.goniometry import Goniometry
 from rgbmidic.lab.study.perturbation import area_means, area_stds, residual_percent
 from rgbmidic.lab.study.plate import Topography, virtual_goniometry, virtual_topography
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.disturbed_zone import SetUpThreshold, set_up_threshold
 from rgbmidic.weights.threshold import blurred, threshold_weights
@@ -430,16 +431,15 @@ def _frontier(ripple: FloatArray, competitor: Competitor, images: IlluminationIm
         edge |= np.asarray(cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)), dtype=np.uint8)
     distance = cv2.distanceTransform(1 - edge, cv2.DIST_L2, 5) if edge.any() else np.full(images.shape, np.inf)
     known = np.isfinite(ripple)
-    beside = known & (distance > _ELEMENT) & (distance <= 3 * _ELEMENT)
+    beside = known & (distance > ELEMENT_SIZE) & (distance <= 3 * ELEMENT_SIZE)
     sides = [beside & (masks.sum(axis=0) == count) for count in range(len(masks) + 1)]
-    level = max((float((ripple[side] ** 2).mean()) for side in sides if side.sum() >= 20 * _ELEMENT**2), default=0.0)
-    band = known & (distance <= _ELEMENT)
-    if level == 0 or band.sum() < 20 * _ELEMENT**2:
+    level = max(
+        (float((ripple[side] ** 2).mean()) for side in sides if side.sum() >= 20 * ELEMENT_SIZE**2), default=0.0
+    )
+    band = known & (distance <= ELEMENT_SIZE)
+    if level == 0 or band.sum() < 20 * ELEMENT_SIZE**2:
         return float("nan")
     return float(np.sqrt((ripple[band] ** 2).mean() / level))
-
-
-_ELEMENT = 25.0
 
 
 def _relative(images: IlluminationImages) -> FloatImage:
