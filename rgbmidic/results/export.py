@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.files import write_complete
+from rgbmidic.results.files import write_complete, writing
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.results.result import Result
 
@@ -52,10 +52,13 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     out = Path(out)
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
-    if out.exists() and not (overwrite and out.is_file()):
-        raise ResultError(f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)")
-    if not out.parent.is_dir():
-        raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
+    with writing(out):
+        if out.exists() and not (overwrite and out.is_file()):
+            raise ResultError(
+                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
+            )
+        if not out.parent.is_dir():
+            raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
     write_complete(out, lambda file: _WRITERS[to](result, file))
 
 
