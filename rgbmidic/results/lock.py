@@ -29,8 +29,8 @@ def take_lock(file: Path) -> None:
         except FileExistsError:
             if _may_live(holder := _holder(file)):
                 raise ResultError(
-                    f"{file.parent} is in use by {holder.get('process', 'a process')} on "
-                    f"{holder.get('host', 'some host')}: give another folder, or delete {file} if that run is dead"
+                    f"{file.parent} is in use by process {holder.get('process', '?')} on {holder.get('host', '?')}; "
+                    f"give another folder, or delete {file} if that run is dead"
                 ) from None
             file.unlink(missing_ok=True)
             take_lock(file)

@@ -34,6 +34,7 @@ __all__ = ["SCHEMA_VERSION", "ResultStore"]
 
 SCHEMA_NAME = "rgbmidic-result"
 SCHEMA_VERSION = 3
+"""Goes up with every change of the quantities: a result of another version is refused, not guessed at."""
 
 _PROVENANCE, _MESH, _REFERENCE, _FRAMES = "provenance.json", "mesh.npz", "reference.npz", "solution"
 _LOCK = "in_use.json"

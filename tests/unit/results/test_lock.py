@@ -39,7 +39,7 @@ def test_second_run_is_refused_and_the_first_goes_on(tmp_path: Path) -> None:
     make_result(tmp_path / "out")
     with _create(tmp_path / "out", overwrite=True) as store:
         store.write_frame(0, random_record(0))
-        with pytest.raises(ResultError, match=rf"in use by {os.getpid()} on {socket.gethostname()}"):
+        with pytest.raises(ResultError, match=rf"in use by process {os.getpid()} on {socket.gethostname()}"):
             _create(tmp_path / "out", overwrite=True)
         store.write_frame(1, random_record(1))
         store.finish()
@@ -63,7 +63,7 @@ def test_only_the_lock_of_a_dead_process_of_this_host_is_taken_over(tmp_path: Pa
     assert not (tmp_path / "dead" / LOCK).exists()
     for name, process, host in (("alive", alive, here), ("elsewhere", dead, "elsewhere")):
         _write_lock(tmp_path / name, process, host)
-        with pytest.raises(ResultError, match=f"in use by {process} on {host}"):
+        with pytest.raises(ResultError, match=f"in use by process {process} on {host}"):
             _create(tmp_path / name)
     (tmp_path / "alive" / LOCK).write_text("half a li")
     with pytest.raises(ResultError, match=f"delete {tmp_path / 'alive' / LOCK}"):
