@@ -99,7 +99,8 @@ _ADVICE = {
     "camera's own file as DNG or 16-bit TIFF, without demosaicing",
     (".jpg", ".jpeg", ".bmp", ".gif", ".heic", ".webp"): "a picture that is no raw frame: let the camera record DNG or "
     "16-bit TIFF, without demosaicing",
-    (".raw", ".bin"): "a file without a camera's header: state frames.shape and frames.dtype (--shape, --dtype)",
+    (".raw", ".bin"): "a file without a camera's header: state its shape and dtype (frames.shape and frames.dtype, or "
+    "--shape and --dtype)",
 }
 """By endings, what files are that no format recognises, and what to do."""
 
@@ -113,9 +114,10 @@ class _UnknownFile(FrameSource):
     """A file that no format recognises: reading it says which are."""
 
     def _shape(self) -> NoReturn:
-        what = f": it is {text}" if (text := advice(self.path)) else ""
+        if text := advice(self.path):
+            raise FrameError(f"{self.path} is {text}")
         allowed = ", ".join(known.name for known in FORMATS)
-        raise FrameError(f"{self.path} is not a frame that rgbmidic reads{what} (allowed are {allowed})")
+        raise FrameError(f"{self.path} is not a frame that rgbmidic reads; allowed are {allowed}")
 
     def _stored(self, index: int) -> NoReturn:
         self._shape()

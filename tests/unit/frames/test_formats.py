@@ -285,7 +285,7 @@ def test_levels_that_contradict_each_other_are_no_fault_of_the_file(tmp_path: Pa
         ("f.MRAW", "export its frames"),
         ("f.avi", "compressed or demosaiced: export them from the camera's own file"),
         ("f.jpg", "no raw frame: let the camera record DNG"),
-        ("f.RAW", r"state frames\.shape and frames\.dtype \(--shape, --dtype\)"),
+        ("f.RAW", "header: state its shape and dtype .*frames.shape and frames.dtype, or --shape and --dtype"),
     ],
 )
 def test_a_file_that_is_not_read_says_what_to_do(tmp_path: Path, name: str, advice: str) -> None:
