@@ -42,7 +42,7 @@ def main() -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     handler = RichHandler(console=_messages, show_time=False, show_path=False, markup=False)
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    logging.getLogger("rgbmidic").addHandler(handler)  # not the root: other libraries talk to programmers
     sys.exit(_run(arguments, debug=debug))
 
 
