@@ -61,7 +61,8 @@ def measure_frame(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, St
     except Exception as error:  # whatever it is, the other frames can be measured
         reason = f"unexpected error: {type(error).__name__}: {error}"
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
-    return FrameRecord.failed(reason, nodes=len(plan.reference.mesh.nodes), lights=len(plan.images.names)), start
+    nodes, lights, number = len(plan.reference.mesh.nodes), len(plan.images.names), plan.series.numbers[index]
+    return FrameRecord.failed(reason, nodes=nodes, lights=lights, number=number), start
 
 
 def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
@@ -85,6 +86,7 @@ def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
     _tell_dark(name, images.names, brightness)
     record = FrameRecord.from_solution(
         kept,
+        number=plan.series.numbers[index],
         brightness=brightness,
         weights_thumbnail=_thumbnail(weights),
         reflection_thumbnail=None if images.reflection_index is None else _thumbnail(images.reflection_index),

@@ -146,7 +146,9 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
         for axis, (label, values) in zip(axes, panels.items(), strict=True):
             for light, series in zip(result.lights, values[frames].T, strict=True):
                 colour = LIGHT_COLOURS.get(light)
-                axis.plot(frames, series, marker="o", markersize=2.5, linewidth=1, label=light, color=colour)
+                axis.plot(
+                    result.number[frames], series, marker="o", markersize=2.5, linewidth=1, label=light, color=colour
+                )
             if np.nanmin(values, initial=0) >= 0:
                 axis.set_ylim(bottom=0)
             finish_plot(axis, "frame", label)

@@ -19,7 +19,7 @@ from rgbmidic.results.result import Result
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
 
-_CSV_HEAD = ("frame", "name", "status", "node", "node_status", "x", "y")
+_CSV_HEAD = ("frame", "number", "name", "status", "node", "node_status", "x", "y")
 
 
 def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool = False) -> None:
@@ -86,7 +86,7 @@ def _write_csv(result: Result, file: BinaryIO) -> None:
 
 def _csv_rows(result: Result, index: int, fields: Iterable[str]) -> Iterator[list[Any]]:
     record = result.frame(index)
-    head = [index, result.names[index], record.status]
+    head = [index, record.number, result.names[index], record.status]
     numbers = np.column_stack([result.nodes, *(record.values[name] for name in fields)])
     for node, (status, row) in enumerate(zip(record.node_status, numbers.tolist(), strict=True)):
         yield [*head, node, int(status), *("" if number != number else f"{number:.9g}" for number in row)]

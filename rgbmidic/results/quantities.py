@@ -99,6 +99,9 @@ _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
+    Quantity(
+        "number", (), "", "", "number of the frame: a frame that is missing leaves a gap", dtype=np.int64, blank=-1
+    ),
     Quantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
     Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
     Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),

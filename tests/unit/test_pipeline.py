@@ -409,3 +409,12 @@ def test_an_interruption_ends_the_run(bayer, tmp_path, monkeypatch):
     monkeypatch.setattr(frame, "track", interrupted)
     with pytest.raises(KeyboardInterrupt):
         measure(bayer.settings(), tmp_path / "result")
+
+
+def test_a_missing_frame_leaves_a_gap_in_the_numbers(copy):
+    moved = copy("frames")
+    last = sorted(moved.iterdir())[-1]
+    last.rename(last.with_name(last.name.replace(last.stem[-1], str(int(last.stem[-1]) + 1))))
+    settings = read_test(copy("TEST.toml"))
+    result = measure(settings, copy("result"))
+    assert result.number.tolist() == [*range(len(result) - 1), len(result)]
