@@ -17,7 +17,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
 from rgbmidic.settings import FrameSettings

@@ -20,7 +20,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames import file_hash
 from rgbmidic.results.files import read_arrays, read_json, write_arrays, write_json, writing

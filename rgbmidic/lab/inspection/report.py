@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.lab.output import check_folder, write_document

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.lab.output import check_folder, write_document
 from rgbmidic.lab.planning.lamps import Proposal
 from rgbmidic.lab.planning.plan import Outlook, Plan

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
 from rgbmidic.lab.study import figures as figures
 from rgbmidic.lab.study.causes import RADIUS, Cause
