@@ -150,21 +150,15 @@ def write_raw_test(folder: Path, f: FloatArray, g: FloatArray) -> None:
 
 def run_file(folder: Path, repeats: int) -> dict[str, Any]:
     """From a raw frame's file to its displacement, step by step; the reference is prepared once before."""
-    from rgbmidic import Tri3Mesh, read_test
-    from rgbmidic.correlation import Deformed, Reference, SolveOptions
-    from rgbmidic.frames.series import open_frames
-    from rgbmidic.pipeline import Separator, Start, read_region, texture, track
-    from rgbmidic.weights.threshold import light_weights
+    from rgbmidic import read_test
+    from rgbmidic.correlation import Deformed, Start, track
+    from rgbmidic.pipeline import Plan, correlated
 
     imports = peak_memory()
     settings = read_test(folder / "TEST.toml")
-    separator, frames = Separator.from_settings(settings), open_frames(settings.frames, settings.base)
-    first = separator(frames.read(0))
-    region = read_region(settings.region, first.shape)
-    mesh = Tri3Mesh.from_region(region, settings.element_size)
-    weights = light_weights(first, settings.weights)
-    reference = Reference.prepare(texture(first, settings), region, weights, mesh=mesh, prefilter="binomial")
-    start, steps = Start(displacement=np.zeros((len(mesh.nodes), 2))), dict[str, list[float]]()
+    plan = Plan.from_settings(settings)
+    start = Start(displacement=np.zeros_like(plan.reference.mesh.nodes))
+    steps = dict[str, list[float]]()
 
     def frame() -> Any:
         clock = [time.perf_counter()]
@@ -173,15 +167,15 @@ def run_file(folder: Path, repeats: int) -> dict[str, Any]:
             clock.append(time.perf_counter())
             steps.setdefault(name, []).append(clock[-1] - clock[-2])
 
-        raw = frames.read(1)
+        raw = plan.series.read(1)
         lap("read")
-        images = separator(raw)
+        images = plan.separation(raw)
         lap("linearise, demosaic, unmix")
-        ready, weights = texture(images, settings), light_weights(images, settings.weights)
+        ready, weights = correlated(images, settings.illumination), plan.weights.deformed(images, 1)
         lap("normalise, weights")
         deformed = Deformed.prepare(ready, weights, prefilter="binomial")
         lap("prefilter, spline")
-        solution = track(reference, deformed, start, SolveOptions(), search_radius=64.0)
+        solution = track(plan.reference, deformed, start, settings.solver)
         lap("solve, uncertainty")
         return solution
 
@@ -190,7 +184,7 @@ def run_file(folder: Path, repeats: int) -> dict[str, Any]:
         "seconds": seconds,
         "nodes": len(found.nodes),
         "iterations": found.iterations,
-        "error": rms_error(found.nodes, found.displacement[:, 1], len(reference.images[0])),
+        "error": rms_error(found.nodes, found.displacement[:, 1], len(plan.reference.images[0])),
         "steps": {name: min(times[1:]) for name, times in steps.items()},
         "imports": imports,
     }

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rgbmidic.correlation import NodeStatus, Solution, Status, correlate
     from rgbmidic.errors import RgbmidicError
-    from rgbmidic.frames.readers import read_frame
+    from rgbmidic.frames import read_frame
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.lab.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import Region, Tri3Mesh
     from rgbmidic.pipeline import measure
-    from rgbmidic.results.store import Result
+    from rgbmidic.results import Result
     from rgbmidic.settings import TestSettings, read_test
 
 __version__ = "0.1.0"
@@ -46,7 +46,7 @@ _HOMES = {
     "Inspection": "rgbmidic.lab.inspection",
     "NodeStatus": "rgbmidic.correlation",
     "Region": "rgbmidic.mesh",
-    "Result": "rgbmidic.results.store",
+    "Result": "rgbmidic.results",
     "RgbmidicError": "rgbmidic.errors",
     "Solution": "rgbmidic.correlation",
     "Status": "rgbmidic.correlation",
@@ -55,7 +55,7 @@ _HOMES = {
     "correlate": "rgbmidic.correlation",
     "inspect_frame": "rgbmidic.lab.inspection",
     "measure": "rgbmidic.pipeline",
-    "read_frame": "rgbmidic.frames.readers",
+    "read_frame": "rgbmidic.frames",
     "read_test": "rgbmidic.settings",
 }
 

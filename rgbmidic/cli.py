@@ -19,8 +19,7 @@ from rich.table import Table
 
 from rgbmidic import __version__
 from rgbmidic.errors import InputError, RgbmidicError
-from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.store import Result
+from rgbmidic.results import EXPORT_FORMATS, Result, export_result
 from rgbmidic.settings import FrameSettings
 
 __all__ = ["app", "main"]

@@ -19,6 +19,7 @@ from rgbmidic.errors import ConfigurationError
 
 __all__ = [
     "BAYER_PATTERNS",
+    "ELEMENT_SIZE",
     "FrameKind",
     "FrameSettings",
     "IlluminationSettings",
@@ -33,6 +34,9 @@ __all__ = [
 ]
 
 FrameKind = Literal["bayer", "rgb", "monochrome"]
+
+ELEMENT_SIZE = 25.0
+"""Side of the elements in px where nobody states another: the paper's (section 2.2)."""
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """The four phases of the Bayer colour filter array, named by the top-left 2x2 cell read row by row."""
@@ -186,7 +190,7 @@ class WeightSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolverSettings:
-    """The MIDIC minimisation (``[solver]``).
+    """The MIDIC minimisation (``[solver]``), and the options of `rgbmidic.correlate`.
 
     Attributes
     ----------
@@ -199,7 +203,8 @@ class SolverSettings:
         Grey-level correction: ``"global"``, a gain and offset per light; ``"local"``, both as linear shape functions on
         the mesh.
     curvature
-        Correct the nodal values for the curvature that linear elements cannot follow.
+        Correct the nodal values for the curvature that linear elements cannot follow. Without it the linear field is
+        the best fit, its nodes are off by what the correction would be, and that is part of their uncertainty.
     fill
         Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
         flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
@@ -211,7 +216,7 @@ class SolverSettings:
         Iterations before the frame counts as not converged.
     """
 
-    prefilter: Literal["none", "binomial", "gaussian"] | None = None
+    prefilter: Literal["none", "binomial", "gaussian"] = "binomial"
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
     brightness: Literal["none", "global", "local"] = "none"
     curvature: bool = False
@@ -256,7 +261,7 @@ class TestSettings:
     frames: FrameSettings
     region: RegionSettings
     calibration_file: Path | None = field(default=None, metadata={"key": "calibration.file"})
-    element_size: float = field(default=25.0, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
+    element_size: float = field(default=ELEMENT_SIZE, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
     illumination: IlluminationSettings = field(default_factory=IlluminationSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
@@ -438,9 +443,12 @@ def _plain(value: Any) -> Any:
 
 
 def _check_bounds(settings: Any, section: str) -> None:
+    hints = get_type_hints(type(settings))
     for entry in fields(settings):
         value = getattr(settings, entry.name)
         where = entry.metadata.get("key", f"{section}.{entry.name}")
+        if get_origin(hints[entry.name]) is Literal:
+            convert_value(value, hints[entry.name], where, Path())
         for number in _numbers(value):
             if not math.isfinite(number):
                 raise ConfigurationError(f"{where} must be finite, not {number}")

@@ -10,8 +10,8 @@ from typing import Any
 
 import rgbmidic
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.series import FrameSequence, FrameSource, file_hash, open_frames
+from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
+from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings
 
 __all__ = ["CaptureFiles", "check_output", "named_patterns", "provenance"]
@@ -25,19 +25,23 @@ class CaptureFiles:
     ----------
     role
         ``"dark"``, ``"light red"`` ...: for messages and the provenance.
-    sequence
-        The files.
+    series
+        Their frames.
     stated
         What the user stated about them.
     """
 
     role: str
-    sequence: FrameSequence
+    series: FrameSeries
     stated: FrameSettings
 
     @classmethod
-    def find(cls, role: str, pattern: str, stated: FrameSettings, base: Path | None = None) -> CaptureFiles:
+    def find(
+        cls, role: str, pattern: str, stated: FrameSettings, calibration: Calibration | None = None
+    ) -> CaptureFiles:
         """Files that a pattern or folder names; `stated` is what the user says of them (its path is not used).
+
+        Pattern and levels that neither the files nor the user tell come from the `calibration`.
 
         Raises
         ------
@@ -46,37 +50,37 @@ class CaptureFiles:
         """
         settings = replace(stated, path=(pattern,))
         try:
-            return cls(role=role, sequence=open_frames(settings, base or Path()), stated=settings)
+            return cls(role=role, series=open_series(settings, camera=calibration), stated=settings)
         except FrameError as error:
             raise CalibrationError(f"{role}: {error}") from None
 
     def by_folder(self) -> list[CaptureFiles]:
         """The same flat frames in one group per folder."""
         groups: dict[Path, list[FrameSource]] = {}
-        for source in self.sequence.lights[0]:
+        for source in self.series.lights[0]:
             groups.setdefault(source.path.parent, []).append(source)
         return [
-            replace(self, role=f"flat {folder}", sequence=FrameSequence(lights=(tuple(sources),)))
+            replace(self, role=f"flat {folder}", series=FrameSeries(lights=(tuple(sources),)))
             for folder, sources in groups.items()
         ]
 
     def __len__(self) -> int:
-        return len(self.sequence)
+        return len(self.series)
 
     def frames(self) -> Iterator[Mosaic | ChannelFrame]:
         """The frames one after the other."""
         for index in range(len(self)):
-            yield self.sequence.read(index)[0]
+            yield self.series.read(index)[0]
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Name of every frame, for messages."""
-        return tuple(self.sequence.name(index) for index in range(len(self)))
+        return tuple(self.series.name(index) for index in range(len(self)))
 
     @property
-    def paths(self) -> tuple[Path, ...]:
-        """The files."""
-        return tuple(source.path for source in self.sequence.lights[0])
+    def fingerprints(self) -> dict[str, str]:
+        """The files with their SHA-256."""
+        return {str(source.path): source.fingerprint for source in self.series.lights[0]}
 
 
 def named_patterns(options: Sequence[str], option: str) -> dict[str, str]:
@@ -118,7 +122,9 @@ def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
 def provenance(command: str, groups: Sequence[CaptureFiles], details: Mapping[str, Any]) -> dict[str, Any]:
     """Where a section of the calibration file comes from: date, version, inputs with hashes, and `details`."""
     inputs = [
-        {"role": group.role, "file": str(path), "sha256": file_hash(path)} for group in groups for path in group.paths
+        {"role": group.role, "file": path, "sha256": fingerprint}
+        for group in groups
+        for path, fingerprint in group.fingerprints.items()
     ]
     names = ("kind", "cfa", "black_level", "white_level", "shape", "dtype")
     stated = {name: getattr(groups[0].stated, name) for name in names} if groups else {}

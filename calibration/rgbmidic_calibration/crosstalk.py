@@ -16,10 +16,11 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.blocks import BlockMeans, block_centres
-from rgbmidic_calibration.plausibility import CHECKS, check_captures, check_matrix
+from rgbmidic_calibration.light_fit import LightFit, check_matrix
+from rgbmidic_calibration.plausibility import CHECKS, check_captures
 from rgbmidic_calibration.ratio import ColumnFit, Variation, capture_scatter, fit_column, offsets_left, variation
 
-__all__ = ["CHANNELS", "CrosstalkEstimate", "LightFit", "estimate_crosstalk"]
+__all__ = ["CHANNELS", "CrosstalkEstimate", "estimate_crosstalk"]
 
 
 CHANNELS = ("R", "G", "B")
@@ -33,47 +34,6 @@ LARGEST_ORDER = 4
 FIELD_SIGNIFICANCE = 1e-3
 FIELD_TOLERANCE = 5e-4
 """Variation of an entry over the field (rms) that is let be, however significant: it leaks 0.05 % at most."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LightFit:
-    """What was found for one light.
-
-    Attributes
-    ----------
-    name : str
-    reference : int
-        Channel that sees the light best.
-    column : ndarray, shape (C,)
-        Column of A; 1 in the reference channel.
-    signal : float
-        Mean grey level (DN above dark) of the reference channel in the blocks used.
-    used, saturated, rejected : float
-        Shares of the blocks that were used, left out as saturated, and left out as outliers.
-    intensity_drift : float
-        Range of the light's strength over the captures, relative to its mean.
-    colour_drift : float
-        Largest scatter (standard deviation) of an entry between captures beyond their noise.
-    offset, offset_std : ndarray, shape (C,)
-        Grey level that is left where the light is absent, and its uncertainty (`ratio.offsets_left`).
-    variation : Variation
-        The test whether the column varies over the field.
-    captures : int
-    """
-
-    name: str
-    reference: int
-    column: FloatArray
-    signal: float
-    used: float
-    saturated: float
-    rejected: float
-    intensity_drift: float
-    colour_drift: float
-    offset: FloatArray
-    offset_std: FloatArray
-    variation: Variation
-    captures: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

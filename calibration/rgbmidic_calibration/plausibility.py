@@ -1,4 +1,4 @@
-"""Checks that keep a mistake with lamps, files or settings from becoming a wrong crosstalk matrix.
+"""Checks of the captures that keep a mistake with lamps, files or settings from becoming a wrong crosstalk matrix.
 
 A check that fails is an error; the user who knows better waives it by name. What is merely worth knowing is a warning.
 """
@@ -6,7 +6,6 @@ A check that fails is an error; the user who knows better waives it by name. Wha
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +13,7 @@ import numpy.typing as npt
 from rgbmidic.errors import CalibrationError
 from rgbmidic_calibration.blocks import BlockMeans
 
-if TYPE_CHECKING:
-    from rgbmidic_calibration.crosstalk import LightFit
-
-__all__ = ["CHECKS", "check_captures", "check_matrix"]
+__all__ = ["CHECKS", "check_captures"]
 
 Labels = Mapping[str, Sequence[str]]
 
@@ -32,8 +28,6 @@ CHECKS = {
     "white-level": "no samples pile up below the white level",
 }
 
-COLOURS = ("red", "green", "blue")
-
 DARK_SHARE_LIMIT = 0.10
 """Dark frames brighter than this share of the weakest light's own signal are not dark."""
 DARK_SCALE_LIMIT = 0.05
@@ -46,11 +40,6 @@ WEAK_LIMIT, WEAK_WARNING = 0.01, 0.10
 COLOUR_LIMIT = 0.02
 """A capture whose entry departs by more than this from the median of its light is another picture."""
 DETAIL_LIMIT = 0.6
-INTENSITY_WARNING, DELIBERATE = 0.05, 0.30
-"""Captures whose strengths differ by more than the second are meant to: an exposure series."""
-COLOUR_DRIFT_WARNING = 5e-4
-OFFSET_WARNING, OFFSET_SIGNIFICANCE = 0.002, 5.0
-CONDITION_WARNING = 6.0
 
 
 def check_captures(
@@ -88,56 +77,6 @@ def check_captures(
         warnings += _check_greens(name, captures, level, report)
         warnings += _check_agreement(name, captures, level, labels.get(name, ()), report)
     return warnings
-
-
-def check_matrix(fits: Sequence[LightFit], *, allow: Sequence[str]) -> list[str]:
-    """Check the fitted columns: the right channel for each light's name, one light per channel, quiet lamps.
-
-    Returns
-    -------
-    list of str
-        Warnings.
-
-    Raises
-    ------
-    CalibrationError
-        A light is seen best by another channel than its name says, or two by the same, and that is not waived.
-    """
-    for fit, expected in zip(fits, _expected_channels([fit.name for fit in fits]), strict=True):
-        if "name" not in allow and expected not in (None, fit.reference):
-            raise CalibrationError(
-                f"light {fit.name} is seen best by the {COLOURS[fit.reference]} channel: are the captures of two "
-                "lights swapped, or is the colour filter array (--cfa) another one? (--allow name goes on all the same)"
-            )
-    for index, fit in enumerate(fits):
-        twin = next((other for other in fits[:index] if other.reference == fit.reference), None)
-        if twin is not None and "same-channel" not in allow:
-            raise CalibrationError(
-                f"lights {twin.name} and {fit.name} are both seen best by the {COLOURS[fit.reference]} channel: did "
-                "the same lamp shine in both captures? (--allow same-channel goes on all the same)"
-            )
-    warnings = [message for fit in fits for message in _fit_warnings(fit)]
-    condition = float(np.linalg.cond(np.column_stack([fit.column for fit in fits])))
-    if condition > CONDITION_WARNING:
-        warnings.append(
-            f"the matrix has condition number {condition:.1f}: unmixing amplifies noise strongly. Are two lamps close "
-            "in colour, or did a second lamp or daylight shine in the captures of one?"
-        )
-    unseen = [COLOURS[c] for c in range(3) if c not in {fit.reference for fit in fits}]
-    if len(fits) < 3 and unseen:
-        warnings.append(
-            f"no light is seen best by the {' and '.join(unseen)} channel: if such a lamp shines during the test it "
-            "must be calibrated too"
-        )
-    return warnings
-
-
-def _expected_channels(names: Sequence[str]) -> list[int | None]:
-    """Channel that each name promises; single letters count only where all names are colours."""
-    lower = [name.lower() for name in names]
-    if all(name in (*COLOURS, "r", "g", "b") for name in lower):
-        return ["rgb".index(name[0]) for name in lower]
-    return [COLOURS.index(name) if name in COLOURS else None for name in lower]
 
 
 def _check_presence(lights: Mapping[str, Sequence[BlockMeans]]) -> None:
@@ -296,30 +235,3 @@ def _check_agreement(
         "matrix does not suffer, a registration would"
         for index in np.flatnonzero(detail < DETAIL_LIMIT * np.median(detail))
     ]
-
-
-def _fit_warnings(fit: LightFit) -> list[str]:
-    warnings = []
-    if INTENSITY_WARNING < fit.intensity_drift < DELIBERATE:
-        warnings.append(
-            f"light {fit.name}: its strength differs by {100 * fit.intensity_drift:.1f} % between captures: let the "
-            "lamp warm up (the matrix does not suffer)"
-        )
-    if fit.colour_drift > COLOUR_DRIFT_WARNING:
-        warnings.append(
-            f"light {fit.name}: its colour drifts between captures (entries scatter by {fit.colour_drift:.2g} beyond "
-            "noise); the stated uncertainty covers it"
-        )
-    left = np.abs(fit.offset)
-    if (clear := (left > OFFSET_SIGNIFICANCE * fit.offset_std) & (left > OFFSET_WARNING * fit.signal)).any():
-        channel = int(np.where(clear, left, 0).argmax())
-        warnings.append(
-            f"light {fit.name}: the {COLOURS[channel]} channel keeps {fit.offset[channel]:+.1f} DN where the light is "
-            "absent: dark frames of other settings or another ambient light, or a camera that is not linear"
-        )
-    if fit.rejected > 0.05:
-        warnings.append(
-            f"light {fit.name}: {100 * fit.rejected:.0f} % of the blocks are outliers: coloured or fluorescent "
-            "spots on the target?"
-        )
-    return warnings

@@ -7,8 +7,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
-from rgbmidic.frames.readers import tells_camera
-from rgbmidic.frames.series import file_hash
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration.blocks import block_means
@@ -86,7 +84,7 @@ def check_calibration(
     """
     limits = limits or Limits()
     calibration = Calibration.read(path)
-    files = _find(lights, dark, together, _with_camera(told, calibration, lights))
+    files = _find(lights, dark, together, told, calibration)
     warnings, skipped = _reused(calibration, files), []
     dark_stack = stack_frames(files.dark.frames(), drifts=False, name="the dark frames") if files.dark else None
     stacks = {name: stack_frames(group.frames(), name=group.role) for name, group in files.lights.items()}
@@ -128,23 +126,19 @@ def read_limits(options: Sequence[str]) -> Limits:
     return limits
 
 
-def _with_camera(told: FrameSettings, calibration: Calibration, lights: Mapping[str, str]) -> FrameSettings:
-    """Pattern and levels of the calibration where neither the files nor the user tell them."""
-    first = next(iter(lights.values()), None)
-    if first is None:
+def _find(
+    lights: Mapping[str, str],
+    dark: str | None,
+    together: Mapping[str, str],
+    told: FrameSettings,
+    calibration: Calibration,
+) -> _Captures:
+    def find(role: str, pattern: str) -> CaptureFiles:
+        return CaptureFiles.find(role, pattern, told, calibration)
+
+    if not lights:
         raise ConfigurationError("check needs captures with one light on: --light NAME=FILES")
-    if tells_camera(CaptureFiles.find("light", first, told).paths[0]):
-        return told
-    return replace(
-        told,
-        cfa=told.cfa or (calibration.cfa if told.kind in (None, "bayer") else None),
-        black_level=calibration.black_level if told.black_level is None else told.black_level,
-        white_level=calibration.white_level if told.white_level is None else told.white_level,
-    )
-
-
-def _find(lights: Mapping[str, str], dark: str | None, together: Mapping[str, str], told: FrameSettings) -> _Captures:
-    found = {name: CaptureFiles.find(f"light {name}", pattern, told) for name, pattern in lights.items()}
+    found = {name: find(f"light {name}", pattern) for name, pattern in lights.items()}
     for names in together:
         if missing := [name for name in names.split("+") if name not in found]:
             raise ConfigurationError(
@@ -154,8 +148,8 @@ def _find(lights: Mapping[str, str], dark: str | None, together: Mapping[str, st
             raise ConfigurationError(f"--together takes NAME+NAME=FILES, at least two lights, not {names}")
     return _Captures(
         found,
-        {names: CaptureFiles.find(f"lights {names}", pattern, told) for names, pattern in together.items()},
-        CaptureFiles.find("dark", dark, told) if dark else None,
+        {names: find(f"lights {names}", pattern) for names, pattern in together.items()},
+        find("dark", dark) if dark else None,
     )
 
 
@@ -166,8 +160,8 @@ def _reused(calibration: Calibration, files: _Captures) -> list[str]:
         if isinstance(origin, Mapping)
         for entry in origin.get("inputs", ())
     }
-    lit = [path for group in (*files.lights.values(), *files.together.values()) for path in group.paths]
-    reused = [path for path in lit if file_hash(path) in known]
+    groups = (*files.lights.values(), *files.together.values())
+    reused = [path for group in groups for path, fingerprint in group.fingerprints.items() if fingerprint in known]
     if not reused:
         return []
     made = f"{len(reused)} of these captures made the calibration ({reused[0]} ...)"

@@ -1,8 +1,9 @@
 """The MIDIC solve: one displacement field from k weighted image pairs (paper, section 3.2)."""
 
 from rgbmidic.correlation.correlate import correlate
-from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
-from rgbmidic.correlation.solve import SolveOptions, solve
+from rgbmidic.correlation.solve import solve
+from rgbmidic.correlation.track import Start, track
 
-__all__ = ["Deformed", "NodeStatus", "Reference", "Solution", "SolveOptions", "Status", "correlate", "solve"]
+__all__ = ["Deformed", "NodeStatus", "Reference", "Solution", "Start", "Status", "correlate", "solve", "track"]

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.correlation.images import as_light_stack
-from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import Solution
-from rgbmidic.correlation.solve import SolveOptions, solve
-from rgbmidic.correlation.start import coarse_start
-from rgbmidic.errors import InputError
+from rgbmidic.correlation.solve import solve
+from rgbmidic.correlation.track import Start, track
+from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.normalise import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["as_weights", "correlate", "initial_displacement"]
@@ -25,19 +28,13 @@ def correlate(
     deformed: npt.ArrayLike,
     *,
     region: Sequence[float] | Region | None = None,
-    element_size: float = 25.0,
+    element_size: float = ELEMENT_SIZE,
     weights: npt.ArrayLike | None = None,
     initial: npt.ArrayLike | None = None,
     deformed_weights: npt.ArrayLike | None = None,
-    prefilter: str = "binomial",
     normalise: float | None = None,
-    brightness: str = "none",
     statistics: bool = True,
-    curvature: bool = False,
-    rigid: str = "none",
-    search_radius: float = 64.0,
-    tolerance: float = 1e-3,
-    max_iterations: int = 50,
+    **options: Any,
 ) -> Solution:
     """Measure the displacement between two states seen under k lights (k = 1: plain DIC).
 
@@ -55,14 +52,13 @@ def correlate(
         Displacement (u, v) in px to start from; None looks for it within `search_radius`.
     deformed_weights
         Like `weights`, on the deformed images.
-    prefilter
-        Filter on both images: ``"none"``, ``"binomial"`` or ``"gaussian"`` (`rgbmidic.correlation.images.PREFILTERS`).
     normalise
         Standard deviation in px of the local mean by which every image is divided first; None leaves grey levels.
-    search_radius
-        Largest motion in px that is looked for where no start is given.
-    brightness, statistics, curvature, rigid, tolerance, max_iterations
-        See `SolveOptions`.
+    statistics
+        Weight every light by the inverse variance of its own residual around each pixel, robustly.
+    **options
+        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, curvature,
+        search_radius, tolerance, max_iterations.
 
     Returns
     -------
@@ -84,22 +80,23 @@ def correlate(
     if not isinstance(region, Region):
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size)
-    options = SolveOptions(
-        rigid=rigid,
-        brightness=brightness,
-        statistics=statistics,
-        curvature=curvature,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-    )
+    solver = _solver_settings(options)
     if normalise is not None:
         f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
-    first = Reference.prepare(f, region, as_weights(weights, f.shape, "weights"), mesh=mesh, prefilter=prefilter)
-    second = Deformed.prepare(g, as_weights(deformed_weights, f.shape, "deformed_weights"), prefilter=prefilter)
+    first = Reference.prepare(f, region, as_weights(weights, f.shape, "weights"), mesh=mesh, prefilter=solver.prefilter)
+    second = Deformed.prepare(g, as_weights(deformed_weights, f.shape, "deformed_weights"), prefilter=solver.prefilter)
     start = initial_displacement(initial, len(mesh.nodes))
     if start is None:
-        start = coarse_start(first, second, search_radius)
-    return solve(first, second, start, options)
+        return track(first, second, Start(displacement=None), solver, statistics=statistics)
+    return solve(first, second, start, solver, statistics=statistics)
+
+
+def _solver_settings(options: dict[str, Any]) -> SolverSettings:
+    try:
+        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
+        return SolverSettings(**options)
+    except ConfigurationError as error:
+        raise InputError(str(error)) from None
 
 
 def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str) -> FloatImage | None:

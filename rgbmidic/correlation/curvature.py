@@ -15,12 +15,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import curvature_deviation, element_vector, interpolate_nodal
-from rgbmidic.correlation.problem import Reference
-from rgbmidic.correlation.step import Step
+from rgbmidic.correlation.equations import Equations
+from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Bent", "curvature_correction"]
+__all__ = ["CurvatureOffset", "curvature_offset"]
 
 
 _FARTHEST = 3.5
@@ -28,7 +28,7 @@ _FARTHEST = 3.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Bent:
+class CurvatureOffset:
     """What linear elements make of a curved field.
 
     Attributes
@@ -50,27 +50,31 @@ class Bent:
     deviation: FloatImage
 
 
-def curvature_correction(reference: Reference, step: Step, displacement: FloatArray) -> Bent:
+def curvature_offset(
+    reference: Reference, equations: Equations, displacement: FloatArray, sound: BoolArray
+) -> CurvatureOffset:
     """Offsets of nodal displacement and strain; 0 where no curvature is known within a few elements.
 
     Parameters
     ----------
     reference
         The reference state.
-    step
-        The last pass, with its weights and factors.
+    equations
+        Of the last pass, with its weights and factors.
     displacement : ndarray, shape (N, 2)
         The solution, finite everywhere.
+    sound : ndarray, shape (N,), bool
+        Nodes whose displacement tells a curvature: seen, and not beside elements that do not match.
     """
-    curvature = _curvature(reference, displacement, step.measured)
+    curvature = _curvature(reference, displacement, sound)
     mesh, pixels = reference.mesh, reference.pixels
     geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
     deviation, carried = np.empty((2, 2, pixels.rows.size), dtype=np.float32)
     curvature_deviation(mesh.nodes, mesh.elements, curvature[mesh.elements].mean(axis=1), *geometry, deviation)
-    offset = _offset(reference, step, deviation)
+    offset = _offset(reference, equations, deviation)
     interpolate_nodal(offset, mesh.elements, *geometry, carried)
     one_sided = _one_sided(mesh, curvature)
-    return Bent(
+    return CurvatureOffset(
         displacement=offset,
         one_sided=one_sided,
         strain=reference.strain(offset) + one_sided,
@@ -78,18 +82,18 @@ def curvature_correction(reference: Reference, step: Step, displacement: FloatAr
     )
 
 
-def _offset(reference: Reference, step: Step, deviation: FloatImage) -> FloatArray:
+def _offset(reference: Reference, equations: Equations, deviation: FloatImage) -> FloatArray:
     """Offset (N, 2) of the nodes: the `deviation` (2, P) projected as a residual is."""
     mesh, pixels = reference.mesh, reference.pixels
-    total = np.zeros(reference.equations.size)
+    total = np.zeros(reference.assembly.size)
     parts = np.zeros((len(mesh.elements), 3, 2))
-    for weight, gx, gy in zip(step.weights, reference.gradient_x, reference.gradient_y, strict=True):
+    for weight, gx, gy in zip(equations.weights, reference.gradient_x, reference.gradient_y, strict=True):
         along = weight * (gx * deviation[0] + gy * deviation[1])
         element_vector(
             along * gx, along * gy, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, parts
         )
-        total += reference.equations.vector(parts)
-    return step.solve(total).reshape(-1, 2)
+        total += reference.assembly.vector(parts)
+    return equations.solve(total).reshape(-1, 2)
 
 
 def _one_sided(mesh: Tri3Mesh, curvature: FloatArray) -> FloatArray:

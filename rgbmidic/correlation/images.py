@@ -15,7 +15,6 @@ __all__ = [
     "apply_prefilter",
     "as_light_stack",
     "fill_holes",
-    "noise_energy",
     "spline_coefficients",
     "usable_pixels",
 ]
@@ -90,26 +89,3 @@ def spline_coefficients(image: FloatImage) -> FloatImage:
     out = np.empty((image.shape[0] + 2 * PAD, image.shape[1] + 2 * PAD), dtype=np.float32)
     bspline_coefficients(np.ascontiguousarray(image), out)
     return out
-
-
-def noise_energy(prefilter: str, displacement: FloatArray) -> float:
-    """Variance of an image filtered and interpolated at displaced pixels, for white noise of variance 1.
-
-    Interpolation smooths most half-way between pixels, so the mean is taken over the fractions of the displacements
-    (M, 2), in px. The separable impulse response is the prefilter convolved with the cardinal cubic spline.
-    """
-    distance = np.arange(-12, 13)
-    pole = np.sqrt(3.0) - 2.0
-    line = np.convolve(-6 * pole / (1 - pole**2) * pole ** np.abs(distance), PREFILTERS[prefilter])
-    fractions = np.linspace(0, 1, 33)
-    taps = _bspline(np.arange(-2, 3)[:, None] - fractions)
-    energy = [float((np.convolve(line, column) ** 2).sum()) for column in taps.T]
-    wrapped = displacement - np.floor(displacement)
-    return float(np.interp(wrapped, fractions, energy).prod(axis=1).mean())
-
-
-def _bspline(t: FloatArray) -> FloatArray:
-    """Centred cubic B-spline."""
-    a = np.abs(t)
-    inner = 2 / 3 - a**2 + a**3 / 2
-    return np.asarray(np.where(a < 1, inner, np.where(a < 2, (2 - a) ** 3 / 6, 0.0)))

@@ -8,9 +8,13 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NodeStatus", "Solution", "Status"]
+__all__ = ["NO_MATCH", "NodeStatus", "Solution", "Status"]
+
+NO_MATCH = "the images do not match anywhere in the region"
+"""Reason of a frame in which nothing was found."""
 
 
 class Status(IntEnum):
@@ -87,6 +91,28 @@ class Solution:
     residual: FloatArray
     weight_share: FloatArray
     history: FloatArray
+
+    @classmethod
+    def failed(cls, mesh: Tri3Mesh, lights: int, reason: str, history: FloatArray) -> Solution:
+        """What is left where nothing can be measured: NaN everywhere, and the reason."""
+        count = len(mesh.nodes)
+        return cls(
+            nodes=mesh.nodes,
+            elements=mesh.elements,
+            displacement=np.full((count, 2), np.nan),
+            displacement_std=np.full((count, 2), np.nan),
+            strain=np.full((count, 3), np.nan),
+            strain_std=np.full((count, 3), np.nan),
+            node_status=np.full(count, NodeStatus.NOT_SEEN, dtype=np.uint8),
+            light_share=np.zeros((count, lights)),
+            misfit=np.full(count, np.nan),
+            status=Status.FAILED,
+            reason=reason,
+            rigid=np.zeros((lights, 0)),
+            residual=np.full(lights, np.nan),
+            weight_share=np.zeros(lights),
+            history=history,
+        )
 
     @property
     def iterations(self) -> int:

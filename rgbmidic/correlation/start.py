@@ -12,8 +12,9 @@ import logging
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
-from rgbmidic.correlation.problem import Deformed, Reference
+from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["coarse_start", "refine_start"]
@@ -31,13 +32,16 @@ _SCORE = 0.3
 """Correlation coefficient under which a window counts as not found."""
 
 
-def coarse_start(reference: Reference, deformed: Deformed, search_radius: float) -> FloatArray:
-    """Displacement (N, 2) of the nodes in px, found without any hint within `search_radius` px."""
+def coarse_start(
+    reference: Reference, deformed: Deformed, search_radius: float, around: FloatArray | None = None
+) -> FloatArray:
+    """Displacement (N, 2) of the nodes in px, found within `search_radius` px of `around` (N, 2), or of rest."""
     f, g = (feature_image(state.images, state.weights) for state in (reference, deformed))
     half_f, half_g = (np.asarray(cv2.pyrDown(image), dtype=np.float32) for image in (f, g))
     centres = _window_centres(reference)
     side = min(_WINDOW, *(int(size) // 2 * 2 for size in f.shape))
-    motion, score = _match(half_f, half_g, centres / 2, side // 2, int(np.ceil(search_radius / 2)), None)
+    guess = None if around is None else around[cKDTree(reference.mesh.nodes).query(centres)[1]] / 2
+    motion, score = _match(half_f, half_g, centres / 2, side // 2, int(np.ceil(search_radius / 2)), guess)
     motion = _smooth_outliers(centres, 2 * motion, score, tolerance=3.0)
     start = _interpolate(centres, motion, reference.mesh.nodes)
     return _refine(reference, f, g, start)
@@ -115,8 +119,6 @@ def _vertex(line: FloatImage, peak: int) -> float:
 
 def _smooth_outliers(points: FloatArray, motion: FloatArray, score: FloatArray, *, tolerance: float) -> FloatArray:
     """Replace motions with a low score or far from their neighbours' median by the median of good neighbours."""
-    from scipy.spatial import cKDTree
-
     if len(points) < 4:
         good = score > _SCORE
         return np.where(good[:, None], motion, np.median(motion[good], axis=0) if good.any() else 0.0)
@@ -140,8 +142,6 @@ def _nanmedian(values: FloatArray) -> FloatArray:
 
 
 def _fill_from_nearest(points: FloatArray, motion: FloatArray) -> FloatArray:
-    from scipy.spatial import cKDTree
-
     good = np.isfinite(motion).all(axis=1)
     if not good.any():
         return np.zeros_like(motion)

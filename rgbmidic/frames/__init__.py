@@ -1,1 +1,24 @@
-"""Raw frames and where they come from."""
+"""Raw frames and where they come from: readers, the series of a test's frames, writers."""
+
+from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels, shift_cfa
+from rgbmidic.frames.formats import open_source, read_frame
+from rgbmidic.frames.series import FrameSeries, list_frames, open_series
+from rgbmidic.frames.source import FrameSource, file_hash
+from rgbmidic.frames.writers import write_dng, write_tiff
+
+__all__ = [
+    "BAYER_PATTERNS",
+    "ChannelFrame",
+    "FrameSeries",
+    "FrameSource",
+    "Mosaic",
+    "cfa_channels",
+    "file_hash",
+    "list_frames",
+    "open_series",
+    "open_source",
+    "read_frame",
+    "shift_cfa",
+    "write_dng",
+    "write_tiff",
+]

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.contents import FileContents, damaged
 from rgbmidic.frames.data import BAYER_PATTERNS
-from rgbmidic.frames.tiff_structure import RawStructure
+from rgbmidic.frames.source import FrameSource
+from rgbmidic.frames.stored import StoredFrame, damaged
+from rgbmidic.frames.tiff_pages import RawStructure
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     import rawpy
 
-__all__ = ["MAXIMUM_FLAT_ROWS", "camera_raw_shape", "has_camera_header", "read_camera_raw"]
+__all__ = ["CAMERA_RAW_ENDINGS", "MAXIMUM_FLAT_ROWS", "CameraRaw", "has_camera_header"]
+
+_NAMES = "3fr arw cr2 cr3 dcr dng erf fff iiq kdc mef mos mrw nef nrw orf pef raf rw2 rwl sr2 srf srw x3f"
+CAMERA_RAW_ENDINGS = tuple(f".{name}" for name in _NAMES.split())
 
 MAXIMUM_FLAT_ROWS = 0.01
 """Share of rows without any noise above which a camera raw counts as not decoded: defective rows may exist."""
@@ -33,50 +38,51 @@ _CAMERA_HEADERS = (
 _CR3_HEADER = b"ftypcrx "
 
 
-def read_camera_raw(path: Path) -> FileContents:
-    """Read the visible part of a camera raw: the mosaic of a Bayer camera or the image of a monochrome one.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraRaw(FrameSource):
+    """The visible part of a camera raw: the mosaic of a Bayer camera or the image of a monochrome one.
 
-    Orientation and default crop of the file are not applied: pixels stay where they are on the sensor.
-
-    Raises
-    ------
-    FrameError
-        LibRaw does not know or cannot decode the file, the file is truncated, its image is already demosaiced, or
-        its colour filter array is not a Bayer pattern.
+    Orientation and default crop of the file are not applied: pixels stay where they are on the sensor. Refused are
+    files that LibRaw cannot decode, images already demosaiced, and colour filter arrays that are no Bayer pattern.
     """
-    structure = RawStructure.read(path)
-    with _open(path) as raw:
-        cell = _colour_cell(raw, path)
-        values = np.array(raw.raw_image_visible, dtype=np.uint16)
-        black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
-        white, margins, names = float(raw.white_level), raw.sizes, _names(raw, cell)
-        monochrome = raw.num_colors == 1
-    told = structure.black_level(margins.top_margin, margins.left_margin) if structure else None
-    black = black if told is None else told
-    _check_filled(values, black, white, stored_as_is=structure is not None and structure.stored_as_is, path=path)
-    if monochrome:
-        return FileContents(values=values, kind="monochrome", black_level=black, white_level=white)
-    return FileContents(values=values, kind="bayer", cfa=names, black_level=black, white_level=white)
 
+    tells_camera: ClassVar[bool] = True
 
-def camera_raw_shape(path: Path) -> tuple[int, int]:
-    """Rows and columns of the visible part, from the header alone."""
-    with _open(path) as raw:
-        return int(raw.sizes.height), int(raw.sizes.width)
+    def _shape(self) -> tuple[int, int]:
+        with _libraw(self.path) as raw:
+            return int(raw.sizes.height), int(raw.sizes.width)
+
+    def _stored(self, index: int) -> StoredFrame:
+        structure = RawStructure.read(self.path)
+        with _libraw(self.path) as raw:
+            cell = _colour_cell(raw, self.path)
+            values = np.array(raw.raw_image_visible, dtype=np.uint16)
+            black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
+            white, margins, names = float(raw.white_level), raw.sizes, _names(raw, cell)
+            monochrome = raw.num_colors == 1
+        told = structure.black_level(margins.top_margin, margins.left_margin) if structure else None
+        black = black if told is None else told
+        as_is = structure is not None and structure.stored_as_is
+        _check_filled(values, black, white, stored_as_is=as_is, path=self.path)
+        return StoredFrame(
+            values=values,
+            kind="monochrome" if monochrome else "bayer",
+            cfa=None if monochrome else names,
+            black_level=black,
+            white_level=white,
+        )
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[rawpy.RawPy]:
+def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
     """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError."""
     import rawpy
 
-    if not has_camera_header(path):
-        raise _unsupported(path)
     try:
         with rawpy.imread(str(path)) as raw:
             yield raw
     except rawpy.LibRawFileUnsupportedError:
-        raise _unsupported(path) from None
+        raise FrameError(f"{path} is a camera raw that LibRaw {rawpy.libraw_version} does not know") from None
     except NotImplementedError:  # rawpy's answer to filters that repeat neither after 2x2 nor after 6x6 pixels
         raise _not_bayer(path, "that is no mosaic of 2x2 pixels") from None
     except rawpy.LibRawError as error:
@@ -88,16 +94,12 @@ def has_camera_header(path: Path) -> bool:
 
     LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture.
     """
-    with path.open("rb") as file:
-        head = file.read(12)
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:  # told by whoever reads the file
+        return False
     return head.startswith(_CAMERA_HEADERS) or head[4:] == _CR3_HEADER
-
-
-def _unsupported(path: Path) -> FrameError:
-    return FrameError(
-        f"{path} is not a frame that rgbmidic reads; allowed are camera raws (DNG, NEF, CR2, ARW, ...), TIFF, PNG, and "
-        "headerless .raw or .bin files whose shape and dtype are stated"
-    )
 
 
 def _not_bayer(path: Path, what: str) -> FrameError:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, enlarged, gather_moments, learn_texture
+from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, enlarged
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic import (
     Demosaicer,
@@ -17,7 +17,6 @@ from rgbmidic.illumination.demosaic import (
     Reconstruction,
     ReflectionAwareDemosaicer,
 )
-from rgbmidic.illumination.demosaic.base import red_position
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearMosaic
@@ -25,7 +24,7 @@ from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "frame_texture", "reconstructed_lights", "separate"]
+__all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "reconstructed_lights", "separate"]
 
 
 DEFAULT_METHOD = "reflection-aware"
@@ -73,21 +72,6 @@ def reconstructed_lights(reconstruction: Reconstruction, crosstalk: Crosstalk) -
     images = unmix(reconstruction.channels, crosstalk)
     index = _reflection_index(reconstruction.factors, reconstruction.mean, crosstalk)
     return replace(images, reflection_index=enlarged(index, BLOCK, images.shape), texture=reconstruction.texture)
-
-
-def frame_texture(mosaic: LinearMosaic, method: str = DEFAULT_METHOD) -> TextureModel | None:
-    """The speckle's autocorrelation as a frame shows it, for `separate` of all frames of a test; None if the method
-    does not use it.
-
-    Raises
-    ------
-    InputError
-        Unknown method.
-    """
-    if _chosen(method, mosaic) != DEFAULT_METHOD or min(mosaic.values.shape) < SMALLEST_FRAME:
-        return None
-    values = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
-    return learn_texture(gather_moments(values, red_position(mosaic.cfa), mosaic.noise))
 
 
 def _chosen(method: str, mosaic: LinearMosaic) -> str:

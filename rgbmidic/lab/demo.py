@@ -14,14 +14,11 @@ import numpy as np
 from rgbmidic.correlation import correlate
 from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
-from rgbmidic.frames.readers import read_frame
-from rgbmidic.frames.series import list_frames
+from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.linearise import LinearMosaic, linearise
-from rgbmidic.illumination.separate import separate
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import measure
-from rgbmidic.results.store import Result
+from rgbmidic.pipeline import Separation, measure
+from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage
 
@@ -159,14 +156,9 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
 def _separated(settings: TestSettings) -> list[FloatImage]:
     """The lights (k, H, W) of every frame."""
     assert settings.calibration_file is not None
-    calibration = Calibration.read(settings.calibration_file)
-    assert calibration.crosstalk is not None
-    images = []
-    for path in list_frames(settings.frames.path[0], settings.base):
-        mosaic = linearise(read_frame(path), calibration.noise)
-        assert isinstance(mosaic, LinearMosaic)
-        images.append(separate(mosaic, calibration.crosstalk).values)
-    return images
+    separation = Separation(calibration=Calibration.read(settings.calibration_file))
+    frames = open_series(settings.frames, settings.base)
+    return [separation(frames.read(index)).values for index in range(len(frames))]
 
 
 def _one_light(reference: FloatImage, deformed: FloatImage, settings: TestSettings) -> FloatArray:

@@ -98,6 +98,11 @@ class PixelMap:
         """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
         return np.ascontiguousarray(image[..., self.rows, self.columns])
 
+    def by_element(self, values: FloatImage) -> FloatArray:
+        """Sum of values (P,) over the pixels of each element, shape (E,)."""
+        owner = np.repeat(np.arange(len(self.origin)), np.diff(self.offsets))
+        return np.bincount(owner, weights=values, minlength=len(self.origin)).astype(np.float64)
+
     def blocks(self, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
         """Number of the block of `side` px in which each owned pixel lies (P,), and the grid of blocks (rows,
         columns) over `bounds`."""

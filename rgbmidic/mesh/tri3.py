@@ -48,7 +48,7 @@ class Tri3Mesh:
         object.__setattr__(self, "elements", elements)
 
     @classmethod
-    def from_region(cls, region: Region, element_size: float = 25.0) -> Tri3Mesh:
+    def from_region(cls, region: Region, element_size: float) -> Tri3Mesh:
         """Mesh a region with triangles whose legs are about `element_size` px.
 
         A rectangle gets a regular mesh; other regions a Delaunay mesh that follows their outline and holes.
@@ -80,6 +80,12 @@ class Tri3Mesh:
         """Sum of a value per element (E,) over the elements around each node, shape (N,)."""
         sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
         return np.asarray(sums, dtype=np.float64)
+
+    def beside(self, nodes: BoolArray) -> BoolArray:
+        """Nodes (N,) that share an element with one of `nodes` (N,), these included."""
+        near = np.zeros(len(self.nodes), dtype=bool)
+        near[self.elements[nodes[self.elements].any(axis=1)]] = True
+        return near
 
     def element_gradient(self, values: FloatArray) -> FloatArray:
         """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2)."""

@@ -1,6 +1,8 @@
 """The main job: raw frames in, displacement fields out."""
 
-from rgbmidic.pipeline.run import Start, Weigher, measure, read_region, texture, track, with_camera
-from rgbmidic.pipeline.separator import Separator, average
+from rgbmidic.pipeline.frame import measure_frame
+from rgbmidic.pipeline.plan import Plan, read_region
+from rgbmidic.pipeline.run import measure
+from rgbmidic.pipeline.separation import Separation, correlated
 
-__all__ = ["Separator", "Start", "Weigher", "average", "measure", "read_region", "texture", "track", "with_camera"]
+__all__ = ["Plan", "Separation", "correlated", "measure", "measure_frame", "read_region"]

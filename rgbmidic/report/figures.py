@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.store import Result
+from rgbmidic.results import QUANTITIES, REFLECTING, Result
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:
@@ -69,14 +69,14 @@ def displacement_figure(result: Result, frame: int, image: AnyArray | None = Non
         The frame's file is damaged.
     """
     record = result.frame(frame)
-    fields = {"u": record.displacement[:, 0], "v": record.displacement[:, 1]}
+    fields = {"u": record.u, "v": record.v}
     return _maps(result, fields, "px", "viridis", _frame_title(result, frame), image)
 
 
 def uncertainty_figure(result: Result, frame: int, image: AnyArray | None = None) -> Figure:
     """Maps of the standard uncertainty of u and v of one frame, in px; the rest as `displacement_figure`."""
     record = result.frame(frame)
-    fields = {"std of u": record.displacement_std[:, 0], "std of v": record.displacement_std[:, 1]}
+    fields = {"std of u": record.u_std, "std of v": record.v_std}
     return _maps(result, fields, "px", "magma", _frame_title(result, frame), image)
 
 
@@ -121,12 +121,9 @@ def share_figure(result: Result, frame: int, image: AnyArray | None = None) -> F
 def reflection_figure(result: Result, frame: int, images: AnyArray) -> Figure | None:
     """Each light's reflection index in one frame, shaded over its reference image (k, H, W); None where the separation
     did not tell it."""
-    seen = result.frame(frame).reflection_thumbnail
-    if seen is None:
+    index = result.frame(frame).reflection_thumbnail / 255
+    if not index.size:
         return None
-    from rgbmidic.illumination.images import REFLECTING
-
-    index = seen / 255
     titles = [
         f"{light}: reflects on {(i > REFLECTING).mean():.1%}" for light, i in zip(result.lights, index, strict=True)
     ]
@@ -166,20 +163,19 @@ def residual_figure(result: Result) -> Figure:
 
 def convergence_figure(result: Result) -> Figure:
     """Largest motion of a node in each iteration, one line per frame, with the tolerance where it is known."""
-    records = [result.frame(index) for index in range(len(result))]
     tolerance = result.provenance.get("settings", {}).get("solver", {}).get("tolerance")
 
     def draw(figure: Figure, axes: list[Axes]) -> None:
         axis = axes[0]
-        colours = _colour_per_frame(figure, axis, len(records))
-        for name, record, colour in zip(result.names, records, colours, strict=True):
-            iterations = np.arange(1, record.iterations + 1)
-            axis.plot(iterations, record.history, marker="o", markersize=2.5, linewidth=1, color=colour, label=name)
+        colours = _colour_per_frame(figure, axis, len(result))
+        for name, history, colour in zip(result.names, result.each("history"), colours, strict=True):
+            iterations = np.arange(1, len(history) + 1)
+            axis.plot(iterations, history, marker="o", markersize=2.5, linewidth=1, color=colour, label=name)
         if tolerance is not None:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
         axis.set_yscale("log")
         _finish_plot(axis, "iteration", "largest motion of a node (px)")
-        if len(records) <= _MANY_FRAMES:
+        if len(result) <= _MANY_FRAMES:
             figure.legend(loc="outside right upper")
 
     return _figure(draw, count=1, aspect=0.6, colour_bars=False)
@@ -366,10 +362,8 @@ def _colour_per_frame(figure: Figure, axis: Axes, count: int) -> list[Any]:
 
 def _frame_title(result: Result, frame: int) -> str:
     """Frame, file and how it ended, in words."""
-    from rgbmidic.correlation.solution import Status  # the solver's module is slow to import
-
     record = result.frame(frame)
-    end = Status(record.status).name.lower().replace("_", " ")
-    blank = np.isnan(record.displacement).any(axis=1).mean()
+    end = QUANTITIES["status"].codes[record.status]
+    blank = np.isnan(record.u).mean()
     missing = f", {blank:.1%} of the nodes not measured" if blank else ""
     return f"frame {frame}: {result.names[frame]} ({end}, {record.iterations} iterations{missing})"

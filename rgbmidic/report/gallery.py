@@ -19,7 +19,7 @@ from rgbmidic.report.figures import (
     share_figure,
     uncertainty_figure,
 )
-from rgbmidic.results.store import Result
+from rgbmidic.results import Result
 
 __all__ = ["remove_figures", "write_figures"]
 
@@ -64,7 +64,7 @@ def write_figures(result: Result, folder: Path | str, *, frames: int = _FRAMES) 
     }
     first = _reference_index(result)
     weights = result.frame(first).weights_thumbnail
-    if result.reference is not None and weights is not None:
+    if result.reference is not None and weights.size:
         figures["masks"] = mask_figure(result.reference, weights / 255, result.lights)
     if result.reference is not None and (reflections := reflection_figure(result, first, result.reference)) is not None:
         figures["reflections"] = reflections

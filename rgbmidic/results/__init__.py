@@ -1,1 +1,19 @@
 """What is kept of a test: one record per frame, the folder that holds them, and other programs' formats."""
+
+from rgbmidic.illumination.images import REFLECTING
+from rgbmidic.results.export import EXPORT_FORMATS, export_result
+from rgbmidic.results.quantities import QUANTITIES, Quantity
+from rgbmidic.results.record import FrameRecord
+from rgbmidic.results.result import Result
+from rgbmidic.results.store import ResultStore
+
+__all__ = [
+    "EXPORT_FORMATS",
+    "QUANTITIES",
+    "REFLECTING",
+    "FrameRecord",
+    "Quantity",
+    "Result",
+    "ResultStore",
+    "export_result",
+]

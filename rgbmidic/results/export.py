@@ -4,34 +4,31 @@ from __future__ import annotations
 
 import csv
 import io
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.record import write_complete
-from rgbmidic.results.store import Result
+from rgbmidic.results.files import write_complete
+from rgbmidic.results.quantities import QUANTITIES
+from rgbmidic.results.result import Result
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
 
-_ARRAYS = ("nodes", "elements", "u", "v", "u_std", "v_std", "node_status", "light_share", "misfit")
-_STRAIN = ("exx", "eyy", "exy")
-_CSV_COLUMNS = (
-    *("frame", "name", "status", "node", "node_status", "x", "y", "u", "v", "u_std", "v_std"),
-    *_STRAIN,
-    *(f"{name}_std" for name in _STRAIN),
-)
+_CSV_HEAD = ("frame", "name", "status", "node", "node_status", "x", "y")
+_CSV_FIELDS = tuple(q.name for q in QUANTITIES.values() if q.axes == ("node",) and q.name not in _CSV_HEAD)
 
 
 def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool = False) -> None:
     """Write all frames of a result into one file.
 
-    ``"npz"``: nodes (N, 2) and elements (E, 3); u, v, exx, eyy, exy, each also with _std, node_status and misfit (T,
-    N); light_share (T, N, k); status and iterations (T,); residual and weight_share (T, k); brightness (T, k, 2),
-    gain and offset; names and lights.
-    ``"csv"``: a header line, then one row per node and frame.
+    ``"npz"``: nodes (N, 2), elements (E, 3), names (T,), lights (k,) and every quantity of
+    `rgbmidic.results.QUANTITIES` that has one shape in all frames, the frames as first axis.
+    ``"csv"``: a header line, then one row per node and frame with the quantities that are one number per node.
     Positions and displacements are in px, x right, y down; NaN (an empty field in csv) where not measured.
 
     Parameters
@@ -63,20 +60,22 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
 
 
 def _write_npz(result: Result, file: BinaryIO) -> None:
-    arrays: dict[str, Any] = {name: getattr(result, name) for name in (*_ARRAYS, "status", "iterations")}
-    for axis, name in enumerate(_STRAIN):
-        arrays[name], arrays[f"{name}_std"] = result.strain[..., axis], result.strain_std[..., axis]
-    arrays |= {
-        name: np.asarray(getattr(result, name))
-        for name in ("residual", "weight_share", "brightness", "names", "lights")
-    }
-    np.savez_compressed(file, **arrays)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in _arrays(result):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+
+
+def _arrays(result: Result) -> Iterator[tuple[str, npt.ArrayLike]]:
+    """Name and content of each array, one after the other: only one is in memory."""
+    yield from {name: getattr(result, name) for name in ("nodes", "elements", "names", "lights")}.items()
+    yield from ((name, result.stack(name)) for name, quantity in QUANTITIES.items() if quantity.stackable)
 
 
 def _write_csv(result: Result, file: BinaryIO) -> None:
     text = io.TextIOWrapper(file, encoding="utf-8", newline="")
     writer = csv.writer(text)
-    writer.writerow(_CSV_COLUMNS)
+    writer.writerow((*_CSV_HEAD, *_CSV_FIELDS))
     for index in range(len(result)):
         writer.writerows(_csv_rows(result, index))
     text.detach()  # leaves the file open for whoever opened it
@@ -85,7 +84,7 @@ def _write_csv(result: Result, file: BinaryIO) -> None:
 def _csv_rows(result: Result, index: int) -> Iterator[list[Any]]:
     record = result.frame(index)
     head = [index, result.names[index], record.status]
-    numbers = np.hstack([result.nodes, record.displacement, record.displacement_std, record.strain, record.strain_std])
+    numbers = np.column_stack([result.nodes, *(record.values[name] for name in _CSV_FIELDS)])
     for node, (status, row) in enumerate(zip(record.node_status, numbers.tolist(), strict=True)):
         yield [*head, node, int(status), *("" if number != number else f"{number:.9g}" for number in row)]
 

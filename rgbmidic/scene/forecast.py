@@ -27,6 +27,7 @@ from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.speckle_patch import SpecklePatch, cross_spectra, mosaic_disturbances
 from rgbmidic.scene.speckle_spectrum import SpeckleSpectrum
 from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
+from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["Energies", "Forecast", "Instrument", "channel_mixing", "node_constant", "pixel_size", "trace_change"]
@@ -128,7 +129,7 @@ class Instrument:
 
     @classmethod
     def of(
-        cls, scene: Scene, *, element_size: float = 25.0, demosaic: str = "malvar", prefilter: str = "binomial"
+        cls, scene: Scene, *, element_size: float = ELEMENT_SIZE, demosaic: str = "malvar", prefilter: str = "binomial"
     ) -> Instrument:
         """Reduce a scene.
 

@@ -17,7 +17,7 @@ from rgbmidic.scene.in_plane import AffineField, InPlaneField, MeshField
 from rgbmidic.scene.light import Light, three_lights
 from rgbmidic.scene.scene import Body, Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface
-from rgbmidic.settings import check_names, convert_value  # the one strict reader of TOML values
+from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value  # the one strict reader of TOML values
 
 __all__ = ["DatasetSettings", "Experiment", "Target", "read_scene"]
 
@@ -59,7 +59,7 @@ class DatasetSettings:
     calibration_frames: int = 3
     target: Target = "white"
     region: tuple[float, float, float, float] | None = None
-    element_size: float = 25.0
+    element_size: float = ELEMENT_SIZE
     noise_free: bool = False
 
     def __post_init__(self) -> None:

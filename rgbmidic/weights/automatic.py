@@ -8,25 +8,58 @@ here the one whose reflection disturbs most is taken, as the others' may lie out
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from rgbmidic.correlation import Status, correlate
-from rgbmidic.errors import InputError
+from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.fields import at_pixels, high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import FloatImage
 from rgbmidic.weights.disturbed_zone import SetUpThreshold, set_up_threshold
-from rgbmidic.weights.threshold import blurred
+from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
-__all__ = ["FALLBACK", "automatic_threshold"]
+__all__ = ["FALLBACK", "automatic_threshold", "automatic_weights"]
 
 logger = logging.getLogger(__name__)
 
 FALLBACK = 2 / 3
 """Threshold where no reflection disturbs the first deformed frame: the paper's."""
+
+
+def automatic_weights(
+    settings: TestSettings,
+    reference: IlluminationImages,
+    region: Region,
+    *,
+    frames: int,
+    images_of: Callable[[int], IlluminationImages],
+) -> ThresholdWeights:
+    """Weights by the threshold that the first deformed frame shows, else by the paper's; the log says which.
+
+    Parameters as in `rgbmidic.weights.prepare_weights`.
+    """
+    blur, found, why = settings.weights.blur, None, "there is no deformed frame"
+    index = next((i for i in range(frames) if i not in settings.frames.reference), None)
+    if index is not None:
+        why = f"no disturbed zone in frame {index}"
+        size, prefilter = settings.element_size, settings.solver.prefilter
+        try:
+            deformed = images_of(index)
+            found = automatic_threshold(reference, deformed, region, blur=blur, element_size=size, prefilter=prefilter)
+        except RgbmidicError as error:
+            why = f"frame {index} cannot be used: {error}"
+    value = FALLBACK if found is None else found.value
+    if found is None:
+        logger.warning('weights.threshold = "auto": %s; the threshold is %.3g of the dynamic range', why, value)
+    else:
+        place = found.zone.radius, found.zone.centre, index
+        logger.info("threshold %.3f: disturbed zone of radius %.0f px around %s in frame %d", value, *place)
+    return ThresholdWeights(threshold=value, blur=blur, notes={"weights_threshold": value})
 
 
 def automatic_threshold(
@@ -35,7 +68,7 @@ def automatic_threshold(
     region: Region,
     *,
     blur: float = 10.0,
-    element_size: float = 25.0,
+    element_size: float = ELEMENT_SIZE,
     prefilter: str = "binomial",
 ) -> SetUpThreshold | None:
     """Threshold from the reference and one deformed state, or None where no light's reflection disturbs.

@@ -15,7 +15,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.typing import FloatArray
 from rgbmidic.weights.threshold import blurred
 
-__all__ = ["DISTURBED", "MARGIN", "DisturbedZone", "SetUpThreshold", "disturbed_zone", "set_up_threshold"]
+__all__ = ["DisturbedZone", "SetUpThreshold", "disturbed_zone", "set_up_threshold"]
 
 
 DISTURBED = 1.5
@@ -76,41 +76,32 @@ class SetUpThreshold:
     value: float
 
 
-def disturbed_zone(
-    high_passed: FloatArray,
-    centre: tuple[float, float],
-    *,
-    unaffected: float | None = None,
-    factor: float = DISTURBED,
-    ring: float = RING,
-) -> DisturbedZone:
+def disturbed_zone(high_passed: FloatArray, centre: tuple[float, float]) -> DisturbedZone:
     """Find how far from a reflection the displacement is disturbed.
 
     Parameters
     ----------
     high_passed
-        `rgbmidic.lab.study.high_pass` of a displacement measured without weights, shape (H, W); NaN where not measured.
+        `rgbmidic.fields.high_pass` of a displacement measured without weights, shape (H, W); NaN where not measured.
     centre
         Middle of the reflection, (x, y) in px.
-    unaffected
-        P (px) away from the reflection; None: over the pixels farthest away.
-    factor
-        Multiple of it at which the zone ends.
-    ring
-        Width (px) of the rings over which P is taken.
+
+    Raises
+    ------
+    InputError
+        The measured field is too small to tell.
     """
     rows, columns = np.nonzero(np.isfinite(high_passed))
     distance = np.hypot(columns - centre[0], rows - centre[1])
-    if not rows.size or distance.max() < 3 * ring:
-        raise InputError(f"the measured field does not reach {3 * ring:g} px from the reflection at {centre}")
-    radii, profile = _ring_profile(distance, high_passed[rows, columns], ring)
-    if unaffected is None:
-        unaffected = float(np.median(profile[radii > _FAR * distance.max()]))
+    if not rows.size or distance.max() < 3 * RING:
+        raise InputError(f"the measured field does not reach {3 * RING:g} px from the reflection at {centre}")
+    radii, profile = _ring_profile(distance, high_passed[rows, columns])
+    unaffected = float(np.median(profile[radii > _FAR * distance.max()]))
     near = max(1, int((radii < _NEAR * distance.max()).sum()))
     peak = int(profile[:near].argmax())
     return DisturbedZone(
         centre=centre,
-        radius=_first_crossing(radii, profile, factor * unaffected, peak),
+        radius=_first_crossing(radii, profile, DISTURBED * unaffected, peak),
         unaffected=unaffected,
         radii=radii,
         profile=profile,
@@ -119,33 +110,21 @@ def disturbed_zone(
 
 
 def set_up_threshold(
-    high_passed: FloatArray,
-    images: IlluminationImages,
-    *,
-    light: int = 0,
-    blur: float = 10.0,
-    centre: tuple[float, float] | None = None,
-    unaffected: float | None = None,
-    factor: float = DISTURBED,
-    margin: float = MARGIN,
+    high_passed: FloatArray, images: IlluminationImages, *, light: int = 0, blur: float = 10.0
 ) -> SetUpThreshold:
     """The weighting threshold of a set-up, from a measurement with one light and without weights.
+
+    The middle of the reflection is the brightest point, where there is a measurement, of the image blurred twice as
+    much as for the weights.
 
     Parameters
     ----------
     high_passed
-        `rgbmidic.lab.study.high_pass` of its displacement at a small motion, shape (H, W).
+        `rgbmidic.fields.high_pass` of its displacement at a small motion, shape (H, W).
     images
         The reference images; `light` is the one that was used.
     blur
         Standard deviation (px) of the blur that the weights will use.
-    centre
-        Middle of the reflection (x, y); None: the brightest point, where there is a measurement, of the image blurred
-        twice as much.
-    unaffected, factor
-        As in `disturbed_zone`.
-    margin
-        Share of the dynamic range by which the threshold lies below the contour, to be on the safe side.
 
     Raises
     ------
@@ -153,25 +132,23 @@ def set_up_threshold(
         The displacement is nowhere disturbed: the set-up needs no weights, or the motion is too small to show it.
     """
     image = blurred(images, blur)[light].astype(np.float64) / images.full_scale
-    if centre is None:
-        smooth = np.where(np.isfinite(high_passed), blurred(images, 2 * blur)[light], -np.inf)
-        row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
-        centre = (float(column), float(row))
-    zone = disturbed_zone(high_passed, centre, unaffected=unaffected, factor=factor)
+    smooth = np.where(np.isfinite(high_passed), blurred(images, 2 * blur)[light], -np.inf)
+    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
+    zone = disturbed_zone(high_passed, (float(column), float(row)))
     if not zone.radius > 0:
         raise InputError(
-            f"no disturbed zone around {centre}: P is {zone.contrast * zone.unaffected:.2g} px there and "
-            f"{zone.unaffected:.2g} px away from it, less than {factor:g} times as much"
+            f"no disturbed zone around {zone.centre}: P is {zone.contrast * zone.unaffected:.2g} px there and "
+            f"{zone.unaffected:.2g} px away from it, less than {DISTURBED:g} times as much"
         )
     level = _mean_on_circle(image, zone)
-    return SetUpThreshold(zone=zone, contour=level, value=level - margin)
+    return SetUpThreshold(zone=zone, contour=level, value=level - MARGIN)
 
 
-def _ring_profile(distance: FloatArray, ripple: FloatArray, ring: float) -> tuple[FloatArray, FloatArray]:
+def _ring_profile(distance: FloatArray, ripple: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean radius and root mean square of the rings that hold enough pixels to tell."""
-    index = (distance / ring).astype(int)
+    index = (distance / RING).astype(int)
     count = np.bincount(index)
-    full = count >= ring**2
+    full = count >= RING**2
     radii = np.bincount(index, weights=distance)[full] / count[full]
     return radii, np.sqrt(np.bincount(index, weights=ripple**2)[full] / count[full])
 

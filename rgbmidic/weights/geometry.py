@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
 from rgbmidic.errors import ConfigurationError, InputError
+from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.scene.forecast import Instrument
 from rgbmidic.scene.projection import material_points
 from rgbmidic.scene.reflection import angle_weights, surface_from_heights
@@ -28,7 +30,7 @@ _STEP = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeometryWeights:
-    """Weights of every frame of a test, from lamps, camera and specimen.
+    """Weights of every frame of a test, from lamps, camera and specimen; a `LightWeights`.
 
     Attributes
     ----------
@@ -36,6 +38,8 @@ class GeometryWeights:
         Lamps, camera, paint and body.
     states
         State of every frame; empty: not known, all frames show the body at rest.
+    reference_frames
+        Indices of the frames whose mean is the reference.
     order
         For each light of the test its place in the scene.
     limit_deg
@@ -46,8 +50,11 @@ class GeometryWeights:
         Points and normals (3, h, w) on the grid of the prediction, from a height map; None: the scene's body.
     """
 
+    notes: ClassVar[Mapping[str, float]] = {}
+
     scene: Scene
     states: tuple[State, ...]
+    reference_frames: tuple[int, ...]
     order: tuple[int, ...]
     limit_deg: float | None
     instrument: Instrument
@@ -90,33 +97,37 @@ class GeometryWeights:
         return cls(
             scene=scene,
             states=(State(), *experiment.states) if experiment.states else (),
+            reference_frames=settings.frames.reference,
             order=_order(scene, lights, weights.geometry),
             limit_deg=weights.limit_deg,
             instrument=Instrument.of(
                 scene,
                 element_size=settings.element_size,
                 demosaic=settings.illumination.demosaic,
-                prefilter=settings.solver.prefilter or "binomial",
+                prefilter=settings.solver.prefilter,
             ),
             surface=surface,
         )
 
-    def reference(self, indices: Sequence[int]) -> FloatImage:
-        """Weights (k, H, W) of the reference, the mean of some frames: binary ones, or 1.
+    def reference(self, images: IlluminationImages) -> FloatImage:
+        """Weights (k, H, W) of the reference: binary ones, or 1 where an image is valid.
 
         Soft weights belong to a pair of states and are given to the deformed one.
         """
+        valid = images.valid.astype(np.float32)
         if self.limit_deg is None:
-            return np.ones((len(self.order), *self.scene.camera.shape), dtype=np.float32)
-        each = [self._binary(self._state(index)) for index in indices]
-        return np.asarray(np.min(each, axis=0))
+            return valid
+        each = [self._binary(self._state(index)) for index in self.reference_frames]
+        return np.asarray(valid * np.min(each, axis=0))
 
-    def frame(self, index: int, reference: int) -> FloatImage:
-        """Weights (k, H, W) of a frame, `reference` being the frame that it is compared with."""
-        state = self._state(index)
+    def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
+        """Weights (k, H, W) of frame `index` compared with the first reference frame."""
+        return np.asarray(images.valid * self._predicted(self._state(index)))
+
+    def _predicted(self, state: State) -> FloatImage:
         if self.limit_deg is not None:
             return self._binary(state)
-        before, after = self._zones(self._state(reference), state), self._zones(state, state)
+        before, after = self._zones(self._state(self.reference_frames[0]), state), self._zones(state, state)
         return self._whole(self.instrument.weights(before, after, known=bool(self.states)))
 
     def _binary(self, state: State) -> FloatImage:

@@ -1,38 +1,46 @@
-"""Weights p_j of the lights: where each light reflects, it is excluded (paper, section 3.2).
+"""Weights by a threshold: where a light is bright it reflects, and is excluded (paper, section 3.2).
 
 The paper's second method: blur the image so that the speckle vanishes, and exclude what is brighter than a fraction of
-the dynamic range. The weight of a pixel is the product of its weight in the reference image and in the deformed image
-at the place the pixel has moved to; the solve brings the latter back.
+the dynamic range.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
 import cv2
 import numpy as np
 
-from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.settings import WeightSettings
 from rgbmidic.typing import FloatImage
 
-__all__ = ["blurred", "light_weights", "threshold_weights"]
+__all__ = ["ThresholdWeights", "blurred", "threshold_weights"]
 
 
-def light_weights(images: IlluminationImages, settings: WeightSettings) -> FloatImage:
-    """Weights (k, H, W) in [0, 1] of one state by the method of `settings`; 0 where an image is not valid.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThresholdWeights:
+    """One threshold for all lights and frames; a `LightWeights`.
 
-    Only the threshold acts on the images: statistics come from the residual, in the solve, and geometry from a scene.
-
-    Raises
-    ------
-    InputError
-        The threshold is ``"auto"``: it must be found first (`rgbmidic.lab.study.automatic_threshold`).
+    Attributes
+    ----------
+    threshold, blur
+        As in `threshold_weights`.
+    notes
+        The threshold, where it was found from the test's own frames.
     """
-    if settings.method != "threshold":
-        return images.valid.astype(np.float32)
-    if isinstance(settings.threshold, str):
-        raise InputError('weights.threshold is "auto": it must be found from two states before it can be applied')
-    return threshold_weights(images, threshold=settings.threshold, blur=settings.blur)
+
+    threshold: float
+    blur: float
+    notes: Mapping[str, float] = field(default_factory=dict)
+
+    def reference(self, images: IlluminationImages) -> FloatImage:
+        """Binary weights (k, H, W)."""
+        return threshold_weights(images, threshold=self.threshold, blur=self.blur)
+
+    def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
+        """Binary weights (k, H, W)."""
+        return threshold_weights(images, threshold=self.threshold, blur=self.blur)
 
 
 def threshold_weights(images: IlluminationImages, *, threshold: float = 2 / 3, blur: float = 10.0) -> FloatImage:

@@ -16,7 +16,7 @@ from results import make_result, random_record
 
 from rgbmidic import __version__, cli
 from rgbmidic.errors import FrameError
-from rgbmidic.results.store import FrameRecord, Result, ResultStore
+from rgbmidic.results import FrameRecord, Result, ResultStore
 
 TEST = '[frames]\npath = "f*.tif"\nkind = "monochrome"\n[region]\nrectangle = [40, 40, 160, 120]\n'
 

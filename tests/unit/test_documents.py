@@ -7,12 +7,12 @@ import tomllib
 from dataclasses import MISSING, fields
 from pathlib import Path
 
-import numpy as np
 import pytest
 from small_tests import colour_test
 
-from rgbmidic import NodeStatus, Status, TestSettings, measure
-from rgbmidic.results.export import export_result
+from rgbmidic import NodeStatus, Status, TestSettings
+from rgbmidic.results import QUANTITIES
+from rgbmidic.results.quantities import SHARED
 from rgbmidic.settings import _place, _sections
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -97,22 +97,17 @@ def test_status_codes_are_documented(codes):
         assert f"| {int(code)} | `{code.name}` |" in text
 
 
-def test_every_exported_array_is_documented_with_its_shape(tmp_path):
-    test = colour_test(tmp_path / "test", [(0.0, 0.0), (0.3, 0.1)])
-    result = measure(test.settings(), tmp_path / "result")
-    export_result(result, "npz", tmp_path / "result.npz")
-    rows = re.findall(
-        r"^\| (`\w+`[^|]*) \| ([^|]*\([^|]*\)) \|", (DOCS / "conventions.md").read_text("utf-8"), re.MULTILINE
-    )
-    shapes = {}
-    for names, text in rows:
-        names, parts = re.findall(r"`(\w+)`", names), re.findall(r"\(([^)]*)\)", text)
-        shapes |= dict(zip(names, parts if len(parts) > 1 else parts * len(names), strict=True))
-    sizes = {"T": 2, "N": len(result.nodes), "E": len(result.elements), "k": 3, "2": 2, "3": 3}
-    with np.load(tmp_path / "result.npz") as archive:
-        for name in archive.files:
-            stated = tuple(sizes[size.strip()] for size in shapes[name].split(",") if size.strip())
-            assert archive[name].shape == stated, name
+SIZES = {"node": "N", "light": "k", "element": "E", "function": "m", "row": "h", "column": "w", "iteration": "i"}
+SIZES |= {"image row": "H", "image column": "W", "file": "files"}
+
+
+@pytest.mark.parametrize(("quantities", "frames"), [(SHARED, ()), (QUANTITIES, ("T",))])
+def test_every_quantity_of_a_result_is_documented(quantities, frames):
+    text = (DOCS / "conventions.md").read_text(encoding="utf-8")
+    for name, quantity in quantities.items():
+        sizes = (*frames, *(str(SIZES.get(axis, axis)) for axis in quantity.axes))
+        shape = f"({', '.join(sizes)}{',' * (len(sizes) == 1)})"
+        assert f"| `{name}` | {shape} | {quantity.unit} | {quantity.meaning} |".replace("  ", " ") in text, name
 
 
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):

@@ -226,7 +226,9 @@ _settings = st.builds(
     element_size=_numbers,
     illumination=st.builds(IlluminationSettings),
     weights=st.builds(WeightSettings, threshold=st.floats(0.01, 1), blur=_numbers),
-    solver=st.builds(SolverSettings, prefilter=st.none() | st.just("none"), max_iterations=st.integers(1, 100)),
+    solver=st.builds(
+        SolverSettings, prefilter=st.sampled_from(["none", "binomial"]), max_iterations=st.integers(1, 100)
+    ),
     scale=st.builds(ScaleSettings, mm_per_pixel=st.none() | _numbers, frame_rate=st.none() | _numbers),
     base=st.just(Path("/data")),
 )

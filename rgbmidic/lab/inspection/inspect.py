@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.frames import open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.readers import read_frame
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import ReflectionAwareDemosaicer
@@ -27,8 +27,8 @@ from rgbmidic.lab.inspection.prediction import Prediction, predict
 from rgbmidic.lab.inspection.results import BLIND, ChannelFacts, Inspection, LightFacts, Spread
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline import read_region, with_camera
-from rgbmidic.settings import FrameSettings, TestSettings
+from rgbmidic.pipeline import read_region
+from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, SolverSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["inspect_files", "inspect_frame", "state_frames"]
@@ -72,19 +72,7 @@ def inspect_files(
     calibrated = calibration or (test.calibration_file if test else None)
     known = None if calibrated is None else Calibration.read(calibrated)
     paths = [Path(file) for file in files]
-    told = with_camera(stated, paths[0], known)
-    frames = tuple(
-        read_frame(
-            path,
-            kind=told.kind,
-            cfa=told.cfa,
-            black_level=told.black_level,
-            white_level=told.white_level,
-            shape=told.shape,
-            dtype=told.dtype,
-        )
-        for path in paths
-    )
+    frames = tuple(open_source(path, stated, known).read(0) for path in paths)
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     place = Region.from_rectangle(region, shape) if region is not None else None
     if place is None and test is not None:
@@ -94,9 +82,9 @@ def inspect_files(
             frames,
             calibration=known,
             region=place,
-            element_size=element_size or (test.element_size if test else 25.0),
+            element_size=element_size or (test.element_size if test else ELEMENT_SIZE),
             demosaic=test.illumination.demosaic if test else "auto",
-            prefilter=(test.solver.prefilter if test else None) or "binomial",
+            prefilter=(test.solver if test else SolverSettings()).prefilter,
             name=" + ".join(path.name for path in paths),
         )
     except InputError as error:
@@ -108,7 +96,7 @@ def inspect_frame(
     *,
     calibration: Calibration | None = None,
     region: Region | Sequence[float] | None = None,
-    element_size: float = 25.0,
+    element_size: float = ELEMENT_SIZE,
     demosaic: str = "auto",
     prefilter: str = "binomial",
     name: str = "frame",

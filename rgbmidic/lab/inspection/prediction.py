@@ -15,22 +15,22 @@ import cv2
 import numpy as np
 import scipy.sparse as sp
 
+from rgbmidic.correlation.assembly import Assembly, factorise
 from rgbmidic.correlation.images import PREFILTERS, apply_prefilter
-from rgbmidic.correlation.system import NormalEquations, factorise
-from rgbmidic.correlation.uncertainty import Probing, displacement_functionals, functional_std
+from rgbmidic.correlation.node_status import LOST
+from rgbmidic.correlation.uncertainty.propagation import NodeColouring, displacement_functionals, functional_std
 from rgbmidic.illumination.normalise import local_mean
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection.disturbances import Disturbances
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Prediction", "nodal_std", "predict"]
+__all__ = ["Prediction", "expected_std", "predict"]
 
 
 SEEN = 0.05
-"""Share of the median information under which a node is not measured: that of the solver (`rgbmidic.correlation`)."""
-LOST = 0.5
-"""Standard uncertainty (px) from which a node is not measured: that of the solver."""
+"""Share of the median information under which a node is not measured: that of the solver
+(`rgbmidic.correlation.equations`)."""
 _GRID, _REACH = 64, 16
 """Frequencies on which the kernel is computed, and the distance (px) to which it is kept: speckle's gradients are
 correlated over a speckle or two."""
@@ -105,7 +105,7 @@ def predict(
         square = sum(((pull * part).sum(axis=1) ** 2).mean(axis=0) for part in parts if len(part))
         score = 2 * _smooth(np.asarray(square, dtype=np.float32)[None], region.mask, mesh.size)[0]
         information = energy * (pull * contrast).sum(axis=0)
-        return nodal_std(mesh, _element_means(information, pixels), _element_means(score, pixels))
+        return expected_std(mesh, _element_means(information, pixels), _element_means(score, pixels))
 
     noise, mosaic = scores.noise[None], scores.mosaic
     each = [np.where(np.arange(len(pull))[:, None, None] == light, pull, 0) for light in range(len(pull))]
@@ -117,7 +117,7 @@ def predict(
     )
 
 
-def nodal_std(mesh: Tri3Mesh, information: FloatArray, score: FloatArray) -> FloatArray:
+def expected_std(mesh: Tri3Mesh, information: FloatArray, score: FloatArray) -> FloatArray:
     """Standard uncertainty (N,) of a displacement component at the nodes, px; NaN where they see too little.
 
     Parameters
@@ -132,16 +132,16 @@ def nodal_std(mesh: Tri3Mesh, information: FloatArray, score: FloatArray) -> Flo
     seen = density > SEEN * np.median(density[density > 0]) if (density > 0).any() else np.zeros(len(density), bool)
     if not seen.any():
         return np.full(len(density), np.nan)
-    equations = NormalEquations.from_mesh(mesh)
+    assembly = Assembly.from_mesh(mesh)
     mass = ((1 + np.eye(3)) / 12)[..., None] * np.array([1.0, 0.0, 1.0])
 
     def assembled(values: FloatArray) -> sp.csc_matrix:
-        return equations.matrix((values * mesh.areas)[:, None, None, None] * mass)
+        return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
 
     # elements that no light sees must not make the system singular
     solve = factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
     along_x = displacement_functionals(len(density))[:1]
-    std = functional_std(solve, assembled(score), Probing.from_mesh(mesh), along_x, seen)[:, 0]
+    std = functional_std(solve, assembled(score), NodeColouring.from_mesh(mesh), along_x, seen)[:, 0]
     return np.where(seen & (std < LOST), std, np.nan)
 
 

@@ -17,9 +17,10 @@ import numpy.typing as npt
 from rgbmidic.fields import at_pixels, high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.study.bench import Bench, study_paint
-from rgbmidic.lab.study.competitors import ELEMENT_SIZE, Competitor
+from rgbmidic.lab.study.competitors import Competitor
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.scene.surface import Finish, Surface
+from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["RADIUS", "VARIATIONS", "Cause", "NoiseOfLights", "Variation", "find_causes", "noise_of_lights"]

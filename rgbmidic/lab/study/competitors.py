@@ -8,21 +8,20 @@ taken as they are and the lights' shares are not balanced: what rgbmidic does be
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Reference, Solution, SolveOptions, solve
+from rgbmidic.correlation import Deformed, Reference, Solution, solve
 from rgbmidic.correlation.start import coarse_start
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.settings import ELEMENT_SIZE, SolverSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import threshold_weights
 
 __all__ = ["METHODS", "Competitor", "Method"]
-
-ELEMENT_SIZE = 25.0
-"""px (paper, section 2.2)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +43,7 @@ class Method:
     title: str
     all_lights: bool = False
     weighted: bool = False
-    brightness: str = "none"
+    brightness: Literal["none", "local"] = "none"
 
 
 METHODS: dict[str, Method] = {
@@ -150,8 +149,8 @@ class Competitor:
         )
         if start is None:
             start = coarse_start(self.reference, deformed, _SEARCH)
-        options = SolveOptions(brightness=METHODS[self.method].brightness, statistics=False, curvature=False)
-        return solve(self.reference, deformed, start, options)
+        options = SolverSettings(brightness=METHODS[self.method].brightness)
+        return solve(self.reference, deformed, start, options, statistics=False)
 
 
 _SEARCH = 64.0

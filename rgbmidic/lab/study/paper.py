@@ -14,11 +14,12 @@ from rgbmidic.fields import at_pixels, high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.study.bench import BENCHES, SMALLEST, Bench
 from rgbmidic.lab.study.causes import VARIATIONS, Cause, NoiseOfLights, find_causes, noise_of_lights
-from rgbmidic.lab.study.competitors import ELEMENT_SIZE, METHODS, Competitor
+from rgbmidic.lab.study.competitors import METHODS, Competitor
 from rgbmidic.lab.study.goniometry import Goniometry
 from rgbmidic.lab.study.perturbation import area_means, area_stds, residual_percent
 from rgbmidic.lab.study.plate import Topography, virtual_goniometry, virtual_topography
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.disturbed_zone import SetUpThreshold, set_up_threshold
 from rgbmidic.weights.threshold import blurred, threshold_weights

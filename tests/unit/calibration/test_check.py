@@ -7,8 +7,8 @@ import pytest
 from calibration_scene import BLACK, GAIN, MATRICES, READ, WHITE, captures, expose, registered_pictures, speckle_target
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
+from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import Mosaic
-from rgbmidic.frames.readers import read_frame
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.registration import Registration, frame_geometry

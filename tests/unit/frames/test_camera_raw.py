@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames import camera_raw
+from rgbmidic.frames import camera_raw, open_source, read_frame
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
-from rgbmidic.frames.readers import frame_shape, read_frame, tells_camera
 from rgbmidic.frames.writers import write_dng
+from rgbmidic.settings import FrameSettings
+
+STATED = FrameSettings(path=("frame",))
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def test_pattern_and_black_levels_follow_odd_margins(tmp_path: Path, cfa: str, m
     np.testing.assert_array_equal(cell // 1000 - 1, cfa_channels(frame.cfa))
     np.testing.assert_array_equal(cell % 1000 + 60, frame.black_level)
     assert frame.values.min() >= 1000, "a masked margin is in the frame"
-    assert frame_shape(path) == frame.values.shape
+    assert open_source(path, STATED).shape == frame.values.shape
 
 
 def test_monochrome_camera_raw_is_one_channel(tmp_path: Path) -> None:
@@ -129,7 +131,7 @@ def test_headerless_file_is_not_taken_for_a_camera_raw_by_its_length(shared_data
         (tmp_path / name).write_bytes(content)
         with pytest.raises(FrameError, match="shape and dtype"):
             read_frame(tmp_path / name)
-        assert not tells_camera(tmp_path / name)
+        assert not open_source(tmp_path / name, STATED).tells_camera
 
 
 def test_what_a_camera_raw_tells_need_not_be_stated_but_must_not_be_contradicted(dng: Path) -> None:
@@ -139,7 +141,7 @@ def test_what_a_camera_raw_tells_need_not_be_stated_but_must_not_be_contradicted
     for name, value in wrong.items():
         with pytest.raises(FrameError, match=rf"{name} is stated as .*whole\.dng says"):
             read_frame(dng, **{**stated, name: value})
-    assert tells_camera(dng)
+    assert open_source(dng, STATED).tells_camera
 
 
 def test_dng_with_a_tiff_name_is_read_as_dng(dng: Path) -> None:

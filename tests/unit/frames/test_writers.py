@@ -11,8 +11,8 @@ from frames import channel_frames, mosaics, noisy_mosaic
 from hypothesis import given, settings
 
 from rgbmidic.errors import InputError
+from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
-from rgbmidic.frames.readers import read_frame
 from rgbmidic.frames.writers import MINIMUM_DNG_SIZE, write_dng, write_tiff
 
 

@@ -25,7 +25,7 @@ from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
 from rgbmidic.lab.inspection.disturbances import gaussian_field
-from rgbmidic.lab.inspection.prediction import nodal_std
+from rgbmidic.lab.inspection.prediction import expected_std
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -141,13 +141,13 @@ def test_inner_nodes_of_an_even_field_follow_the_closed_form_of_plan():
     side, information, score = 20.0, 0.03, 7e-6
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 240, 240), (241, 241)), side)
     everywhere = np.ones(len(mesh.elements))
-    std = nodal_std(mesh, information * everywhere, score * everywhere)
+    std = expected_std(mesh, information * everywhere, score * everywhere)
     inner = ((mesh.nodes > 60) & (mesh.nodes < 180)).all(axis=1)
     closed = np.sqrt(node_constant() * score) / (side * information)
     assert np.sqrt(np.mean(std[inner] ** 2)) == pytest.approx(closed, rel=0.01)
     assert std[~inner].max() > 1.4 * closed
     blind = np.where((mesh.nodes[mesh.elements].mean(axis=1)[:, 0] < 100), 0.0, information)
-    assert np.isnan(nodal_std(mesh, blind, score * everywhere)).mean() == pytest.approx(5 / 13, abs=0.01)
+    assert np.isnan(expected_std(mesh, blind, score * everywhere)).mean() == pytest.approx(5 / 13, abs=0.01)
 
 
 def test_noise_is_estimated_from_a_flat_or_coarsely_painted_frame():

@@ -156,7 +156,7 @@ def test_shape_functions_are_one_at_their_corner_and_sum_to_one():
 
 def test_gather_and_scatter_are_inverse_on_the_region():
     region = REGIONS["whole image"]
-    pixels = PixelMap.from_mesh(Tri3Mesh.from_region(region), region)
+    pixels = PixelMap.from_mesh(Tri3Mesh.from_region(region, 25), region)
     image = np.random.default_rng(0).normal(size=SHAPE).astype(np.float32)
     np.testing.assert_array_equal(pixels.scatter(pixels.gather(image)), image)
     np.testing.assert_array_equal(pixels.gather(np.stack([image, 2 * image]))[1], 2 * pixels.gather(image))
@@ -212,7 +212,7 @@ def test_too_small_regions_and_elements_are_refused():
     with pytest.raises(InputError, match="at least 4 px"):
         Tri3Mesh.from_region(REGIONS["rectangle"], float("nan"))
     with pytest.raises(RegionError, match="too small"):
-        Tri3Mesh.from_region(Region.from_rectangle((10, 10, 13, 60), SHAPE))
+        Tri3Mesh.from_region(Region.from_rectangle((10, 10, 13, 60), SHAPE), 25)
     line = np.zeros(SHAPE, dtype=bool)
     line[20, 10:60] = True
     with pytest.raises(RegionError, match="too small"):

@@ -13,7 +13,7 @@ from results import LIGHTS, MESH, NODES, make_result
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.report import figures
 from rgbmidic.report.gallery import remove_figures, write_figures
-from rgbmidic.results.store import FrameRecord, Result, ResultStore
+from rgbmidic.results import FrameRecord, Result, ResultStore
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 
@@ -21,23 +21,16 @@ IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 def _linear_result(path: Path, *, blank: bool = False) -> Result:
     """One frame with u = x / 10 and v = 1 - y / 20; some nodes blank where asked for."""
     x, y = MESH.nodes.T
-    displacement = np.stack([x / 10, 1 - y / 20], axis=1)
     hidden = (x > 60) & blank
-    displacement[hidden] = np.nan
     store = ResultStore.create(path, nodes=MESH.nodes, elements=MESH.elements, names=["only"], lights=LIGHTS)
-    content = FrameRecord.failed("", nodes=NODES, lights=len(LIGHTS))
-    record = FrameRecord(
-        displacement=displacement,
-        displacement_std=0.01 + 0 * displacement,
-        strain=np.zeros((len(displacement), 3)),
-        light_share=np.ones((len(displacement), 3)),
-        misfit=np.ones(len(displacement)),
-        strain_std=np.full((len(displacement), 3), 1e-4),
+    record = FrameRecord.of(
+        nodes=NODES,
+        lights=len(LIGHTS),
+        u=np.where(hidden, np.nan, x / 10),
+        v=np.where(hidden, np.nan, 1 - y / 20),
         status=0,
-        node_status=hidden.astype(np.uint8),
+        node_status=hidden,
         residual=np.ones(3),
-        weight_share=np.ones(3),
-        rigid=content.rigid,
         history=np.array([1.0, 0.01, 0.0001]),
     )
     store.write_frame(0, record)

@@ -10,8 +10,7 @@ import pytest
 from results import LIGHTS, NODES, make_result
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.store import Result
+from rgbmidic.results import EXPORT_FORMATS, QUANTITIES, Result, export_result
 
 
 @pytest.fixture
@@ -25,11 +24,10 @@ def test_npz_holds_every_array(result: Result, tmp_path: Path) -> None:
         assert archive["u"].shape == archive["v_std"].shape == (3, NODES)
         assert archive["names"].tolist() == ["frame 0", "frame 1", "frame 2"]
         assert archive["lights"].tolist() == list(LIGHTS)
-        strains = {f"{name}{suffix}" for name in ("exx", "eyy", "exy") for suffix in ("", "_std")}
-        np.testing.assert_array_equal(archive["exy_std"], result.strain_std[..., 2])
-        for name in set(archive.files) - {"names", "lights"} - strains:
+        stackable = {name for name, quantity in QUANTITIES.items() if quantity.stackable}
+        assert set(archive.files) == {"nodes", "elements", "names", "lights"} | stackable
+        for name in archive.files:
             np.testing.assert_array_equal(archive[name], getattr(result, name), err_msg=name)
-        assert {"nodes", "elements", "u", "v", "u_std", "v_std", "status", "node_status"} <= set(archive.files)
 
 
 def test_csv_has_one_row_per_node_and_frame(result: Result, tmp_path: Path) -> None:
@@ -37,7 +35,7 @@ def test_csv_has_one_row_per_node_and_frame(result: Result, tmp_path: Path) -> N
     with (tmp_path / "fields.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * NODES
-    for name in ("u", "v", "u_std", "v_std"):
+    for name in ("u", "v", "u_std", "v_std", "exy", "exx_std", "misfit"):
         column = np.array([float(row[name] or "nan") for row in rows]).reshape(3, NODES)
         np.testing.assert_allclose(column, getattr(result, name), rtol=1e-8, err_msg=name)
     x, y = (np.array([float(row[name]) for row in rows[:NODES]]) for name in ("x", "y"))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import pickle
+from dataclasses import replace
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +15,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, make_result, random_record
 
+from rgbmidic.correlation import NodeStatus, Solution, Status
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.record import read_record, write_record
-from rgbmidic.results.store import FrameRecord, Result, ResultStore
+from rgbmidic.results import QUANTITIES, FrameRecord, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("records")
+def store(tmp_path_factory: pytest.TempPathFactory) -> ResultStore:
+    return _create(tmp_path_factory.mktemp("records") / "out", 2)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
-def test_record_written_and_read_is_the_same(folder: Path, seed: int) -> None:
+def test_record_written_and_read_is_the_same(store: ResultStore, seed: int) -> None:
     record = random_record(seed)
-    write_record(folder / "frame_000000.npz", record)
-    back = read_record(folder / "frame_000000.npz")
-    for name in FrameRecord.__slots__:
+    store.write_frame(0, record)
+    back = store.read_frame(0)
+    for name, quantity in QUANTITIES.items():
         np.testing.assert_equal(getattr(back, name), getattr(record, name))
+        if quantity.axes:
+            assert getattr(back, name).dtype.type is quantity.dtype
 
 
 def test_result_gives_every_frame_back(tmp_path: Path) -> None:
@@ -39,18 +44,16 @@ def test_result_gives_every_frame_back(tmp_path: Path) -> None:
     assert len(result) == 4
     np.testing.assert_array_equal(result.nodes, MESH.nodes)
     np.testing.assert_array_equal(result.elements, MESH.elements)
-    for name, expected in {
-        "u": [record.displacement[:, 0] for record in records],
-        "v": [record.displacement[:, 1] for record in records],
-        "u_std": [record.displacement_std[:, 0] for record in records],
-        "v_std": [record.displacement_std[:, 1] for record in records],
-        "status": [record.status for record in records],
-        "node_status": [record.node_status for record in records],
-        "iterations": [len(record.history) for record in records],
-        "residual": [record.residual for record in records],
-        "weight_share": [record.weight_share for record in records],
-    }.items():
+    stackable = [name for name, quantity in QUANTITIES.items() if quantity.stackable]
+    assert {"u", "v", "u_std", "v_std", "status", "node_status", "iterations", "residual"} <= set(stackable)
+    for name in stackable:
+        expected = np.array([getattr(record, name) for record in records])
         np.testing.assert_array_equal(getattr(result, name), expected, err_msg=name)
+        assert getattr(result, name).dtype == expected.dtype, name
+    np.testing.assert_array_equal(result.strain[..., 2], result.exy)
+    np.testing.assert_array_equal(result.strain_std[..., 0], result.exx_std)
+    for record, history in zip(records, result.each("history"), strict=True):
+        np.testing.assert_array_equal(history, record.history)
     assert result.reasons == tuple(record.reason for record in records)
     assert result.names == ("frame 0", "frame 1", "frame 2", "frame 3")
     assert result.u.shape == (4, NODES)
@@ -60,7 +63,7 @@ def test_frames_may_come_in_any_order_and_twice(tmp_path: Path) -> None:
     store = _create(tmp_path / "out", 3)
     for index in (2, 0, 1, 0):
         store.write_frame(index, random_record(index))
-    np.testing.assert_array_equal(Result.open(tmp_path / "out").frame(2).displacement, random_record(2).displacement)
+    np.testing.assert_array_equal(Result.open(tmp_path / "out").frame(2).u, random_record(2).u)
     assert not list((tmp_path / "out").rglob("*.part"))
 
 
@@ -76,7 +79,7 @@ def test_provenance(tmp_path: Path) -> None:
     document = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert document["settings"] == test.to_mapping()
     assert document["calibration"]["sha256"].startswith("44136fa355b3678a")
-    assert document["inputs"] == result.inputs == {"/data/0.dng": "00", "/data/1.dng": "01"}
+    assert result.inputs == {"/data/0.dng": "00", "/data/1.dng": "01"}
     assert document["lights"] == list(LIGHTS)
     assert document["note"] == "n"
     assert {"rgbmidic", "python", "numpy", "numba"} <= set(document["versions"])
@@ -122,12 +125,41 @@ def test_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
 
 @given(share=st.floats(0, 1, exclude_max=True))
 @settings(max_examples=40, deadline=None)
-def test_truncated_frame_file_is_told(folder: Path, share: float) -> None:
-    write_record(folder / "frame_000000.npz", random_record(0))
-    content = (folder / "frame_000000.npz").read_bytes()
-    (folder / "frame_000001.npz").write_bytes(content[: int(share * len(content))])
+def test_truncated_frame_file_is_told(store: ResultStore, share: float) -> None:
+    store.write_frame(1, random_record(0))
+    file = store.path / "solution" / "frame_000001.npz"
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
     with pytest.raises(ResultError, match=r"frame_000001\.npz is damaged"):
-        read_record(folder / "frame_000001.npz")
+        store.read_frame(1)
+
+
+def test_a_quantity_is_read_without_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a run of many frames costs: one frame at a time, nothing kept, nothing read back at the end."""
+    result = make_result(tmp_path / "out", frames=3)
+    reads: list[tuple[int, list[str]]] = []
+    read = ResultStore.read
+
+    def counted(self: ResultStore, index: int, names: Any) -> Any:
+        reads.append((index, list(names)))
+        return read(self, index, names)
+
+    monkeypatch.setattr(ResultStore, "read", counted)
+    result.store.finish()
+    assert reads == []
+    assert result.u is result.u
+    assert reads == [(0, ["u"]), (1, ["u"]), (2, ["u"])]
+    result.frame(1)
+    assert [index for index, _ in reads[3:]] == [1]
+
+
+def test_only_what_stacks_is_an_attribute(tmp_path: Path) -> None:
+    result = make_result(tmp_path / "out")
+    assert {"u", "exy_std", "brightness", "nodes"} <= set(dir(result))
+    for name in ("history", "weights_thumbnail", "reason", "bogus"):
+        assert name not in dir(result)
+        with pytest.raises(AttributeError, match=name):
+            getattr(result, name)
 
 
 def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
@@ -143,7 +175,7 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
     assert "schema version 9" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 9}')
-    assert "is missing" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 2}')
+    assert "list of names" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 3}')
     assert "mesh.npz is missing" in damaged("mesh.npz", None)
     assert "mesh.npz is damaged" in damaged("mesh.npz", b"PK")
     assert "frame 1 (frame 1) of 2 is missing" in damaged("solution/frame_000001.npz", None)
@@ -153,29 +185,73 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
 def test_frame_of_another_mesh_is_refused(tmp_path: Path) -> None:
     store = _create(tmp_path / "out", 1)
     other = FrameRecord.failed("no light", nodes=NODES + 1, lights=len(LIGHTS))
-    with pytest.raises(InputError, match=f"{NODES + 1} nodes"):
+    with pytest.raises(InputError, match=f"sizes.*{NODES + 1}"):
         store.write_frame(0, other)
     with pytest.raises(InputError, match="no frame 1"):
         store.write_frame(1, random_record(0))
-    write_record(tmp_path / "out" / "solution" / "frame_000000.npz", other)
+    replace(store, sizes=other.sizes).write_frame(0, other)
     with pytest.raises(ResultError, match="does not belong to this mesh"):
         Result.open(tmp_path / "out").frame(0)
 
 
 def test_failed_record_measures_nothing_and_says_why() -> None:
     record = FrameRecord.failed("file damaged", nodes=5, lights=2)
-    assert np.isnan(record.displacement).all()
-    assert np.isnan(record.displacement_std).all()
-    assert (record.node_status > 0).all()
-    assert (record.status, record.reason, record.iterations) == (2, "file damaged", 0)
+    measured = [name for name, quantity in QUANTITIES.items() if quantity.axes == ("node",) and name != "node_status"]
+    assert all(np.isnan(getattr(record, name)).all() for name in measured)
+    assert (record.node_status == NodeStatus.NOT_SEEN).all()
+    assert (record.status, record.reason, record.iterations) == (Status.FAILED, "file damaged", 0)
+    assert record.history.shape == (0,)
+    assert record.reflection_thumbnail.shape == (2, 0, 0)
 
 
-@pytest.mark.parametrize("name", ["displacement", "rigid", "history"])
+@pytest.mark.parametrize("name", ["u", "rigid", "history"])
 def test_record_of_wrong_shape_is_refused(name: str) -> None:
-    record = random_record(0)
-    content = {slot: getattr(record, slot) for slot in FrameRecord.__slots__}
     with pytest.raises(InputError, match=name):
-        FrameRecord(**{**content, name: np.zeros((3, 4, 5))})
+        FrameRecord.of(nodes=3, lights=2, **{name: np.zeros((3, 4, 5))})
+
+
+def test_record_of_an_unknown_quantity_is_refused() -> None:
+    with pytest.raises(InputError, match="unknown: w"):
+        FrameRecord.of(nodes=3, lights=2, w=np.zeros(3))
+    with pytest.raises(AttributeError, match="'w'"):
+        _ = FrameRecord.failed("", nodes=3, lights=2).w
+
+
+def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
+    nodes, values = 4, np.random.default_rng(0)
+    solution = Solution(
+        nodes=values.random((nodes, 2)),
+        elements=np.array([[0, 1, 2]], dtype=np.int32),
+        displacement=values.random((nodes, 2)),
+        displacement_std=values.random((nodes, 2)),
+        strain=values.random((nodes, 3)),
+        strain_std=values.random((nodes, 3)),
+        node_status=np.arange(nodes).astype(np.uint8),
+        light_share=values.random((nodes, 2)),
+        misfit=values.random(nodes),
+        status=Status.NOT_CONVERGED,
+        reason="why",
+        rigid=values.random((2, 3)),
+        residual=values.random(2),
+        weight_share=values.random(2),
+        history=values.random(6),
+    )
+    brightness = values.random((2, 2))
+    record = pickle.loads(pickle.dumps(FrameRecord.from_solution(solution, inputs={"a": "b"}, brightness=brightness)))
+    np.testing.assert_array_equal(np.stack([record.u, record.v], axis=1), solution.displacement)
+    np.testing.assert_array_equal(np.stack([record.u_std, record.v_std], axis=1), solution.displacement_std)
+    np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), solution.strain)
+    np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), solution.strain_std)
+    for name in ("node_status", "light_share", "misfit", "rigid", "residual", "weight_share", "history"):
+        np.testing.assert_array_equal(getattr(record, name), getattr(solution, name), err_msg=name)
+    assert (record.status, record.reason, record.iterations) == (1, "why", 6)
+    np.testing.assert_array_equal(record.brightness, brightness)
+    assert record.inputs.tolist() == [["a", "b"]]
+
+
+@pytest.mark.parametrize(("name", "codes"), [("status", Status), ("node_status", NodeStatus)])
+def test_the_words_of_a_status_are_the_solvers(name: str, codes: type[IntEnum]) -> None:
+    assert QUANTITIES[name].codes == tuple(code.name.lower().replace("_", " ") for code in codes)
 
 
 def test_reference_is_kept_as_pictures(tmp_path: Path) -> None:

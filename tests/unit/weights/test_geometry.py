@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rgbmidic.errors import ConfigurationError
+from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.virtual import State
 from rgbmidic.scene.projection import material_points, placed
 from rgbmidic.scene.scenefile import read_scene
@@ -28,16 +31,18 @@ kind = "rgb"
 STATES = "[[states]]\nangle_deg = 3.0\n[[states]]\nangle_deg = 6.0\n"
 LIGHTS = ("red", "green", "blue")
 SHAPE = (90, 120)
+ONES = np.ones((3, *SHAPE), dtype=np.float32)
+IMAGES = IlluminationImages(values=ONES, valid=ONES > 0, names=LIGHTS, full_scale=1.0)
 
 
 @pytest.fixture
 def prepare(tmp_path: Path):
     """Weights from a scene text, settings of ``[weights]`` and what the test is like."""
 
-    def run(scene=SCENE + STATES, *, lights=LIGHTS, shape=SHAPE, frames=3, **weights):
+    def run(scene=SCENE + STATES, *, lights=LIGHTS, shape=SHAPE, frames=3, reference=0, **weights):
         (tmp_path / "scene.toml").write_text(scene)
         document = {
-            "frames": {"path": "x", "kind": "monochrome"},
+            "frames": {"path": "x", "kind": "monochrome", "reference": reference},
             "region": {"rectangle": [0, 0, 9, 9]},
             "weights": {"method": "geometry", "geometry": "scene.toml", **weights},
         }
@@ -49,12 +54,12 @@ def prepare(tmp_path: Path):
 
 def test_soft_weights_are_low_where_a_light_reflects_and_the_motion_changes_it(prepare, tmp_path):
     found = prepare()
-    weights = found.frame(2, 0)
+    weights = found.deformed(IMAGES, 2)
     assert weights.shape == (3, *SHAPE)
     assert weights.dtype == np.float32
     assert weights.min() > 0
     assert weights.max() <= 1
-    np.testing.assert_array_equal(found.reference([0]), 1)
+    np.testing.assert_array_equal(found.reference(IMAGES), 1)
     scene = read_scene(tmp_path / "scene.toml").scene
     seen = material_points(scene, State(angle_deg=6.0))
     before, after = (predict_zones(scene, State(angle_deg=angle), material=seen).share for angle in (0.0, 6.0))
@@ -63,11 +68,11 @@ def test_soft_weights_are_low_where_a_light_reflects_and_the_motion_changes_it(p
         assert changed.mean() > 0.05
         assert weights[light][changed].mean() < 0.7 * weights[light][calm].mean()
         # the same state twice: the reflection has not changed, only noise is left
-        assert found.frame(0, 0)[light][changed].mean() > 1.5 * weights[light][changed].mean()
+        assert found.deformed(IMAGES, 0)[light][changed].mean() > 1.5 * weights[light][changed].mean()
 
 
 def test_binary_weights_are_those_of_the_angle_at_every_pixel(prepare, tmp_path):
-    weights = prepare(limit_deg=15.0).frame(1, 0)
+    weights = prepare(limit_deg=15.0).deformed(IMAGES, 1)
     scene = read_scene(tmp_path / "scene.toml").scene
     deviation = predict_zones(scene, State(angle_deg=3.0)).geometry.deviation_deg
     clear = abs(deviation - 15) > 0.3  # the prediction is interpolated between every fourth pixel
@@ -76,14 +81,26 @@ def test_binary_weights_are_those_of_the_angle_at_every_pixel(prepare, tmp_path)
 
 
 def test_the_reference_excludes_what_any_of_its_frames_excludes(prepare):
-    found = prepare(limit_deg=15.0)
-    both = found.reference([0, 2])
-    np.testing.assert_array_equal(both, np.minimum(found.frame(0, 0), found.frame(2, 0)))
+    found = prepare(limit_deg=15.0, reference=[0, 2])
+    both = found.reference(IMAGES)
+    np.testing.assert_array_equal(both, np.minimum(found.deformed(IMAGES, 0), found.deformed(IMAGES, 2)))
+
+
+@pytest.mark.parametrize("limit_deg", [None, 15.0])
+def test_pixels_that_are_not_valid_have_no_weight(prepare, limit_deg):
+    weights = prepare(**({"limit_deg": limit_deg} if limit_deg else {}))
+    valid = ONES > 0
+    valid[1, 20:30] = False
+    images = replace(IMAGES, valid=valid)
+    for found in (weights.reference(images), weights.deformed(images, 1)):
+        np.testing.assert_array_equal(found[1, 20:30], 0)
+        assert found[0, 20:30].max() > 0
+        assert found.dtype == np.float32
 
 
 def test_lights_are_found_by_name_and_before_a_monochrome_camera_by_order(prepare):
     plain, turned = prepare(), prepare(lights=("blue", "red", "green"))
-    np.testing.assert_array_equal(turned.frame(1, 0), plain.frame(1, 0)[[2, 0, 1]])
+    np.testing.assert_array_equal(turned.deformed(IMAGES, 1), plain.deformed(IMAGES, 1)[[2, 0, 1]])
     grey = SCENE.replace('"rgb"', '"monochrome"')
     assert prepare(grey, lights=("light 1", "light 2", "light 3")).order == (0, 1, 2)
     with pytest.raises(ConfigurationError, match="scene's lights are red, green, blue, the test's are amber"):
@@ -92,15 +109,21 @@ def test_lights_are_found_by_name_and_before_a_monochrome_camera_by_order(prepar
 
 def test_without_states_every_frame_is_the_body_at_rest_and_the_reflections_count_as_changed(prepare):
     found = prepare(SCENE, frames=17)
-    np.testing.assert_array_equal(found.frame(3, 0), found.frame(16, 0))
+    np.testing.assert_array_equal(found.deformed(IMAGES, 3), found.deformed(IMAGES, 16))
     share = predict_zones(found.scene).share
-    weights = found.frame(3, 0)
+    weights = found.deformed(IMAGES, 3)
     assert weights[0][share[0] > 0.3].mean() < 0.7 * weights[0][share[0] < 0.05].mean()
+
+
+def test_weights_by_geometry_can_be_pickled(prepare):
+    weights = prepare()
+    again = pickle.loads(pickle.dumps(weights))
+    np.testing.assert_array_equal(again.deformed(IMAGES, 1), weights.deformed(IMAGES, 1))
 
 
 def test_beside_the_body_nothing_is_seen(prepare):
     found = prepare(SCENE.replace('kind = "sphere"', 'kind = "plate"\nwidth = 10.0\nheight = 100.0'), frames=2)
-    weights = found.frame(1, 0)
+    weights = found.deformed(IMAGES, 1)
     np.testing.assert_array_equal(weights[:, :, :30], 0)
     assert weights[:, :, 45:75].min() > 0
 
@@ -111,8 +134,8 @@ def test_a_height_map_takes_the_place_of_the_body(prepare, tmp_path):
     sphere = read_scene(tmp_path / "scene.toml").scene
     points, _ = placed(sphere, material_points(sphere))
     np.save(tmp_path / "heights.npy", sphere.body.front[2] - points[2])
-    mapped = prepare(scene, height_map="heights.npy", limit_deg=15.0).frame(1, 0)
-    modelled = prepare(SCENE, limit_deg=15.0).frame(1, 0)
+    mapped = prepare(scene, height_map="heights.npy", limit_deg=15.0).deformed(IMAGES, 1)
+    modelled = prepare(SCENE, limit_deg=15.0).deformed(IMAGES, 1)
     assert (mapped != modelled).mean() < 0.01
     assert 1 - modelled.mean() > 0.05
 

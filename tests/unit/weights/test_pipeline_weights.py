@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from rgbmidic import Result, Status, measure, read_test
-from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.errors import ConfigurationError
 from rgbmidic.lab.virtual.dataset import write_dataset
 from rgbmidic.settings import TestSettings
 from rgbmidic.weights.automatic import FALLBACK
-from rgbmidic.weights.threshold import light_weights
 
 SCENE = """
 [body]
@@ -93,28 +90,12 @@ def test_a_scene_of_another_camera_stops_the_job_before_anything_is_written(fold
 
 
 def test_where_nothing_is_disturbed_the_automatic_threshold_is_the_paper_s_and_says_so(folder, tmp_path, caplog):
-    with caplog.at_level(logging.WARNING, logger="rgbmidic.pipeline"):
+    with caplog.at_level(logging.WARNING, logger="rgbmidic.weights"):
         result = run(folder, tmp_path / "auto", method="threshold", threshold="auto")
     assert result.provenance["weights_threshold"] == pytest.approx(FALLBACK)
     assert "no disturbed zone" in caplog.text
     fixed = run(folder, tmp_path / "fixed", method="threshold")
     np.testing.assert_array_equal(result.u, fixed.u)
-
-
-def test_an_automatic_threshold_must_be_found_before_it_is_applied():
-    settings = TestSettings.from_mapping(
-        {
-            "frames": {"path": "x"},
-            "region": {"rectangle": [0, 0, 9, 9]},
-            "weights": {"method": "threshold", "threshold": "auto"},
-        }
-    ).weights
-    images = IlluminationImages(
-        values=np.ones((1, 9, 9)), valid=np.ones((1, 9, 9), dtype=bool), names=("a",), full_scale=4.0
-    )
-    with pytest.raises(InputError, match='"auto"'):
-        light_weights(images, settings)
-    assert light_weights(images, replace(settings, threshold=0.2)).max() == 0
 
 
 def test_a_test_without_a_deformed_frame_takes_the_paper_s_threshold(folder, tmp_path, caplog):

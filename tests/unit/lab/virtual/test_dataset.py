@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import ConfigurationError, ResultError
-from rgbmidic.frames.readers import read_frame
+from rgbmidic.frames import read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual import AffineField, MeshField, Sphere, record, render, truth
 from rgbmidic.lab.virtual.dataset import write_dataset

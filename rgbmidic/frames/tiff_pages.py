@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from rgbmidic.errors import RgbmidicError
-from rgbmidic.frames.contents import damaged
+from rgbmidic.frames.stored import damaged
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ __all__ = [
 # A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
+_BYTE_ORDERS: dict[bytes, Literal["little", "big"]] = {b"II*\0": "little", b"MM\0*": "big"}
 _UNCOMPRESSED = 1
 _REDUCED = 1
 _RAW_PHOTOMETRIC = (32803, 34892)
@@ -71,16 +72,18 @@ def tiff_pages(path: Path) -> Iterator[list[TiffPage] | None]:
 
 
 def is_dng(path: Path) -> bool:
-    """Whether the file is a DNG, whatever its name says; False where it has no readable first image."""
-    import tifffile
-
+    """Whether the tags of the first image say DNG, whatever the file's name says; False for what cannot be read."""
     try:
-        with tifffile.TiffFile(path) as tiff:
-            return _DNG_VERSION in tiff.pages.first.tags
+        with path.open("rb") as file:
+            head = file.read(8)
+            order = _BYTE_ORDERS.get(head[:4], "little")
+            file.seek(int.from_bytes(head[4:], order))
+            tags = file.read(12 * int.from_bytes(file.read(2), order))
     except OSError:
-        raise
-    except Exception:  # see tiff_pages; whoever reads the image tells what is wrong
         return False
+    return head[:4] in _BYTE_ORDERS and _DNG_VERSION in (
+        int.from_bytes(tags[start : start + 2], order) for start in range(0, len(tags), 12)
+    )
 
 
 def _pages(tiff: TiffFile) -> Iterator[TiffPage]:

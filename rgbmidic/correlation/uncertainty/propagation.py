@@ -17,17 +17,15 @@ import scipy.sparse as sp
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Probing", "displacement_functionals", "exact_std", "functional_std", "strain_functionals"]
+__all__ = ["NodeColouring", "displacement_functionals", "functional_std", "strain_functionals"]
 
 
-_CHUNK = 256
-"""Columns solved for at once."""
 _RINGS = 4
 """Nodes of one colour are at least this many edges apart."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Probing:
+class NodeColouring:
     """Colouring of the nodes so that nodes of one colour are far apart.
 
     Attributes
@@ -41,7 +39,7 @@ class Probing:
     nearest: npt.NDArray[np.int64]
 
     @classmethod
-    def from_mesh(cls, mesh: Tri3Mesh) -> Probing:
+    def from_mesh(cls, mesh: Tri3Mesh) -> NodeColouring:
         """Greedy colouring of the graph of nodes closer than `_RINGS` edges."""
         from scipy.spatial import cKDTree
 
@@ -73,9 +71,9 @@ def _greedy_colours(indptr: npt.NDArray[np.int32], indices: npt.NDArray[np.int32
 def functional_std(
     solve: Callable[[FloatArray], FloatArray],
     right_side_covariance: sp.csc_matrix,
-    probing: Probing,
+    colouring: NodeColouring,
     functionals: Sequence[sp.csr_matrix],
-    measured: BoolArray,
+    nodes: BoolArray,
 ) -> FloatArray:
     """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
 
@@ -85,38 +83,22 @@ def functional_std(
         Solves ``M x = b`` for b of shape (2 N, R).
     right_side_covariance
         S, shape (2 N, 2 N).
-    probing
-        Colouring of the mesh.
+    colouring
+        Of the mesh.
     functionals
         F matrices (N, 2 N); row n of each gives the quantity at node n, and is zero but for n and its neighbours.
-    measured : ndarray, shape (N,), bool
-        Nodes whose uncertainty is asked for; the columns of the others reach far and would spoil those of their colour.
+    nodes : ndarray, shape (N,), bool
+        Nodes whose uncertainty is asked for. The quantity must not touch a node that is hardly seen: such a column
+        reaches far and would spoil those of its colour.
     """
-    count, colours = len(probing.colour), len(probing.nearest)
-    members = sp.csr_matrix((measured * 1.0, (np.arange(count), probing.colour)), shape=(count, colours))
+    count, colours = len(colouring.colour), len(colouring.nearest)
+    members = sp.csr_matrix((nodes * 1.0, (np.arange(count), colouring.colour)), shape=(count, colours))
     variance = np.empty((count, len(functionals)))
     for i, functional in enumerate(functionals):
         columns = solve((functional.T @ members).toarray())
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
-        variance[:, i] = np.bincount(probing.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
+        variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
     return np.sqrt(np.maximum(variance, 0))
-
-
-def exact_std(
-    solve: Callable[[FloatArray], FloatArray],
-    right_side_covariance: sp.csc_matrix,
-    functionals: Sequence[sp.csr_matrix],
-    nodes: npt.NDArray[np.int64],
-) -> FloatArray:
-    """Standard uncertainty (n, F) as `functional_std`, each of the `nodes` with its own solve: beside a hole the
-    columns reach across it, where probing takes them for another node's."""
-    std = np.empty((len(nodes), len(functionals)))
-    for i, functional in enumerate(functionals):
-        for start in range(0, len(nodes), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            columns = solve(functional[nodes[part]].T.toarray())
-            std[part, i] = np.sqrt(np.maximum((columns * (right_side_covariance @ columns)).sum(axis=0), 0))
-    return std
 
 
 def displacement_functionals(nodes: int) -> list[sp.csr_matrix]:

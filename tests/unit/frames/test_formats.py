@@ -14,9 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rgbmidic.errors import FrameError, InputError
+from rgbmidic.frames import open_source, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.readers import frame_shape, read_frame
+from rgbmidic.frames.formats import FORMATS
+from rgbmidic.settings import FrameSettings
 
+STATED = FrameSettings(path=("frame",))
 GREY = noisy_mosaic((31, 45)).values
 RGB = np.random.default_rng(1).integers(0, 65536, (31, 45, 3)).astype(np.uint16)
 
@@ -47,7 +50,7 @@ def test_tiff_of_any_layout(tmp_path: Path, options: dict[str, Any], dtype: Any)
     assert isinstance(frame, Mosaic)
     np.testing.assert_array_equal(frame.values, values)
     assert (frame.cfa, frame.white_level, frame.black_level.max()) == ("GBRG", np.iinfo(dtype).max, 0)
-    assert frame_shape(tmp_path / "f.tif") == GREY.shape
+    assert open_source(tmp_path / "f.tif", STATED).shape == GREY.shape
 
 
 @pytest.mark.parametrize("values", [GREY, RGB], ids=["grey", "rgb"])
@@ -59,7 +62,7 @@ def test_lzw_tiff_and_png_from_opencv_keep_values_and_colour_order(
         frame = read_frame(_png(tmp_path / name, values), kind=kind)
         assert isinstance(frame, ChannelFrame)
         np.testing.assert_array_equal(np.moveaxis(frame.values, 0, -1).squeeze(), values)
-        assert frame_shape(tmp_path / name) == values.shape[:2]
+        assert open_source(tmp_path / name, STATED).shape == values.shape[:2]
 
 
 def test_planes_one_after_the_other(tmp_path: Path) -> None:
@@ -122,7 +125,7 @@ def test_a_mosaic_needs_its_pattern(tmp_path: Path) -> None:
     file = _png(tmp_path / "f.png", GREY)
     with pytest.raises(FrameError, match=r"f\.png does not tell .*RGGB, BGGR, GRBG, GBRG.*monochrome"):
         read_frame(file)
-    with pytest.raises(InputError, match=r"RGBG.*RGGB, BGGR, GRBG, GBRG"):
+    with pytest.raises(InputError, match=r"^cfa.*RGGB, BGGR, GRBG, GBRG.*RGBG"):
         read_frame(file, cfa="RGBG")
     for kind in ("monochrome", "rgb"):
         with pytest.raises(FrameError, match=r"cfa|kind"):
@@ -248,3 +251,25 @@ def test_a_list_of_images_that_leads_back_to_itself_is_noticed(tmp_path: Path) -
     (tmp_path / "f.tif").write_bytes(content)
     with pytest.raises(FrameError, match="leads back"):
         read_frame(tmp_path / "f.tif", kind="monochrome")
+
+
+def test_every_ending_belongs_to_one_format() -> None:
+    endings = [ending for known in FORMATS for ending in known.endings if ending != ".raw"]
+    assert len(set(endings)) == len(endings)
+
+
+def test_a_source_is_opened_before_its_file_exists_and_has_one_frame(tmp_path: Path) -> None:
+    source = open_source(tmp_path / "f.tif", FrameSettings(path=("frame",), kind="monochrome"))
+    with pytest.raises(FrameError, match="not found"):
+        _ = source.shape
+    tifffile.imwrite(tmp_path / "f.tif", GREY)
+    np.testing.assert_array_equal(source.read(0).values[0], GREY)
+    assert (len(source), source.name(0), source.tells_camera) == (1, "f.tif", False)
+    for index in (-1, 1):
+        with pytest.raises(IndexError, match=r"f\.tif"):
+            source.read(index)
+
+
+def test_levels_that_contradict_each_other_are_no_fault_of_the_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^white_level must be above black_level 64"):
+        read_frame(tmp_path / "f.tif", black_level=64, white_level=10)

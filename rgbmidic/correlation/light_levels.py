@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation.problem import Reference
+from rgbmidic.correlation.reference import Reference
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["brightness_change"]

@@ -9,9 +9,14 @@ import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
 from rgbmidic._kernels.interpolation import sample_with_gradient
+from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
-from rgbmidic.correlation.system import NormalEquations
-from rgbmidic.correlation.uncertainty import Probing, displacement_functionals, strain_functionals
+from rgbmidic.correlation.uncertainty.blocks import unfitted_share
+from rgbmidic.correlation.uncertainty.propagation import (
+    NodeColouring,
+    displacement_functionals,
+    strain_functionals,
+)
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
@@ -50,12 +55,14 @@ class Reference:
 
     Attributes
     ----------
-    mesh, pixels, equations, probing
+    mesh, pixels, assembly, colouring
         TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
     functionals : tuple of csr_matrix, shape (N, 2 N)
         u, v, exx, eyy, exy at the nodes as linear functions of the unknowns.
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded.
+    unfitted : float
+        Share of the variance of a block's score that the fit leaves in the residual (`unfitted_share`).
     values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels, with the gradient in grey levels per px.
     prefilter : str
@@ -63,9 +70,10 @@ class Reference:
 
     mesh: Tri3Mesh
     pixels: PixelMap
-    equations: NormalEquations
-    probing: Probing
+    assembly: Assembly
+    colouring: NodeColouring
     functionals: tuple[sp.csr_matrix, ...]
+    unfitted: float
     images: FloatImage
     weights: FloatImage
     values: FloatImage
@@ -96,14 +104,15 @@ class Reference:
         ready, usable = _prepare(images, weights, prefilter)
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
             usable = usable * usable_pixels(region.mask, prefilter)
-        pixels = PixelMap.from_mesh(mesh, region)
+        pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
         samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
         return cls(
             mesh=mesh,
             pixels=pixels,
-            equations=NormalEquations.from_mesh(mesh),
-            probing=Probing.from_mesh(mesh),
+            assembly=assembly,
+            colouring=NodeColouring.from_mesh(mesh),
             functionals=(*displacement_functionals(len(mesh.nodes)), *strain_functionals(mesh)),
+            unfitted=unfitted_share(mesh, pixels, assembly),
             images=ready,
             weights=usable,
             values=samples[0],
@@ -160,7 +169,7 @@ class Reference:
             parts,
             sums,
         )
-        return self.equations.vector(parts), np.asarray(sums.sum(axis=0))
+        return self.assembly.vector(parts), np.asarray(sums.sum(axis=0))
 
     def _geometry(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray, AnyArray, AnyArray]:
         pixels = self.pixels

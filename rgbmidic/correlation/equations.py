@@ -8,25 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic.correlation.problem import Reference
-from rgbmidic.correlation.system import NormalEquations, factorise
-from rgbmidic.errors import InputError
+from rgbmidic.correlation.assembly import factorise
+from rgbmidic.correlation.reference import Reference
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["RIGID", "Step", "rigid_functions"]
+__all__ = ["Equations", "node_blocks", "rigid_functions"]
 
 
-RIGID = ("none", "translation", "translation+rotation")
-"""Choices of rigid functions."""
-
+_RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
+"""Number of rigid functions of a light."""
 _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
 _ROUNDING = 1e-4
 """Share of a node's texture under which what it sees in its worse direction may be rounding."""
-_ONE_SIDED = 0.3
-"""Texture in the worse direction over that in the better one under which the former may be noise..."""
-_NOISY = 0.3
-"""...and is, if noise alone would give this share of it."""
 _SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area..."""
 _INFORMED = 0.01
@@ -34,24 +28,16 @@ _INFORMED = 0.01
 
 
 def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
-    """Nodal values (2 N, m) of the rigid motions: shifts in x and y (px), rotation (rad) about the mesh's middle.
-
-    Raises
-    ------
-    InputError
-        `rigid` is not one of `RIGID`.
-    """
-    if rigid not in RIGID:
-        raise InputError(f"unknown rigid functions {rigid!r}; allowed are {', '.join(RIGID)}")
+    """Nodal values (2 N, m) of the rigid motions: shifts in x and y (px), rotation (rad) about the mesh's middle."""
     arm = nodes - nodes.mean(axis=0)
     columns = np.zeros((len(nodes), 2, 3))
     columns[:, 0, 0] = columns[:, 1, 1] = 1
     columns[:, 0, 2], columns[:, 1, 2] = -arm[:, 1], arm[:, 0]
-    return columns.reshape(-1, 3)[:, : (0, 2, 3)[RIGID.index(rigid)]]
+    return columns.reshape(-1, 3)[:, : _RIGID_FUNCTIONS[rigid]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Step:
+class Equations:
     """Factorised normal equations for given weights.
 
     Attributes
@@ -64,12 +50,10 @@ class Step:
         Hessian of each further light times the rigid functions, and the solution for it.
     schur : ndarray
         Schur complement of the rigid unknowns.
-    measured : ndarray, shape (N,), bool
+    textured : ndarray, shape (N,), bool
         Nodes that see enough texture.
     light_share : ndarray, shape (N, k), float64
         Share of each light in what determines a node; 0 where nothing does.
-    equations
-        Structure of the equations.
     """
 
     weights: FloatImage
@@ -79,30 +63,29 @@ class Step:
     border: FloatArray
     border_solved: FloatArray
     schur: FloatArray
-    measured: BoolArray
+    textured: BoolArray
     light_share: FloatArray
-    equations: NormalEquations
 
     @classmethod
     def build(
         cls, reference: Reference, weights: FloatImage, functions: FloatArray, given: FloatImage | None = None
-    ) -> Step:
+    ) -> Equations:
         """Assemble and factorise for pixel weights (k, P) and rigid functions (2 N, m).
 
         `given` are the weights without the precision of the lights, where it is part of `weights`.
         """
-        equations = reference.equations
+        assembly = reference.assembly
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
-        hessian = equations.matrix(np.sum(per_light, axis=0))
-        measured, scale = _observability(hessian, equations.nodal_area, _SEEN if given is None else _INFORMED)
+        hessian = assembly.matrix(np.sum(per_light, axis=0))
+        textured, scale = _observability(hessian, assembly.nodal_area, _SEEN if given is None else _INFORMED)
         if given is not None:
             texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
-            measured &= _observability(equations.matrix(np.asarray(texture)), equations.nodal_area, _SEEN)[0]
-        smoothness = sp.csc_matrix((_SMOOTHNESS * scale) * equations.smoothness)
+            textured &= _observability(assembly.matrix(np.asarray(texture)), assembly.nodal_area, _SEEN)[0]
+        smoothness = sp.csc_matrix((_SMOOTHNESS * scale) * assembly.smoothness)
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
-        anchor = 1e-9 * scale * sp.eye(equations.size, format="csc")
+        anchor = 1e-9 * scale * sp.eye(assembly.size, format="csc")
         solve = factorise(sp.csc_matrix(hessian + smoothness + anchor))
-        border, corner = _border([equations.matrix(blocks) for blocks in per_light[1:]], functions)
+        border, corner = _border([assembly.matrix(blocks) for blocks in per_light[1:]], functions)
         solved = solve(border) if border.shape[1] else border
         return cls(
             weights=weights,
@@ -112,27 +95,9 @@ class Step:
             border=border,
             border_solved=solved,
             schur=corner - border.T @ solved,
-            measured=measured,
+            textured=textured,
             light_share=_light_share(reference, per_light),
-            equations=equations,
         )
-
-    def blind(self, noise: Callable[[FloatImage], FloatArray]) -> BoolArray:
-        """Nodes (N,) whose texture runs in one direction only: along the other, the gradient is that of the noise.
-
-        `noise` gives the element blocks of the noise's Hessian; it is asked only where a texture is that one-sided.
-        """
-        xx, xy, yy = _node_blocks(self.hessian)
-        half, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-        weak = half - difference
-        one_sided = self.measured & (weak < _ONE_SIDED * (half + difference))
-        if not one_sided.any():
-            return one_sided
-        angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2  # of the weaker direction
-        x, y = np.cos(angle), np.sin(angle)
-        noise_xx, noise_xy, noise_yy = _node_blocks(self.equations.matrix(noise(self.weights)))
-        along = noise_xx * x * x + 2 * noise_xy * x * y + noise_yy * y * y
-        return np.asarray(one_sided & (along > _NOISY * weak))
 
     def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solve for the motion of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
@@ -163,7 +128,7 @@ def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArra
     return np.asarray(light / np.where(total > 0, total, 1.0))
 
 
-def _node_blocks(matrix: sp.csc_matrix) -> tuple[FloatArray, FloatArray, FloatArray]:
+def node_blocks(matrix: sp.csc_matrix) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Entries (xx, xy, yy) of the nodes' own 2 x 2 blocks."""
     diagonal = matrix.diagonal().reshape(-1, 2)
     nodes = np.arange(len(diagonal))
@@ -175,7 +140,7 @@ def _observability(hessian: sp.csc_matrix, area: FloatArray, least: float) -> tu
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
     """
-    xx, xy, yy = _node_blocks(hessian)
+    xx, xy, yy = node_blocks(hessian)
     half = (xx + yy) / 2
     smallest = half - np.hypot((xx - yy) / 2, xy)
     smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only

@@ -1,4 +1,4 @@
-"""The sparse normal equations of the Gauss-Newton step: structure, assembly and solution."""
+"""From sums per element to the sparse normal equations of the whole mesh, and their factorisation."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from scipy.sparse.linalg import splu
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
-__all__ = ["NormalEquations", "factorise"]
+__all__ = ["Assembly", "factorise"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NormalEquations:
+class Assembly:
     """Sparse structure shared by all frames: the unknowns are (u, v) of node 0, (u, v) of node 1, and so on.
 
     Attributes
@@ -42,7 +42,7 @@ class NormalEquations:
     nodal_area: FloatArray
 
     @classmethod
-    def from_mesh(cls, mesh: Tri3Mesh) -> NormalEquations:
+    def from_mesh(cls, mesh: Tri3Mesh) -> Assembly:
         """Structure of the equations of a mesh."""
         unknowns = (2 * mesh.elements.astype(np.int64)[:, :, None] + np.arange(2)).reshape(-1, 6)
         size = 2 * len(mesh.nodes)

@@ -1,0 +1,98 @@
+"""Which elements' images match at the displacement found, and how well the residual around each node fits in."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rgbmidic._kernels.correlation import element_moments
+from rgbmidic.correlation.precision import Precision
+from rgbmidic.correlation.residual import Residual
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = ["matching_elements", "misfit"]
+
+_MATCHED = (0.4, 0.9)
+"""Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
+_WORSE = 8.0
+"""In between: how many times farther from 1 than the median of the elements around."""
+_AROUND = 61
+"""Elements around: a square of some 5.5 elements a side, of which a crack takes a third."""
+
+
+def matching_elements(
+    residual: Residual, precision: Precision | None = None, *, least: float | None = None
+) -> BoolArray:
+    """Elements (E,) whose images match: zero-mean correlation coefficient of all lights together.
+
+    Elements without weight or texture in the reference say nothing and count as matched. Lights count by their
+    `precision` in the element, where it is known. `least` is the coefficient from which an element matches; None judges
+    it by what the elements around reach.
+    """
+    mesh = residual.reference.mesh
+    fg, ff, gg = _centred_products(residual, _light_precision(residual, precision))
+    own = _correlation(fg, ff, gg)
+    # a few speckles can match by chance; those of all elements around a node hardly
+    around = _correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
+    coefficient = np.minimum(own, np.median(around[mesh.elements], axis=1))
+    if least is not None:
+        return np.asarray(coefficient >= least)
+    typical = _median_around(mesh, coefficient, ff > 0)
+    return np.asarray(coefficient >= np.clip(1 - _WORSE * (1 - typical), *_MATCHED))
+
+
+def _median_around(mesh: Tri3Mesh, values: FloatArray, textured: BoolArray) -> FloatArray:
+    """Median (E,) of the values of the nearest textured elements around each element; 1 where there is none."""
+    if not textured.any():
+        return np.ones_like(values)
+    centre = mesh.nodes[mesh.elements].mean(axis=1)
+    count = min(_AROUND, int(textured.sum()))
+    nearest = cKDTree(centre[textured]).query(centre, k=[*range(1, count + 1)])[1]
+    return np.asarray(np.median(values[textured][nearest], axis=1))
+
+
+def _light_precision(residual: Residual, precision: Precision | None) -> FloatArray:
+    """Mean precision (k, E) of each light in each element, over that of the most precise; 1 where it is not known."""
+    pixels = residual.reference.pixels
+    if precision is None or len(residual.values) == 1:
+        return np.ones((len(residual.values), len(pixels.origin)))
+    mean = np.stack([pixels.by_element(factor) for factor in precision.factor])
+    return np.asarray(mean / np.maximum(mean.max(axis=0), 1e-300))
+
+
+def misfit(residual: Residual, weights: FloatImage, measured: BoolArray) -> FloatArray:
+    """Weighted rms residual around each node (N,), over its median: 1 is ordinary, 3 is suspicious.
+
+    `weights` (k, P) are those of the solve, in units of the inverse variance of the residual.
+    """
+    mesh, pixels = residual.reference.mesh, residual.reference.pixels
+    square, count = (
+        mesh.to_nodes(pixels.by_element(part.sum(axis=0))) for part in (weights * residual.difference**2, weights > 0)
+    )
+    around = square / np.maximum(count, 1.0)
+    typical = float(np.median(around[measured])) if measured.any() else 0.0
+    return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)
+
+
+def _centred_products(residual: Residual, precision: FloatArray) -> FloatArray:
+    """Sums (3, E) over the lights, each with its `precision` (k, E), of the centred products f g, f f and g g."""
+    offsets = residual.reference.pixels.offsets
+    moments = np.zeros((len(offsets) - 1, 6))
+    products = np.zeros((3, len(moments)))
+    lights = zip(residual.values, residual.warped, residual.weights, precision, strict=True)
+    for value, warped, weight, share in lights:
+        element_moments(value, warped, weight, offsets, moments)
+        total, f, g, f2, product, g2 = moments.T
+        total = np.maximum(total, 1e-30)
+        products += share * np.stack([product - f * g / total, f2 - f * f / total, g2 - g * g / total])
+    return products
+
+
+def _correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
+    """Correlation coefficient from centred products; 1 where the reference has nothing to compare, 0 where only the
+    deformed image has nothing."""
+    empty = ff <= 1e-9 * ff.max(initial=0.0)
+    blank = gg <= 1e-9 * ff
+    scale = np.sqrt(np.maximum(ff, 0) * np.maximum(gg, 0))
+    return np.where(empty, 1.0, np.where(blank, 0.0, fg / np.where(empty | blank, 1.0, scale)))

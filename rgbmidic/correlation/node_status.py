@@ -1,0 +1,147 @@
+"""Whether a node counts as measured: one ordered table of rules, each with what it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.correlation.equations import Equations, node_blocks
+from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.solution import NodeStatus
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = ["RULES", "Evidence", "Rule", "judge", "lost_elements", "one_sided_texture"]
+
+LOST = 0.5
+"""Uncertainty (px) from which a node is lost: a position uncertain by half a pixel is not within reach of a match."""
+_MISFIT = 4.0
+"""Residual around a node, over the median, from which it is lost where elements near it do not match."""
+_WANDERING = 0.1
+"""Motion (px) in the last iteration of a pass from which a node is lost."""
+_ONE_SIDED = 0.3
+"""Texture in the worse direction over that in the better one under which the former may be noise..."""
+_NOISY = 0.3
+"""...and is, if noise alone would give this share of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """What is known of the N nodes at the end of a solve.
+
+    Attributes
+    ----------
+    textured : ndarray, shape (N,), bool
+        Enough texture is seen around the node, by what precision there is (`Equations`).
+    one_sided : ndarray, shape (N,), bool
+        The texture runs in one direction only (`one_sided_texture`).
+    mismatched, near_mismatch : ndarray, shape (N,), bool
+        An element around the node does not match; one around the node or its neighbours.
+    std : ndarray, shape (N, 2)
+        Standard uncertainty of u and v, px.
+    misfit : ndarray, shape (N,)
+        Residual around the node over its median.
+    """
+
+    textured: BoolArray
+    one_sided: BoolArray
+    mismatched: BoolArray
+    near_mismatch: BoolArray
+    std: FloatArray
+    misfit: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rule:
+    """A node to which it applies gets the status, unless an earlier rule applied."""
+
+    status: NodeStatus
+    because: str
+    applies: Callable[[Evidence], BoolArray]
+
+
+RULES = (
+    Rule(
+        status=NodeStatus.DECORRELATED,
+        because="its displacement is uncertain by half a pixel or more",
+        applies=lambda nodes: nodes.textured & (nodes.std.max(axis=1) > LOST),
+    ),
+    Rule(
+        status=NodeStatus.DECORRELATED,
+        because="elements near it do not match, and the residual around it is several times the usual one",
+        applies=lambda nodes: nodes.textured & nodes.near_mismatch & (nodes.misfit > _MISFIT),
+    ),
+    Rule(
+        status=NodeStatus.DECORRELATED,
+        because="the elements around it do not match, and the others show too little",
+        applies=lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured),
+    ),
+    Rule(
+        status=NodeStatus.NOT_SEEN,
+        because="the texture runs in one direction only: what lies along it cannot be measured",
+        applies=lambda nodes: nodes.one_sided,
+    ),
+    Rule(
+        status=NodeStatus.NOT_SEEN,
+        because="no light sees enough texture around it",
+        applies=lambda nodes: ~nodes.textured,
+    ),
+)
+"""In this order; a node to which none applies is measured."""
+
+
+def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
+    """`NodeStatus` of every node (N,) by the `RULES`."""
+    applied = [rule.applies(evidence) for rule in RULES]
+    return np.select(applied, [np.uint8(rule.status) for rule in RULES], np.uint8(NodeStatus.MEASURED))
+
+
+def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray) -> BoolArray:
+    """Elements (E,) to leave out of the next pass for a node that its own pixels do not hold.
+
+    A node whose own pixels match nothing wanders, though its elements match as a whole.
+
+    Parameters
+    ----------
+    mesh
+        N nodes, E elements.
+    std : ndarray, shape (N, 2)
+        Standard uncertainty of u and v, px.
+    motion : ndarray, shape (N,)
+        Motion in the last iteration, px.
+    """
+    lost = (std.max(axis=1) > LOST) | (motion > _WANDERING)
+    return np.asarray(lost[mesh.elements].any(axis=1))
+
+
+def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:
+    """Nodes (N,) whose texture runs in one direction only: along the other, the gradient is that of the noise."""
+    xx, xy, yy = node_blocks(equations.hessian)
+    half, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    weak = half - difference
+    one_sided = equations.textured & (weak < _ONE_SIDED * (half + difference))
+    if not one_sided.any():
+        return one_sided
+    angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2  # of the weaker direction
+    x, y = np.cos(angle), np.sin(angle)
+    noise = residual.reference.assembly.matrix(_noise_hessian(residual, equations.weights))
+    noise_xx, noise_xy, noise_yy = node_blocks(noise)
+    along = noise_xx * x * x + 2 * noise_xy * x * y + noise_yy * y * y
+    return np.asarray(one_sided & (along > _NOISY * weak))
+
+
+def _noise_hessian(residual: Residual, weights: FloatImage) -> FloatArray:
+    """Element blocks (E, 3, 3, 3) of the Hessian that noise alone has: what the residual, which holds the noise of
+    both images, differs by from pixel to pixel."""
+    reference = residual.reference
+    pixels = reference.pixels
+    top, left, _, _ = pixels.bounds
+    total = np.zeros((len(reference.mesh.elements), 3, 3, 3))
+    for weight, difference in zip(weights, residual.difference, strict=True):
+        window = pixels.window(difference) / np.float32(np.sqrt(2))
+        slopes = [np.diff(window, axis=axis, append=0)[pixels.rows - top, pixels.columns - left] for axis in (1, 0)]
+        total += reference.blocks(weight, *slopes)
+    return total

@@ -1,0 +1,1 @@
+"""Standard uncertainty of nodal quantities: the scores' covariance from the residual, carried through the equations."""

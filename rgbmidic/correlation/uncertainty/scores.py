@@ -1,0 +1,104 @@
+"""Covariance of the right-hand side from the residual itself: the block estimator of the long-run variance.
+
+The score ``q = sum_j w_j r_j grad f_j`` of a pixel is correlated over the reach of filters, demosaicing and speckle and
+between the lights; the variance of its sum over blocks wider than that reach holds all of it.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from rgbmidic._kernels.grid import block_sums, score_sums
+from rgbmidic.correlation.reference import Reference
+from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.uncertainty.blocks import BLOCK
+from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+
+__all__ = ["displacing_share", "score_covariance"]
+
+_LEAST_RATIO = 1e-2
+"""Least share of a residual's variance that is taken to displace."""
+_EVEN = 0.6
+"""Standard deviation (blocks) of the window in which the information of a block is taken."""
+_SCORE_RANGE = 30.0
+"""Standard deviation (px) of the window over which block sums are averaged."""
+_PRIOR = 0.5 * BLOCK**2
+"""Pixels for which the region's typical score counts in that window: beside a hole few blocks speak."""
+
+
+def displacing_share(residual: Residual, variance: FloatImage) -> FloatImage:
+    """Variance of each light's scores over what white noise of that `variance` (k, P) would give, (k, P)."""
+    pixels = residual.reference.pixels
+    sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32))
+    ratios = [_score_ratios(*light)[0] for light in sums]
+    return np.stack([pixels.from_blocks(np.maximum(r[0] + r[2], _LEAST_RATIO), BLOCK) for r in ratios])
+
+
+def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
+    """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P)."""
+    reference = residual.reference
+    used = np.asarray(weights.any(axis=0), dtype=np.float32)
+    x, y, information, _ = _score_sums(residual, weights).sum(axis=0)
+    index, shape = reference.pixels.blocks(BLOCK)
+    count = np.zeros((1, information.size), dtype=np.float32)
+    block_sums(used[None], index, count)
+    ratios, level = _score_ratios(x, y, information, count.reshape(shape).astype(np.float64))
+    return _per_element(reference, level * ratios / reference.unfitted, used)
+
+
+def _score_sums(residual: Residual, weights: FloatImage) -> FloatArray:
+    """Sums (k, 4, rows, columns) over blocks of the lights' scores in x and y, their information, and pixels."""
+    reference = residual.reference
+    index, shape = reference.pixels.blocks(BLOCK)
+    sums = np.zeros((len(weights), 4, shape[0] * shape[1]))
+    score_sums(residual.difference, weights, reference.gradient_x, reference.gradient_y, index, sums)
+    return sums.reshape(len(weights), 4, *shape)
+
+
+def _score_ratios(
+    x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariance (xx, xy, yy) of the scores of blocks over their information, and the information per pixel.
+
+    A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
+    smooth, and averaged, is its ratio to the information; xx + yy is 1 for white noise and ideal weights.
+    """
+    level = _blur(information, _EVEN) / np.maximum(_blur(count, _EVEN), 1e-6)
+    scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
+    x, y = x * scale, y * scale
+    typical = _typical_square(x, y, count)
+    around = _blur(count, _SCORE_RANGE / BLOCK)
+    ratios = [
+        (_blur(product, _SCORE_RANGE / BLOCK) + _PRIOR * expected) / (around + _PRIOR)
+        for product, expected in ((x * x, typical), (x * y, 0.0), (y * y, typical))
+    ]
+    return np.stack(ratios), level
+
+
+def _typical_square(x: FloatArray, y: FloatArray, count: FloatArray) -> float:
+    """Square of a score in one direction, per pixel, typical of the region's blocks.
+
+    A median, so that what does not match has no part in it: ``x^2 + y^2`` of two independent Gaussian scores is
+    distributed exponentially, with a median of 2 ln 2 variances.
+    """
+    whole = count >= 0.5 * count.max(initial=0.0)
+    square = (x**2 + y**2)[whole] / np.maximum(count[whole], 1.0)
+    return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
+
+
+def _per_element(reference: Reference, density: FloatArray, used: FloatImage) -> FloatArray:
+    """Element blocks of a score variance per pixel (xx, xy, yy) that is constant in each element."""
+    mesh = reference.mesh
+    top, left, _, _ = reference.pixels.bounds
+    place = mesh.nodes[mesh.elements].mean(axis=1) - (left, top)
+    centre = np.round(place / BLOCK - 0.5).astype(int)
+    column = np.clip(centre[:, 0], 0, density.shape[2] - 1)
+    row = np.clip(centre[:, 1], 0, density.shape[1] - 1)
+    # summed over the pixels in use: at an edge they do not cover the element evenly
+    mass = reference.blocks(used, np.ones_like(used), np.zeros_like(used))[..., :1]
+    return np.asarray(mass * density[:, row, column].T[:, None, None, :])
+
+
+def _blur(image: AnyArray, sigma: float) -> AnyArray:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))

@@ -1,0 +1,123 @@
+"""Weights of a pass: what matches, how precise each light is, which grey levels the reference should have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rgbmidic.correlation.equations import Equations
+from rgbmidic.correlation.grey_level import corrected_values
+from rgbmidic.correlation.iteration import Estimate, Problem, compare
+from rgbmidic.correlation.matching import matching_elements
+from rgbmidic.correlation.node_status import lost_elements
+from rgbmidic.correlation.precision import Precision, learn_precision
+from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.uncertainty.nodal import nodal_std
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = [
+    "FIRST_PASS",
+    "Weighting",
+    "first_weighting",
+    "next_weighting",
+    "refining",
+    "settled",
+    "standard_uncertainty",
+]
+
+FIRST_PASS = 0.01
+"""Increment (px) at which the first pass hands over to the pass with the weights brought back anew."""
+_REFINED = {"none": 1, "global": 1, "local": 4}
+"""Passes whose residual still changes weights and grey levels, for each grey-level correction."""
+_STARTED = 0.25
+"""Correlation coefficient at the start under which an element waits until its neighbours have brought it nearer."""
+_SETTLED = 1e-3
+"""Share of the weight that may still change for the passes to end."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weighting:
+    """What the residual at an estimate says about elements, lights and grey levels.
+
+    Attributes
+    ----------
+    residual
+        At the estimate, with the weights brought back.
+    values : ndarray, shape (k, P), float32
+        Reference grey levels, corrected for brightness.
+    matched : ndarray, shape (E,), bool
+        Elements that take part.
+    precision
+        Of the lights; None: not learnt.
+    returned : int
+        Number of the pass after the last one that brought elements back.
+    """
+
+    residual: Residual
+    values: FloatImage
+    matched: BoolArray
+    precision: Precision | None = None
+    returned: int = 0
+
+    @property
+    def given(self) -> FloatImage:
+        """Pixel weights (k, P) without the precision of the lights."""
+        return self.residual.weights * np.repeat(self.matched, np.diff(self.residual.reference.pixels.offsets))
+
+    @property
+    def weights(self) -> FloatImage:
+        """Pixel weights (k, P) of the next pass."""
+        return self.given if self.precision is None else self.given * self.precision.factor
+
+
+def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
+    residual = compare(problem, problem.reference.values, estimate)
+    return Weighting(
+        residual=residual,
+        values=corrected_values(residual, "none" if problem.options.brightness == "none" else "global"),
+        matched=matching_elements(residual, least=_STARTED),
+    )
+
+
+def next_weighting(
+    problem: Problem, last: Weighting, equations: Equations, estimate: Estimate, number: int
+) -> Weighting:
+    """What the displacement found by pass `number` says about matching, grey levels and precision."""
+    residual = compare(problem, last.values, estimate)
+    matched = matching_elements(residual, last.precision)
+    if not matched.all() or estimate.longest > FIRST_PASS:
+        exhausted = len(estimate.increments) >= problem.options.max_iterations
+        motion = np.zeros(len(estimate.displacement)) if exhausted else estimate.increments[-1]
+        std = standard_uncertainty(residual, equations, last.precision, 2)
+        matched &= ~lost_elements(problem.reference.mesh, std, motion)
+    # where elements have come back, what was learnt from their wrong match must be learnt anew, and once more: in
+    # the pass that brings them back the residual is still that of a wrong match
+    returned = number + 1 if (matched & ~last.matched).any() else last.returned
+    weighting = replace(last, residual=residual, matched=matched, returned=returned)
+    if not refining(problem, weighting, number + 1):
+        return weighting
+    return replace(
+        weighting,
+        values=corrected_values(residual, problem.options.brightness),
+        precision=learn_precision(residual) if problem.statistics else None,
+    )
+
+
+def settled(weighting: Weighting, equations: Equations) -> bool:
+    weights = weighting.weights
+    return bool(np.abs(weights - equations.weights).sum() <= _SETTLED * weights.sum()) and bool(weights.any())
+
+
+def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
+    """Whether the residual of a pass still changes weights or grey levels."""
+    learns = problem.statistics or problem.options.brightness != "none"
+    return learns and number <= weighting.returned + _REFINED[problem.options.brightness]
+
+
+def standard_uncertainty(
+    residual: Residual, equations: Equations, precision: Precision | None, quantities: int
+) -> FloatArray:
+    """Standard uncertainty (N, quantities) of the first of u, v (px), exx, eyy, exy."""
+    std = nodal_std(residual, equations, quantities)
+    return std if precision is None else std * precision.robust_loss(residual.reference, equations.weights)[:, None]

@@ -1,0 +1,183 @@
+"""The formats that frames are read from, each declared once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, NoReturn, Protocol
+
+from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.headerless import HeaderlessFile, is_headerless
+from rgbmidic.frames.png import PngFile
+from rgbmidic.frames.source import FrameSource
+from rgbmidic.frames.tiff import TiffFile
+from rgbmidic.frames.tiff_pages import is_dng
+from rgbmidic.settings import FrameKind, FrameSettings
+
+__all__ = ["FORMATS", "FRAME_ENDINGS", "Camera", "FrameFormat", "open_source", "read_frame"]
+
+SampleType = Literal["uint8", "uint16", ">u2"]
+
+
+class Camera(Protocol):
+    """Who knows pattern and levels of the camera: a `Calibration`."""
+
+    @property
+    def cfa(self) -> str | None:
+        """Bayer pattern."""
+
+    @property
+    def black_level(self) -> float | None:
+        """Black level in DN."""
+
+    @property
+    def white_level(self) -> float | None:
+        """White level in DN."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameFormat:
+    """A format of frame files.
+
+    Attributes
+    ----------
+    name
+        What messages call it.
+    endings
+        Endings (lower case) of its files in a folder.
+    recognises
+        Whether a file, with what is stated of it, is read as this format; never an error, whatever the file is.
+    source
+        Its reader; built with `path` and `stated`, it reads nothing yet.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    recognises: Callable[[Path, FrameSettings], bool]
+    source: type[FrameSource]
+
+
+FORMATS = (
+    FrameFormat(
+        name="headerless .raw and .bin files whose shape and dtype are stated",
+        endings=(".raw", ".bin"),
+        recognises=is_headerless,
+        source=HeaderlessFile,
+    ),
+    FrameFormat(
+        name="PNG",
+        endings=(".png",),
+        recognises=lambda path, _: path.suffix.lower() == ".png",
+        source=PngFile,
+    ),
+    FrameFormat(
+        name="TIFF",
+        endings=(".tif", ".tiff"),
+        recognises=lambda path, _: path.suffix.lower() in (".tif", ".tiff") and not is_dng(path),
+        source=TiffFile,
+    ),
+    FrameFormat(
+        name="camera raws (DNG, NEF, CR2, ARW, ...)",
+        endings=CAMERA_RAW_ENDINGS,
+        recognises=lambda path, _: has_camera_header(path),
+        source=CameraRaw,
+    ),
+)
+"""The first that recognises a file reads it."""
+
+FRAME_ENDINGS = tuple(ending for known in FORMATS for ending in known.endings)
+"""Endings (lower case) of the files that count as frames when a folder is listed."""
+
+
+class _UnknownFile(FrameSource):
+    """A file that no format recognises: reading it says which are."""
+
+    def _shape(self) -> NoReturn:
+        allowed = ", ".join(known.name for known in FORMATS)
+        raise FrameError(f"{self.path} is not a frame that rgbmidic reads; allowed are {allowed}")
+
+    def _stored(self, index: int) -> NoReturn:
+        self._shape()
+
+
+def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None = None) -> FrameSource:
+    """The file as a source of frames; a missing or damaged one is told when it is read.
+
+    Parameters
+    ----------
+    path
+        Frame file.
+    stated
+        What the user says of it (`path` and `reference` are not used); it must agree with what the file tells.
+    camera
+        Pattern and levels, as a calibration knows them, where neither the file nor the user tells them.
+    """
+    path = Path(path)
+    source = next((known.source for known in FORMATS if known.recognises(path, stated)), _UnknownFile)
+    if camera is not None and not source.tells_camera:
+        stated = replace(
+            stated,
+            cfa=stated.cfa or (camera.cfa if stated.kind in (None, "bayer") else None),
+            black_level=camera.black_level if stated.black_level is None else stated.black_level,
+            white_level=camera.white_level if stated.white_level is None else stated.white_level,
+        )
+    return source(path=path, stated=stated)
+
+
+def read_frame(
+    path: Path | str,
+    *,
+    kind: FrameKind | None = None,
+    cfa: str | None = None,
+    black_level: float | None = None,
+    white_level: float | None = None,
+    shape: tuple[int, int] | None = None,
+    dtype: SampleType | None = None,
+) -> Mosaic | ChannelFrame:
+    """Read one raw frame.
+
+    Camera raws (LibRaw) tell everything themselves. TIFF and PNG tell size and number of channels; headerless ``.raw``
+    and ``.bin`` files tell nothing. What is stated and also told by the file must agree.
+
+    Parameters
+    ----------
+    path
+        Frame file.
+    kind
+        None: what the file tells (three channels: ``"rgb"``), else ``"bayer"``.
+    cfa
+        Bayer pattern of the first visible pixels; needed for a mosaic whose file does not tell it.
+    black_level, white_level
+        Grey levels (DN); where neither stated nor told 0 and the largest value of the sample type.
+    shape, dtype
+        Rows and columns, and sample type (``"uint8"``, ``"uint16"`` little-endian, ``">u2"`` big-endian) of headerless
+        files.
+
+    Returns
+    -------
+    Mosaic or ChannelFrame
+        A mosaic for ``"bayer"``; (1, H, W) for ``"monochrome"``; (3, H, W) for ``"rgb"``.
+
+    Raises
+    ------
+    FrameError
+        The file is missing, damaged, truncated, already demosaiced, or contradicts a statement (both are named).
+    InputError
+        A statement is not allowed by itself.
+    """
+    try:
+        stated = FrameSettings(
+            path=(str(path),),
+            kind=kind,
+            cfa=cfa,
+            black_level=black_level,
+            white_level=white_level,
+            shape=shape,
+            dtype=dtype,
+        )
+    except ConfigurationError as error:
+        raise InputError(str(error).replace("frames.", "")) from None
+    return open_source(path, stated).read(0)

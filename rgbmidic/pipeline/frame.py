@@ -1,0 +1,99 @@
+"""One frame of a test to one record, whatever the frame is like.
+
+read -> one image per light -> weights -> images of the solve -> displacement and its uncertainty -> gaps filled ->
+brightness of the lights -> record.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.correlation import Deformed, Start, Status, track
+from rgbmidic.correlation.light_levels import brightness_change
+from rgbmidic.errors import FrameError, RgbmidicError
+from rgbmidic.fields import fill
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.separation import correlated
+from rgbmidic.results import FrameRecord
+from rgbmidic.typing import FloatArray, FloatImage
+
+__all__ = ["measure_frame"]
+
+logger = logging.getLogger(__name__)
+
+_THUMBNAIL = 256
+"""Longest side in px of the picture of the weights that is kept of every frame."""
+_DARK = 0.3
+"""Share of its light in the reference under which a light is told to be failing."""
+
+
+def measure_frame(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
+    """Measure one frame of a test.
+
+    A frame that cannot be read or measured gives a record with the reason, an error that is not one of rgbmidic's own
+    included, whose traceback goes to the log.
+
+    Parameters
+    ----------
+    plan
+        What all frames share.
+    index
+        Number of the frame.
+    start
+        From where its displacement is looked for; the reference itself starts from rest.
+
+    Returns
+    -------
+    FrameRecord
+    Start
+        From where the next frame starts; `start` where this one failed.
+    """
+    try:
+        return _measure(plan, index, start)
+    except RgbmidicError as error:
+        reason = str(error)
+        logger.warning("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
+    except Exception as error:  # whatever it is, the other frames can be measured
+        reason = f"unexpected error: {type(error).__name__}: {error}"
+        logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
+    return FrameRecord.failed(reason, nodes=len(plan.reference.mesh.nodes), lights=len(plan.images.names)), start
+
+
+def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
+    settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
+    images = plan.separation(plan.series.read(index))
+    if images.values.shape != reference.images.shape:
+        raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
+    weights = plan.weights.deformed(images, index)
+    deformed = Deformed.prepare(correlated(images, settings.illumination), weights, prefilter=settings.solver.prefilter)
+    if settings.frames.reference == (index,):
+        start = Start(displacement=np.zeros_like(reference.mesh.nodes))
+    statistics = settings.weights.method == "statistics"
+    solution = track(reference, deformed, start, settings.solver, statistics=statistics)
+    if solution.status is Status.FAILED:
+        logger.warning("frame %d (%s) cannot be measured: %s", index, name, solution.reason)
+    kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
+    brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
+    _tell_dark(name, images.names, brightness)
+    record = FrameRecord.from_solution(
+        kept,
+        brightness=brightness,
+        weights_thumbnail=_thumbnail(weights),
+        reflection_thumbnail=None if images.reflection_index is None else _thumbnail(images.reflection_index),
+        inputs=plan.series.inputs(index),
+    )
+    return record, start.after(solution)
+
+
+def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> None:
+    for light, gain in zip(lights, brightness[:, 0], strict=True):
+        if gain < _DARK:
+            logger.warning("%s: %s gives %.0f %% of its light in the reference", name, light, 100 * gain)
+
+
+def _thumbnail(weights: FloatImage) -> npt.NDArray[np.uint8]:
+    step = -(-max(weights.shape[1:]) // _THUMBNAIL)
+    return np.round(weights[:, ::step, ::step] * 255).astype(np.uint8)

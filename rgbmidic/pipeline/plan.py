@@ -1,0 +1,108 @@
+"""What all frames of a test share, made once before the first is measured.
+
+calibration -> series of frames -> reference frames -> one image per light, averaged -> region and mesh -> weights ->
+reference of the solve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rgbmidic.correlation import Reference
+from rgbmidic.errors import FrameError, RegionError
+from rgbmidic.frames import FrameSeries, open_series, read_frame
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.separation import Separation, correlated
+from rgbmidic.settings import RegionSettings, TestSettings
+from rgbmidic.weights import LightWeights, prepare_weights
+
+__all__ = ["Plan", "read_region"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What all frames of a test share; it can be pickled, so that any process can measure any frame.
+
+    Attributes
+    ----------
+    settings
+        What TEST.toml says.
+    series
+        The frames.
+    separation
+        From a raw frame to one image per light.
+    weights
+        How much each light counts.
+    images
+        Images of the reference state, in grey levels.
+    reference
+        The reference state as the solve needs it, with the mesh.
+    """
+
+    settings: TestSettings
+    series: FrameSeries
+    separation: Separation
+    weights: LightWeights
+    images: IlluminationImages
+    reference: Reference
+
+    @classmethod
+    def from_settings(cls, settings: TestSettings) -> Plan:
+        """Read all that the settings name, except the deformed frames.
+
+        Raises
+        ------
+        RgbmidicError
+            The settings, the calibration, the region or the reference frames are not usable.
+        """
+        calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
+        series = open_series(settings.frames, settings.base, calibration)
+        separation = Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
+        images, separation = separation.reference(map(series.read, settings.frames.reference))
+        region = read_region(settings.region, images.shape)
+        mesh = Tri3Mesh.from_region(region, settings.element_size)
+        weights = prepare_weights(
+            settings, images, region, frames=len(series), images_of=lambda index: separation(series.read(index))
+        )
+        reference = Reference.prepare(
+            correlated(images, settings.illumination),
+            region,
+            weights.reference(images),
+            mesh=mesh,
+            prefilter=settings.solver.prefilter,
+        )
+        if not reference.pixel_weights.any():
+            names = ", ".join(map(series.name, settings.frames.reference))
+            raise FrameError(
+                f"no light sees the region in the reference ({names}): it is saturated, dark or excluded by the weights"
+            )
+        return cls(
+            settings=settings,
+            series=series,
+            separation=separation,
+            weights=weights,
+            images=images,
+            reference=reference,
+        )
+
+
+def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
+    """The region of interest of the settings on images of `shape` (H, W).
+
+    Raises
+    ------
+    RegionError
+        The region is empty, outside the image, or the mask image has another size.
+    """
+    if settings.rectangle is not None:
+        return Region.from_rectangle(settings.rectangle, shape)
+    if settings.polygon is not None:
+        return Region.from_polygon(settings.polygon, shape)
+    assert settings.mask is not None
+    mask = read_frame(settings.mask, kind="monochrome").values[0]
+    try:
+        return Region.from_mask(mask, shape)
+    except RegionError as error:
+        raise RegionError(f"region.mask {settings.mask}: {error}") from None

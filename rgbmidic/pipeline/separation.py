@@ -1,0 +1,100 @@
+"""From what the camera recorded of one state to one image per light, as the settings and the calibration say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rgbmidic.errors import ConfigurationError, FrameError
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.illumination.align import align
+from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
+from rgbmidic.illumination.normalise import normalise
+from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.illumination.unmix import unmix
+from rgbmidic.settings import IlluminationSettings
+from rgbmidic.typing import FloatImage
+
+__all__ = ["RawState", "Separation", "correlated"]
+
+RawState = tuple[Mosaic | ChannelFrame, ...]
+"""What the camera recorded of one state: a frame, or one per light fired in succession."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Separation:
+    """From what the camera recorded of one state to one image per light: linearise, demosaic, unmix, align.
+
+    Attributes
+    ----------
+    calibration
+        Crosstalk, noise and registration of the lights; None where monochrome frames need none.
+    demosaic
+        Method for Bayer frames, as in `IlluminationSettings`.
+    texture
+        The speckle's autocorrelation, shared by all frames of a test; None: each frame tells its own.
+    """
+
+    calibration: Calibration | None = None
+    demosaic: str = "auto"
+    texture: TextureModel | None = None
+
+    def __call__(self, frames: RawState) -> IlluminationImages:
+        """Illumination images of one state from its frame, or its frames if lights fired in succession.
+
+        Raises
+        ------
+        ConfigurationError
+            Colour frames without a calibrated crosstalk, or settings that contradict the calibration.
+        """
+        known = self.calibration or Calibration()
+        linear = [linearise(frame, known.noise) for frame in frames]
+        if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
+            return IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)])
+        if len(linear) > 1:
+            raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
+        crosstalk, (only,) = self._crosstalk(), linear
+        if isinstance(only, LinearMosaic):
+            images = separate(only, crosstalk, self.demosaic, texture=self.texture)
+        else:
+            images = unmix(only, crosstalk)
+        return images if known.registration is None else align(images, known.registration)
+
+    def reference(self, states: Iterable[RawState]) -> tuple[IlluminationImages, Separation]:
+        """Mean image of each light over the states of the reference, and the separation that knows their speckle.
+
+        A pixel is valid where it is valid in all of them. The states are taken one by one.
+
+        Raises
+        ------
+        FrameError
+            The frames have different shapes.
+        ConfigurationError
+            As above.
+        """
+        remaining = iter(states)
+        first = self(next(remaining))
+        learnt = replace(self, texture=first.texture)
+        total, valid, count = first.values.astype(np.float64), first.valid, 1
+        for images in map(learnt, remaining):
+            if images.values.shape != total.shape:
+                raise FrameError(f"the reference frames have different shapes: {total.shape}, {images.values.shape}")
+            total, valid, count = total + images.values, valid & images.valid, count + 1
+        return replace(first, values=(total / count).astype(np.float32), valid=valid), learnt
+
+    def _crosstalk(self) -> Crosstalk:
+        if self.calibration is None or self.calibration.crosstalk is None:
+            what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
+            raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
+        return self.calibration.crosstalk
+
+
+def correlated(images: IlluminationImages, settings: IlluminationSettings) -> FloatImage:
+    """What the solve correlates (k, H, W): the lights' images, locally normalised unless the settings say no."""
+    sigma = settings.normalise
+    return normalise(images.values, sigma, images.full_scale) if sigma else images.values

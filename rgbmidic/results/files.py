@@ -1,0 +1,116 @@
+"""Files of a result: each appears under its name only when it is complete, and whatever is wrong with one is told."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from rgbmidic.errors import ResultError
+from rgbmidic.typing import AnyArray
+
+__all__ = ["read_arrays", "read_json", "write_arrays", "write_complete", "write_json"]
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write an npz file, not compressed: its size on disk is what it takes in memory.
+
+    Raises
+    ------
+    ResultError
+        It cannot be written.
+    """
+    write_complete(path, lambda file: np.savez(file, **arrays))
+
+
+def read_arrays(path: Path, names: Iterable[str]) -> dict[str, AnyArray]:
+    """The named arrays of a file that `write_arrays` wrote, checksums verified; the others are not read.
+
+    Raises
+    ------
+    ResultError
+        The file is missing or damaged, or holds more than its size on disk.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {name: _read_array(archive, name) for name in names}
+    except FileNotFoundError:
+        raise ResultError(f"{path} is missing: the result is incomplete") from None
+    except Exception as error:  # zipfile and numpy raise a dozen kinds on damaged files
+        raise ResultError(f"{path} is damaged: {error}") from None
+
+
+def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
+    """One array, once its header is found to promise what the file holds."""
+    entry = archive.getinfo(f"{name}.npy")
+    if entry.compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{name} is compressed")
+    file = io.BytesIO(archive.read(entry))
+    np.lib.format.read_magic(file)
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    promised, held = math.prod(shape) * dtype.itemsize, entry.file_size - file.tell()
+    if promised != held:
+        raise ValueError(f"the header of {name} promises {promised} bytes, the file holds {held}")
+    file.seek(0)
+    array: AnyArray = np.lib.format.read_array(file, allow_pickle=False)
+    return array
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON file.
+
+    Raises
+    ------
+    ResultError
+        It cannot be written.
+    """
+    text = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
+    write_complete(path, lambda file: file.write(text.encode()))
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is none.
+    ResultError
+        It is damaged.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        raise ResultError(f"{path} is damaged: {error}") from None
+
+
+def write_complete(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a file under another name and rename it when all of it is on the disk.
+
+    Raises
+    ------
+    ResultError
+        It cannot be written; nothing is left of it.
+    """
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
+    finally:
+        with contextlib.suppress(OSError):  # a read-only disk refuses even to remove what is not there
+            temporary.unlink()

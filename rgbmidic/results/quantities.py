@@ -1,0 +1,140 @@
+"""The quantities of a result, each declared once: record, store, exports, figures and documents read this table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rgbmidic.errors import InputError
+
+if TYPE_CHECKING:
+    from rgbmidic.correlation.solution import Solution
+
+__all__ = ["QUANTITIES", "SHARED", "Quantity"]
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """What is kept under one name, of every frame or of all together.
+
+    Attributes
+    ----------
+    name
+        Name in records, files and exports.
+    axes
+        Axes in one frame: ``"node"`` and ``"light"`` have the result's sizes, a number is a size itself, and any other
+        word is open: its size may differ from frame to frame. Without axes it is a plain number or text.
+    unit
+        Empty where there is none.
+    source
+        Attribute of a `Solution` it comes from, a column of it behind a dot; empty where the main job gives it.
+    meaning
+        What docs/conventions.md says of it.
+    dtype
+        Type of the array.
+    blank
+        What a frame holds that could not be measured at all.
+    codes
+        What each integer means, for a status.
+    """
+
+    name: str
+    axes: tuple[str | int, ...]
+    unit: str
+    source: str
+    meaning: str
+    _: KW_ONLY
+    dtype: type[np.generic] = np.float64
+    blank: float | str = float("nan")
+    codes: tuple[str, ...] = ()
+
+    def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
+        """Shape in one frame of a result with these sizes of ``"node"`` and ``"light"``; None for an open axis."""
+        return tuple(axis if isinstance(axis, int) else sizes.get(axis) for axis in self.axes)
+
+    @property
+    def stackable(self) -> bool:
+        """Whether all frames make one array: no axis is open, and it is no text."""
+        return None not in self.shape({"node": 0, "light": 0}) and self.dtype is not np.str_
+
+    def convert(self, value: Any, sizes: Mapping[str, int]) -> Any:
+        """`value` in the type of the table; an `InputError` where it has another shape."""
+        array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
+        fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
+        if not fits:
+            raise InputError(f"{self.name} of a result has the shape {shape} (None: any), not {array.shape}")
+        return array if self.axes else array.item()
+
+    def unmeasured(self, sizes: Mapping[str, int]) -> Any:
+        """What a frame holds that could not be measured; open axes have no entry."""
+        return np.full([size or 0 for size in self.shape(sizes)], self.blank, dtype=self.dtype)
+
+    def of(self, solution: Solution) -> Any:
+        """This quantity of a solved frame."""
+        attribute, _, column = self.source.partition(".")
+        value = getattr(solution, attribute)
+        return value[:, int(column)] if column else value
+
+
+_NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
+_TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
+_BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
+_AROUND = "the area-weighted mean of the elements around a node; NaN also beside a node that is not measured"
+_MISFIT = "weighted rms residual around a node over its median: 1 is ordinary, 3 is suspicious"
+_RESIDUAL = (
+    "weighted rms of `f - g(x + u)`, in the unit of the images that are correlated: none if these are divided by their "
+    "local mean (the default), else DN"
+)
+_WEIGHT = "mean share of each light in the weights; adds up to the part of the region that any light sees"
+_BRIGHTNESS = (
+    "gain and offset (DN) of each light against the reference, from the speckle's contrast and mean, medians over the "
+    "elements; told, not used"
+)
+_RIGID = "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad)"
+_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not tell it"
+_ENDS = ("converged", "not converged", "failed")
+_NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
+
+_TABLE = (
+    Quantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
+    Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
+    Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
+    Quantity("history", ("iteration",), "px", "history", "largest motion of a node in each iteration"),
+    Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
+    Quantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
+    Quantity("u", _NODE, "px", "displacement.0", "displacement in x against the reference"),
+    Quantity("v", _NODE, "px", "displacement.1", "displacement in y against the reference"),
+    Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
+    Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
+    Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
+    Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
+    Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
+    Quantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx, curvature included"),
+    Quantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy, curvature included"),
+    Quantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy, curvature included"),
+    Quantity("misfit", _NODE, "", "misfit", _MISFIT),
+    Quantity(
+        "light_share", ("node", "light"), "", "light_share", "share of each light in what determines a node", blank=0
+    ),
+    Quantity("residual", _LIGHT, "", "residual", _RESIDUAL),
+    Quantity("weight_share", _LIGHT, "", "weight_share", _WEIGHT),
+    Quantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
+    Quantity("rigid", ("light", "function"), "", "rigid", _RIGID),
+    Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
+    Quantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
+)
+
+QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
+"""Every quantity by its name, in the order of the documents."""
+
+_CORNERS = "node indices; `(p1 - p0) x (p2 - p0) > 0` in (x, y)"
+_REFERENCE = "reference image of each light, stretched to 8 bit, for pictures"
+SHARED: dict[str, Quantity] = {
+    "nodes": Quantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image"),
+    "elements": Quantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
+    "reference": Quantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
+}
+"""What all frames share."""

@@ -1,0 +1,209 @@
+"""The frames of a test: which, in which order, of one size, with names and hashes."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from frames import noisy_mosaic
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rgbmidic.errors import FrameError
+from rgbmidic.frames import FrameSeries, FrameSource, file_hash, formats, list_frames, open_series
+from rgbmidic.frames.data import ChannelFrame
+from rgbmidic.frames.formats import FrameFormat
+from rgbmidic.frames.stored import StoredFrame
+from rgbmidic.frames.writers import write_dng, write_tiff
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.settings import FrameSettings
+
+
+def _write(folder: Path, names: list[str], shape: tuple[int, int] = (24, 30)) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed, name in enumerate(names):
+        write_tiff(folder / name, noisy_mosaic(shape, seed=seed))
+
+
+def _names(files: tuple[Path, ...]) -> list[str]:
+    return [file.name for file in files]
+
+
+def test_natural_order(tmp_path: Path) -> None:
+    for name in ("f10.tif", "f9.tif", "f1_20.tif", "f1_3.tif", "g².tif", "F2.tif"):
+        (tmp_path / name).touch()
+    assert _names(list_frames("*.tif", tmp_path)) == ["f1_3.tif", "f1_20.tif", "F2.tif", "f9.tif", "f10.tif", "g².tif"]
+
+
+@given(numbers=st.lists(st.integers(0, 10**6), unique=True, min_size=1, max_size=20))
+def test_numbered_names_come_in_the_order_of_their_numbers(
+    tmp_path_factory: pytest.TempPathFactory, numbers: list[int]
+) -> None:
+    folder = tmp_path_factory.mktemp("numbers")
+    for number in numbers:
+        (folder / f"frame {number}.png").touch()
+    assert _names(list_frames(folder, ".")) == [f"frame {number}.png" for number in sorted(numbers)]
+
+
+def test_folder_pattern_file_and_absolute_pattern(tmp_path: Path) -> None:
+    folder = tmp_path / "run [1]"
+    _write(folder, ["a1.tif", "a2.tif"])
+    (folder / "notes.txt").touch()
+    (folder / ".a0.tif").touch()
+    (folder / "sub.tif").mkdir()
+    assert _names(list_frames("run [1]", tmp_path)) == ["a1.tif", "a2.tif"]
+    assert _names(list_frames("run [1]/a2.tif", tmp_path)) == ["a2.tif"]
+    assert _names(list_frames("*/a*.tif", tmp_path)) == ["a1.tif", "a2.tif"]
+    assert _names(list_frames("**/a*.tif", tmp_path)) == ["a1.tif", "a2.tif"]
+    assert _names(list_frames(str(tmp_path / "*" / "*.tif"), "elsewhere")) == ["a1.tif", "a2.tif"]
+
+
+def test_nothing_found_names_the_pattern_and_the_place(tmp_path: Path) -> None:
+    with pytest.raises(FrameError, match=rf"dark/\*\.tif.*{tmp_path}"):
+        list_frames("dark/*.tif", tmp_path)
+    with pytest.raises(FrameError, match="folder without frames"):
+        list_frames(".", tmp_path)
+
+
+def test_a_series_gives_frames_names_and_fingerprints(tmp_path: Path) -> None:
+    _write(tmp_path, ["f2.tif", "f10.tif"])
+    series = open_series(FrameSettings(path=("*.tif",), cfa="RGGB", white_level=4095), tmp_path)
+    assert (len(series), series.name(0), series.name(1)) == (2, "f2.tif", "f10.tif")
+    (frame,) = series.read(1)
+    np.testing.assert_array_equal(frame.values, noisy_mosaic((24, 30), seed=1).values)
+    assert frame.white_level == 4095
+    assert series.inputs(0) == {
+        str(tmp_path / "f2.tif"): hashlib.sha256((tmp_path / "f2.tif").read_bytes()).hexdigest()
+    }
+    for index in (-1, 2):
+        with pytest.raises(IndexError):
+            series.read(index)
+
+
+def test_lights_in_succession_come_together(tmp_path: Path) -> None:
+    _write(tmp_path / "left", ["1.tif", "2.tif"])
+    _write(tmp_path / "right", ["1.tif", "2.tif"])
+    settings = FrameSettings(path=("left", "right"), kind="monochrome")
+    series = open_series(settings, tmp_path)
+    frames = series.read(0)
+    assert len(series) == 2
+    assert [type(frame) for frame in frames] == [ChannelFrame, ChannelFrame]
+    assert len(series.inputs(0)) == 2
+    assert series.name(1) == "2.tif + 2.tif"
+    (tmp_path / "right" / "2.tif").unlink()
+    with pytest.raises(FrameError, match="left: 2, right: 1"):
+        open_series(settings, tmp_path)
+
+
+def test_odd_frame_is_named(tmp_path: Path) -> None:
+    _write(tmp_path, ["f1.tif", "f2.tif"])
+    _write(tmp_path, ["f3.tif"], shape=(24, 31))
+    with pytest.raises(FrameError, match=r"f3\.tif has 24 rows of 31 pixels, .*f1\.tif has 24 of 30"):
+        open_series(FrameSettings(path=("*.tif",), cfa="RGGB"), tmp_path)
+
+
+def test_one_damaged_file_does_not_stop_the_others(tmp_path: Path) -> None:
+    for index in range(3):
+        write_dng(tmp_path / f"f{index}.dng", noisy_mosaic(seed=index))
+    (tmp_path / "f1.dng").write_bytes((tmp_path / "f1.dng").read_bytes()[:600])
+    series = open_series(FrameSettings(path=("*.dng",)), tmp_path)
+    assert series.read(2)[0].values.shape == (40, 50)
+    with pytest.raises(FrameError, match=r"f1\.dng"):
+        series.read(1)
+
+
+def test_reference_must_exist(tmp_path: Path) -> None:
+    _write(tmp_path, ["f1.tif", "f2.tif"])
+    with pytest.raises(FrameError, match=r"reference names frame 2, but there are 2 \(0 to 1\)"):
+        open_series(FrameSettings(path=("*.tif",), cfa="RGGB", reference=(0, 2)), tmp_path)
+
+
+class _Film(FrameSource):
+    """A file of several frames, as a camera's own format gives."""
+
+    counted: ClassVar[list[Path]] = []
+
+    def __len__(self) -> int:
+        self.counted.append(self.path)
+        return self.path.stat().st_size
+
+    def name(self, index: int) -> str:
+        return f"{self.path.name}:{index}"
+
+    def _shape(self) -> tuple[int, int]:
+        return 24, 30
+
+    def _stored(self, index: int) -> StoredFrame:
+        return StoredFrame(values=np.full((24, 30), self.path.read_bytes()[index], dtype=np.uint16))
+
+
+def test_a_format_of_several_frames_joins_by_a_class_and_one_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film = FrameFormat(name="film", endings=(".film",), recognises=lambda path, _: path.suffix == ".film", source=_Film)
+    monkeypatch.setattr(formats, "FORMATS", (film, *formats.FORMATS))
+    _write(tmp_path, ["b.tif"])
+    (tmp_path / "a.film").write_bytes(bytes([5, 6, 7]))
+    (tmp_path / "c.film").write_bytes(bytes([8, 9]))
+    series = open_series(FrameSettings(path=("*.*",), cfa="RGGB"), tmp_path)
+    names = [series.name(index) for index in range(len(series))]
+    assert names == ["a.film:0", "a.film:1", "a.film:2", "b.tif", "c.film:0", "c.film:1"]
+    assert [int(series.read(index)[0].values[0, 0]) for index in (5, 2, 0)] == [9, 7, 5]
+    assert series.inputs(4) == {str(tmp_path / "c.film"): file_hash(tmp_path / "c.film")}
+    assert series.shape == (24, 30)
+
+
+def test_the_frames_of_all_files_are_counted_once(tmp_path: Path) -> None:
+    settings = FrameSettings(path=("frame",))
+    for name in "ab":
+        (tmp_path / name).write_bytes(bytes(10))
+    series = FrameSeries(lights=(tuple(_Film(path=tmp_path / name, stated=settings) for name in "ab"),))
+    _Film.counted.clear()
+    assert [series.name(index) for index in range(len(series))][9:11] == ["a:9", "b:0"]
+    assert not _Film.counted
+
+
+def test_a_series_goes_to_another_process_and_reads_the_same(tmp_path: Path) -> None:
+    _write(tmp_path, ["f1.tif", "f2.tif"])
+    series = open_series(FrameSettings(path=("*.tif",), cfa="RGGB"), tmp_path)
+    other = pickle.loads(pickle.dumps(series))
+    assert other == series
+    np.testing.assert_array_equal(other.read(1)[0].values, series.read(1)[0].values)
+
+
+def test_a_file_is_hashed_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed = []
+    digest = hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda file, name: hashed.append(file.name) or digest(file, name))
+    path = tmp_path / "film.cine"
+    path.write_bytes(b"one")
+    first = {file_hash(path) for _ in range(5)}
+    path.write_bytes(b"other")
+    assert (len(hashed), first) == (1, {hashlib.sha256(b"one").hexdigest()})
+    assert file_hash(path) == hashlib.sha256(b"other").hexdigest()
+    path.unlink()
+    with pytest.raises(FrameError, match=r"film\.cine cannot be read"):
+        file_hash(path)
+
+
+def test_the_camera_fills_in_what_neither_the_file_nor_the_user_tells(tmp_path: Path) -> None:
+    camera = Calibration(cfa="GBRG", black_level=16, white_level=4000)
+    mosaic = noisy_mosaic((24, 30))
+    write_tiff(tmp_path / "f.tif", mosaic)
+    write_dng(tmp_path / "f.dng", mosaic)
+    series = open_series(FrameSettings(path=("*.*",), black_level=64), tmp_path, camera)
+    frames = {series.name(index): series.read(index)[0] for index in range(2)}
+    told = {name: (frame.cfa, frame.black_level.max(), frame.white_level) for name, frame in frames.items()}
+    assert told == {"f.tif": ("GBRG", 64, 4000), "f.dng": (mosaic.cfa, 64, 4095)}
+    (channel,) = open_series(FrameSettings(path=("f.tif",), kind="monochrome"), tmp_path, camera).read(0)
+    assert (channel.black_level.tolist(), channel.white_level) == ([16], 4000)
+
+
+def test_real_series(shared_data: Path) -> None:
+    settings = FrameSettings(path=("dic_rigid_shift/*.tif",), kind="monochrome")
+    series = open_series(settings, shared_data)
+    assert [series.name(i) for i in range(5)] == ["def_1.tif", "def_5.tif", "def_10.tif", "def_15.tif", "ref.tif"]
