@@ -224,17 +224,20 @@ def inspect(
         "dtype": dtype,
     }
     stated["shape"] = tuple(int(one) for one in _numbers(shape, "--shape")) if shape else None
-    inspection = inspect_files(
-        frames,
-        test=settings,
-        calibration=calibration,
-        frame=state_frames(settings, count=len(frames), **stated),
-        region=_numbers(region, "--region") if region else None,
-        element_size=element_size,
-    )
+    with _progress("inspecting") as progress:
+        inspection = inspect_files(
+            frames,
+            test=settings,
+            calibration=calibration,
+            frame=state_frames(settings, count=len(frames), **stated),
+            region=_numbers(region, "--region") if region else None,
+            element_size=element_size,
+            progress=progress,
+        )
     if out is not None:
         report.write_inspection(inspection, out, overwrite=overwrite)
-    print(f"{inspection.name}: {inspection.kind}, {inspection.region.shape[1]} x {inspection.region.shape[0]} px\n")
+    rows, columns = inspection.frame_shape
+    print(f"{inspection.name}: {inspection.kind}, {columns} x {rows} px\n")
     _print_table("samples in the region, shares of the full scale", *report.channel_rows(inspection))
     _print_table("lights", *report.light_rows(inspection))
     known = "" if inspection.noise_known else " (noise estimated, not calibrated)"

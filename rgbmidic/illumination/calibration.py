@@ -10,12 +10,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.frames.data import BAYER_PATTERNS
+from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
 from rgbmidic.illumination.camera_noise import CameraNoise
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
 from rgbmidic.illumination.linearise import NoiseModel
@@ -69,6 +69,59 @@ class Calibration:
             )
         if self.noise is None and self.camera_noise is not None:
             object.__setattr__(self, "noise", self.camera_noise.model)
+
+    def cropped(self, origin: tuple[int, int] | None, shape: tuple[int, int]) -> Calibration:
+        """The calibration for frames that were cropped out of those it was made with.
+
+        Parameters
+        ----------
+        origin
+            Column and row of the calibrated frame at which they begin; None: not stated.
+        shape
+            Their rows and columns.
+
+        Raises
+        ------
+        CalibrationError
+            They reach beyond the calibrated frame; or no origin is stated, they have another size, and the calibration
+            depends on the place.
+        """
+        whole = self._calibrated_shape()
+        if origin is None:
+            if whole is None or whole == shape or not self._depends_on_place():
+                return self
+            raise CalibrationError(
+                f"the calibration was made with frames of {_size(whole)} px and holds what varies over them; those of "
+                f"the test have {_size(shape)} px. If the camera cropped them, state frames.crop_origin = [x, y], the "
+                "column and row of the calibrated frame at which they begin; else calibrate with frames of their size"
+            )
+        column, row = origin
+        if whole is not None and (row + shape[0] > whole[0] or column + shape[1] > whole[1]):
+            raise CalibrationError(
+                f"frames of {_size(shape)} px that begin at frames.crop_origin = {list(origin)} reach beyond the "
+                f"calibrated frame of {_size(whole)} px"
+            )
+        return replace(
+            self,
+            crosstalk=self.crosstalk and self.crosstalk.cropped(origin, shape),
+            registration=self.registration and self.registration.cropped(origin),
+            cfa=self.cfa and shift_cfa(self.cfa, row, column),
+            shape=shape,
+        )
+
+    def _depends_on_place(self) -> bool:
+        return bool(
+            (self.registration and self.registration.depends_on_place) or (self.crosstalk and self.crosstalk.field)
+        )
+
+    def _calibrated_shape(self) -> tuple[int, int] | None:
+        """Rows and columns of the captures; older files tell them by what depends on the place only."""
+        if self.shape is None and self.crosstalk is not None and self.crosstalk.field is not None:
+            return self.crosstalk.field.shape
+        if self.shape is None and self.registration is not None:
+            x, y = self.registration.centre
+            return round(2 * y + 1), round(2 * x + 1)
+        return self.shape
 
     @classmethod
     def read(cls, path: Path | str) -> Calibration:
@@ -212,6 +265,10 @@ def _registration_document(registration: Registration) -> dict[str, Any]:
         "radius": registration.radius,
         "covariance": _listed(registration.covariance),
     }
+
+
+def _size(shape: tuple[int, int]) -> str:
+    return f"{shape[1]} x {shape[0]}"
 
 
 def _listed(values: FloatArray | None) -> Any:

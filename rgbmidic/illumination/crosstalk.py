@@ -7,7 +7,7 @@ stays the mean and whoever ignores the variation makes the smallest error.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -148,6 +148,24 @@ class Crosstalk:
     def identity(cls, lights: tuple[str, ...]) -> Crosstalk:
         """No crosstalk: every light is seen by its own channel alone."""
         return cls(matrix=np.eye(len(lights)), lights=lights)
+
+    def cropped(self, origin: tuple[int, int], shape: tuple[int, int]) -> Crosstalk:
+        """The same crosstalk on frames of `shape` that begin at `origin` (column, row) of the calibrated ones.
+
+        The lights keep their units, so that the largest entries of the new mean need not be 1; its uncertainty is that
+        of the whole field's.
+        """
+        if self.field is None:
+            return self
+        # the polynomial in the crop's own coordinates, from its values at as many points as determine it
+        order = self.field.order
+        y, x = (np.linspace(0, side - 1, order + 1) for side in shape)
+        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        inverse = np.linalg.pinv(legendre_products(points, shape, order))
+        matrices = np.tensordot(inverse, self.at(points + origin), axes=1)
+        return replace(
+            self, matrix=matrices[0], field=CrosstalkField(order=order, coefficients=matrices[1:], shape=shape)
+        )
 
     def at(self, points: npt.ArrayLike) -> FloatArray:
         """A at points (x, y) in px of shape (..., 2): shape (..., C, k)."""

@@ -8,7 +8,7 @@ and c the image centre, light j sees the same point at x + rho_j(x),
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -83,6 +83,15 @@ class Registration:
         """All lights see every point at the same pixel of a frame of `shape` (rows, columns)."""
         centre, radius = frame_geometry(shape)
         return cls(lights=lights, parameters=np.zeros((len(lights), 5)), centre=centre, radius=radius)
+
+    @property
+    def depends_on_place(self) -> bool:
+        """Whether any light is more than shifted."""
+        return bool(self.parameters[:, 2:].any())
+
+    def cropped(self, origin: tuple[int, int]) -> Registration:
+        """The same registration on frames that begin at the pixel `origin` (column, row) of the calibrated ones."""
+        return replace(self, centre=(self.centre[0] - origin[0], self.centre[1] - origin[1]))
 
     def displacement(self, points: npt.ArrayLike) -> FloatArray:
         """rho_j: what light 1 sees at point x is seen by light j at x + rho_j(x).
