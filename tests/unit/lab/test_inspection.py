@@ -15,6 +15,7 @@ from small_tests import REGION, colour_test, grey_frame
 
 import rgbmidic
 from rgbmidic import cli
+from rgbmidic.command import execute
 from rgbmidic.correlation import correlate
 from rgbmidic.errors import FrameError, InputError, RegionError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
@@ -44,7 +45,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run the command in this process: exit status, standard output, standard error."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
-        status = cli._run([str(argument) for argument in arguments], debug=False)
+        status = execute(cli.app, [str(argument) for argument in arguments], debug=False)
         return status, *capsys.readouterr()
 
     return run
