@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rgbmidic.results import Result
     from rgbmidic.settings import TestSettings, read_test
 
-__version__ = "0.1.0"
+from rgbmidic._version import __version__
 
 __all__ = [
     "Calibration",

@@ -13,14 +13,15 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from rgbmidic import __version__, command
+from rgbmidic import command
+from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
 from rgbmidic.settings import FrameSettings
 
 __all__ = ["app", "main"]
 
-_CONVERGED, _FAILED = 0, 2
+_CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 study = typer.Typer(rich_markup_mode=None)
@@ -29,6 +30,7 @@ _messages = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
+Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")]
 
 
 def main() -> None:
@@ -60,7 +62,7 @@ def run(
     test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
     out: Out,
     overwrite: Overwrite = False,
-    figures: Annotated[bool, typer.Option(help="Write pictures into DIR/figures.")] = True,
+    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
     from rgbmidic.pipeline import measure
@@ -68,17 +70,35 @@ def run(
 
     started = time.perf_counter()
     settings = read_test(test)
-    from rgbmidic.report.gallery import remove_figures, write_figures
+    from rgbmidic.report import remove_figures, write_figures
 
     with _progress("measuring") as progress:
         result = measure(settings, out, overwrite=overwrite, progress=progress)
     remove_figures(out / "figures")
-    if figures:
+    if draw:
         write_figures(result, out / "figures")
     _print_summary(result, time.perf_counter() - started)
-    if (result.status == _FAILED).all():
-        message = f"every frame failed; the first says: {result.reasons[0]}"
-        raise typer.Exit(command.fail(message, command.FAILURE))
+    failed = [index for index in result.deformed if result.status[index] == _FAILED]
+    if len(failed) == len(result.deformed):
+        first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
+        raise typer.Exit(command.fail(f"no deformed frame is measured; {first}", command.FAILURE))
+
+
+@app.command()
+def figures(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the pictures; by default RESULT/figures.")
+    ] = None,
+    frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10; by default three frames.")] = "",
+    partial: Partial = False,
+) -> None:
+    """Draw a result: maps, masks and reflections of some frames, and what happened over all of them."""
+    from rgbmidic.report import write_figures
+
+    chosen = _whole_numbers(frames, "--frames") if frames else None
+    for file in write_figures(Result.open(result, partial=partial), out or result / "figures", chosen):
+        print(file)
 
 
 @app.command()
@@ -87,7 +107,7 @@ def export(
     out: Annotated[Path, typer.Option("--out", help="File to write.")],
     to: Annotated[str, typer.Option("--to", help=f"Format: {', '.join(EXPORT_FORMATS)}.")] = "npz",
     overwrite: Overwrite = False,
-    partial: Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")] = False,
+    partial: Partial = False,
 ) -> None:
     """Write a result into one file for another program."""
     export_result(Result.open(result, partial=partial), to, out, overwrite=overwrite)
@@ -101,7 +121,7 @@ def demo(
 ) -> None:
     """Make a small virtual test, calibrate, measure it, and compare with the known truth."""
     from rgbmidic.lab.demo import run_demo
-    from rgbmidic.report.gallery import write_figures
+    from rgbmidic.report import write_figures
 
     started = time.perf_counter()
     with _progress("demo") as progress:
@@ -275,6 +295,13 @@ def _numbers(text: str, option: str) -> list[float]:
         raise InputError(f"{option} are numbers with commas between them, such as 0.333,8; not {text!r}") from None
 
 
+def _whole_numbers(text: str, option: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option} are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
+
+
 @contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one."""
@@ -287,16 +314,19 @@ def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
 
 def _print_summary(result: Result, seconds: float) -> None:
-    measured = 1 - (result.node_status > 0).mean()
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_row("frames", f"{len(result)}, {int((result.status == _CONVERGED).sum())} converged")
-    table.add_row("nodes", f"{len(result.nodes)}, {measured:.1%} measured")
-    for light, share in zip(result.lights, result.mean_share[result.status != _FAILED].T, strict=True):
+    """What became of the deformed frames; the reference, matched with itself, says nothing."""
+    deformed = list(result.deformed)
+    ends = [int((result.status[deformed] == code).sum()) for code in (_CONVERGED, _UNCONVERGED, _FAILED)]
+    words = [f"{ends[0]} converged", *([f"{ends[1]} not converged"] if ends[1] else []), f"{ends[2]} failed"]
+    measured = [float((status == 0).mean()) for status in result.each("node_status", deformed)]
+    rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}
+    if measured:
+        rows["nodes"] += f", {sum(measured) / len(measured):.1%} measured"
+    for light, share in zip(result.lights, result.mean_share[deformed].T, strict=True):
         known = share[share == share]
-        table.add_row(light, f"{known.mean():.0%} of what determines the nodes" if known.size else "-")
-    table.add_row("time", f"{seconds:.1f} s")
-    Console().print(table)
-    print(f"result        {result.path}")  # rich would cut a long path
+        rows[light] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
+    for name, text in {**rows, "time": f"{seconds:.1f} s", "result": result.path}.items():
+        print(f"{name:<8}{text}")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,8 @@ def main(app: typer.Typer) -> None:
 
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    for name in ("rgbmidic", "rgbmidic_calibration"):  # not the root: other libraries talk to programmers
+        logging.getLogger(name).addHandler(handler)
     sys.exit(execute(app, arguments, debug=len(arguments) < len(sys.argv) - 1))
 
 

@@ -63,6 +63,9 @@ class FrameSettings:
         Indices of the frames whose average is the reference.
     shape, dtype
         Rows and columns, and sample type, of headerless files.
+    crop_origin
+        Column and row of the calibrated frame at which cropped frames begin; None: they are as large as the calibrated
+        ones, or nothing of the calibration depends on the place.
     """
 
     path: tuple[str, ...]
@@ -73,6 +76,7 @@ class FrameSettings:
     reference: tuple[int, ...] = _bounded((0,), at_least=0)
     shape: tuple[int, int] | None = _bounded(None, at_least=1)
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
+    crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)
 
     def __post_init__(self) -> None:
         _check_bounds(self, "frames")

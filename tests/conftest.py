@@ -20,3 +20,13 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no shared data at {folder}; set RGBMIDIC_SHARED_DATA to its folder")
     return folder
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say which figures of README and docs this run has not checked, because it had no real data."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    unchecked = sorted({report.nodeid.split("[")[0] for report in skipped if "no shared data" in str(report.longrepr)})
+    if unchecked:
+        terminalreporter.section("figures on real data that were not checked (no shared data)")
+        for name in unchecked:
+            terminalreporter.write_line(name)

@@ -50,7 +50,7 @@ class CaptureFiles:
         """
         settings = replace(stated, path=(pattern,))
         try:
-            return cls(role=role, series=open_series(settings, camera=calibration), stated=settings)
+            return cls(role=role, series=open_series(settings, camera=calibration, in_order=False), stated=settings)
         except FrameError as error:
             raise CalibrationError(f"{role}: {error}") from None
 

@@ -12,7 +12,7 @@ from rgbmidic.correlation.assembly import factorise
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Equations", "node_blocks", "rigid_functions"]
+__all__ = ["SEEN", "Equations", "node_blocks", "rigid_functions"]
 
 
 _RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
@@ -21,7 +21,7 @@ _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
 _ROUNDING = 1e-4
 """Share of a node's texture under which what it sees in its worse direction may be rounding."""
-_SEEN = 0.05
+SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area..."""
 _INFORMED = 0.01
 """...and this share of the median information, its texture over the variance of the residual: 10 times the noise."""
@@ -77,10 +77,10 @@ class Equations:
         assembly = reference.assembly
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
         hessian = assembly.matrix(np.sum(per_light, axis=0))
-        textured, scale = _observability(hessian, assembly.nodal_area, _SEEN if given is None else _INFORMED)
+        textured, scale = _observability(hessian, assembly.nodal_area, SEEN if given is None else _INFORMED)
         if given is not None:
             texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
-            textured &= _observability(assembly.matrix(np.asarray(texture)), assembly.nodal_area, _SEEN)[0]
+            textured &= _observability(assembly.matrix(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
         smoothness = sp.csc_matrix((_SMOOTHNESS * scale) * assembly.smoothness)
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
         anchor = 1e-9 * scale * sp.eye(assembly.size, format="csc")

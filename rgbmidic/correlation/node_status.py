@@ -14,7 +14,7 @@ from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["RULES", "Evidence", "Rule", "judge", "lost_elements", "one_sided_texture"]
+__all__ = ["LOST", "RULES", "Evidence", "Rule", "judge", "lost_elements", "one_sided_texture"]
 
 LOST = 0.5
 """Uncertainty (px) from which a node is lost: a position uncertain by half a pixel is not within reach of a match."""
@@ -66,18 +66,13 @@ class Rule:
 RULES = (
     Rule(
         status=NodeStatus.DECORRELATED,
-        because="its displacement is uncertain by half a pixel or more",
-        applies=lambda nodes: nodes.textured & (nodes.std.max(axis=1) > LOST),
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="elements near it do not match, and the residual around it is several times the usual one",
-        applies=lambda nodes: nodes.textured & nodes.near_mismatch & (nodes.misfit > _MISFIT),
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
         because="the elements around it do not match, and the others show too little",
         applies=lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured),
+    ),
+    Rule(
+        status=NodeStatus.NOT_SEEN,
+        because="no light sees enough texture around it",
+        applies=lambda nodes: ~nodes.textured,
     ),
     Rule(
         status=NodeStatus.NOT_SEEN,
@@ -85,9 +80,14 @@ RULES = (
         applies=lambda nodes: nodes.one_sided,
     ),
     Rule(
-        status=NodeStatus.NOT_SEEN,
-        because="no light sees enough texture around it",
-        applies=lambda nodes: ~nodes.textured,
+        status=NodeStatus.DECORRELATED,
+        because="its displacement is uncertain by half a pixel or more",
+        applies=lambda nodes: nodes.std.max(axis=1) > LOST,
+    ),
+    Rule(
+        status=NodeStatus.DECORRELATED,
+        because="elements near it do not match, and the residual around it is several times the usual one",
+        applies=lambda nodes: nodes.near_mismatch & (nodes.misfit > _MISFIT),
     ),
 )
 """In this order; a node to which none applies is measured."""

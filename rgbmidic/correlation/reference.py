@@ -106,19 +106,21 @@ class Reference:
             usable = usable * usable_pixels(region.mask, prefilter)
         pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
         samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
+        weighted = pixels.gather(usable)
+        used = np.sqrt(weighted)
         return cls(
             mesh=mesh,
             pixels=pixels,
             assembly=assembly,
             colouring=NodeColouring.from_mesh(mesh),
             functionals=(*displacement_functionals(len(mesh.nodes)), *strain_functionals(mesh)),
-            unfitted=unfitted_share(mesh, pixels, assembly),
+            unfitted=unfitted_share(pixels, assembly, samples[1] * used, samples[2] * used),
             images=ready,
             weights=usable,
             values=samples[0],
             gradient_x=samples[1],
             gradient_y=samples[2],
-            pixel_weights=pixels.gather(usable),
+            pixel_weights=weighted,
             prefilter=prefilter,
         )
 

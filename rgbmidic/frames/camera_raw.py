@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,14 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
+from rgbmidic.frames.complaints import complaints
 from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import StoredFrame, damaged
+from rgbmidic.frames.stored import StoredFrame, check_size, damaged
 from rgbmidic.frames.tiff_pages import RawStructure
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     import rawpy
+
+logger = logging.getLogger(__name__)
 
 __all__ = ["CAMERA_RAW_ENDINGS", "MAXIMUM_FLAT_ROWS", "CameraRaw", "has_camera_header"]
 
@@ -58,9 +63,11 @@ class CameraRaw(FrameSource):
             cell = _colour_cell(raw, self.path)
             values = np.array(raw.raw_image_visible, dtype=np.uint16)
             black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
-            white, margins, names = float(raw.white_level), raw.sizes, _names(raw, cell)
+            white, sizes, names = float(raw.white_level), raw.sizes, _names(raw, cell)
             monochrome = raw.num_colors == 1
-        told = structure.black_level(margins.top_margin, margins.left_margin) if structure else None
+        if values.shape != (sizes.height, sizes.width):
+            raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
+        told = structure.black_level(sizes.top_margin, sizes.left_margin) if structure else None
         black = black if told is None else told
         as_is = structure is not None and structure.stored_as_is
         _check_filled(values, black, white, stored_as_is=as_is, path=self.path)
@@ -75,18 +82,22 @@ class CameraRaw(FrameSource):
 
 @contextmanager
 def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
-    """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError."""
+    """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError, what it tells a warning."""
     import rawpy
 
     try:
-        with rawpy.imread(str(path)) as raw:
+        with complaints(os.fsencode(path)) as told, rawpy.imread(str(path)) as raw:
+            needed = 2 * raw.sizes.raw_height * raw.sizes.raw_width
+            check_size(path, needed=needed, stored=path.stat().st_size)
             yield raw
     except rawpy.LibRawFileUnsupportedError:
-        raise FrameError(f"{path} is a camera raw that LibRaw {rawpy.libraw_version} does not know") from None
+        raise FrameError(f"{path} is a camera raw that LibRaw does not know") from None
     except NotImplementedError:  # rawpy's answer to filters that repeat neither after 2x2 nor after 6x6 pixels
         raise _not_bayer(path, "that is no mosaic of 2x2 pixels") from None
     except rawpy.LibRawError as error:
         raise _undecodable(path, error) from None
+    for line in told:
+        logger.warning("LibRaw says: %s", line)
 
 
 def has_camera_header(path: Path) -> bool:

@@ -9,7 +9,7 @@ from typing import Literal, NoReturn, Protocol
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, shift_cfa
 from rgbmidic.frames.headerless import HeaderlessFile, is_headerless
 from rgbmidic.frames.png import PngFile
 from rgbmidic.frames.source import FrameSource
@@ -17,7 +17,7 @@ from rgbmidic.frames.tiff import TiffFile
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
 
-__all__ = ["FORMATS", "FRAME_ENDINGS", "Camera", "FrameFormat", "open_source", "read_frame"]
+__all__ = ["FORMATS", "FRAME_ENDINGS", "Camera", "FrameFormat", "advice", "open_source", "read_frame"]
 
 SampleType = Literal["uint8", "uint16", ">u2"]
 
@@ -92,10 +92,30 @@ FRAME_ENDINGS = tuple(ending for known in FORMATS for ending in known.endings)
 """Endings (lower case) of the files that count as frames when a folder is listed."""
 
 
+_ADVICE = {
+    (".cine", ".mraw", ".cih", ".cihx", ".seq"): "a camera's movie: export its frames as DNG or 16-bit TIFF, without "
+    "demosaicing",
+    (".mp4", ".avi", ".mov", ".mkv", ".wmv"): "a movie whose frames are compressed or demosaiced: export them from the "
+    "camera's own file as DNG or 16-bit TIFF, without demosaicing",
+    (".jpg", ".jpeg", ".bmp", ".gif", ".heic", ".webp"): "a picture that is no raw frame: let the camera record DNG or "
+    "16-bit TIFF, without demosaicing",
+    (".raw", ".bin"): "a file without a camera's header: state its shape and dtype (frames.shape and frames.dtype, or "
+    "--shape and --dtype)",
+}
+"""By endings, what files are that no format recognises, and what to do."""
+
+
+def advice(path: Path) -> str:
+    """What a file is that no format recognises, and what to do; empty where that is not known."""
+    return next((text for endings, text in _ADVICE.items() if path.suffix.lower() in endings), "")
+
+
 class _UnknownFile(FrameSource):
     """A file that no format recognises: reading it says which are."""
 
     def _shape(self) -> NoReturn:
+        if text := advice(self.path):
+            raise FrameError(f"{self.path} is {text}")
         allowed = ", ".join(known.name for known in FORMATS)
         raise FrameError(f"{self.path} is not a frame that rgbmidic reads; allowed are {allowed}")
 
@@ -120,11 +140,19 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
     if camera is not None and not source.tells_camera:
         stated = replace(
             stated,
-            cfa=stated.cfa or (camera.cfa if stated.kind in (None, "bayer") else None),
+            cfa=stated.cfa or (_pattern(camera, stated) if stated.kind in (None, "bayer") else None),
             black_level=camera.black_level if stated.black_level is None else stated.black_level,
             white_level=camera.white_level if stated.white_level is None else stated.white_level,
         )
     return source(path=path, stated=stated)
+
+
+def _pattern(camera: Camera, stated: FrameSettings) -> str | None:
+    """The camera's pattern at the first pixel of a frame that is cropped from the camera's."""
+    if camera.cfa is None or stated.crop_origin is None:
+        return camera.cfa
+    column, row = stated.crop_origin
+    return shift_cfa(camera.cfa, row, column)
 
 
 def read_frame(

@@ -84,6 +84,8 @@ class FrameSource(ABC):
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
     """Something to read is there, and what the disk refuses becomes a FrameError."""
+    if path.is_symlink() and not path.exists():
+        raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
     if not path.is_file():
         raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import lzma
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +13,8 @@ import numpy as np
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.opencv import decode
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import StoredFrame, damaged
-from rgbmidic.frames.tiff_pages import cfa_pattern, is_stored_as_is, tag, tiff_pages
+from rgbmidic.frames.stored import CHECKED_FROM, StoredFrame, check_size, damaged
+from rgbmidic.frames.tiff_pages import cfa_pattern, is_stored_as_is, missing_data, tag, tiff_pages
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -20,6 +22,11 @@ if TYPE_CHECKING:
 
 __all__ = ["TiffFile"]
 
+_UNCOMPRESSED = 1
+_BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+"""Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
+_BY_OPENCV = (5, 7, 32773)
+"""LZW, JPEG, PackBits."""
 _MIN_IS_WHITE, _PALETTE = 0, 3
 _COLOUR_MAP, _ORIENTATION = 320, 274
 
@@ -36,7 +43,7 @@ class TiffFile(FrameSource):
     def _stored(self, index: int) -> StoredFrame:
         with tiff_pages(self.path) as pages:
             page = _single_page(pages, self.path)
-            values = _decode_page(page, self.path)
+            values = _samples(page, self.path)
             if page.photometric == _PALETTE:
                 _check_grey_table(page, values.dtype, self.path)
             elif page.photometric == _MIN_IS_WHITE:
@@ -44,9 +51,7 @@ class TiffFile(FrameSource):
             return StoredFrame.plain(values, self.path, cfa_pattern(page))
 
 
-def _single_page(pages: list[TiffPage] | None, path: Path) -> TiffPage:
-    if pages is None:
-        raise damaged(path, "it is not a TIFF file")
+def _single_page(pages: list[TiffPage], path: Path) -> TiffPage:
     if not pages:
         raise damaged(path, "its header leads to no image")
     if len(pages) > 1:
@@ -55,25 +60,46 @@ def _single_page(pages: list[TiffPage] | None, path: Path) -> TiffPage:
     if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
         kind = page.dtype or f"{page.bitspersample}-bit"
         raise FrameError(f"{path} has {kind} samples; allowed are unsigned 8 or 16 bit")
-    if page.compression == 1 and not is_stored_as_is(page):
-        raise damaged(
-            path, f"its header announces {sum(page.databytecounts)} bytes of image data, too few for its size"
-        )
+    size = path.stat().st_size
+    if reason := missing_data(page, size):
+        raise damaged(path, reason)
+    stored = sum(page.databytecounts)
+    if page.compression == _UNCOMPRESSED and not is_stored_as_is(page):
+        raise damaged(path, f"its header announces {stored} bytes of image data, too few for its size")
+    check_size(path, needed=page.nbytes, stored=min(stored, size))
     return page
 
 
-def _decode_page(page: TiffPage, path: Path) -> AnyArray:
-    """Samples of a page, (H, W) or (H, W, C); by OpenCV where tifffile lacks the decompressor (LZW, JPEG)."""
-    try:
+def _samples(page: TiffPage, path: Path) -> AnyArray:
+    """Samples of a page as they are stored, (H, W) or (H, W, C)."""
+    if page.compression in (_UNCOMPRESSED, *_BY_TIFFFILE):
+        if page.compression in _BY_TIFFFILE:
+            _check_unpacked(page, path)
         values = np.asarray(page.asarray())
-    except Exception as error:  # tifffile meets damaged data with many kinds of error
-        decoded = decode(path) if (tag(page, _ORIENTATION) or (1,)) == (1,) else None
-        if decoded is None or decoded.dtype != page.dtype:
-            raise damaged(path, error) from None
-        return decoded
-    if values.ndim == 3 and page.planarconfig == 2:  # one plane after the other
-        values = np.moveaxis(values, 0, -1)
+        one_plane_after_the_other = values.ndim == 3 and page.planarconfig == 2
+        return np.moveaxis(values, 0, -1) if one_plane_after_the_other else values
+    turned = (tag(page, _ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
+    if turned or page.compression not in _BY_OPENCV:  # OpenCV turns such samples, some more than others
+        name = getattr(page.compression, "name", page.compression)
+        raise FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
+    values = decode(path.read_bytes(), path)
+    if (*values.shape[:2], values.dtype) != (page.imagelength, page.imagewidth, page.dtype):
+        raise damaged(path, f"its header announces another image than its data hold, {values.shape} {values.dtype}")
     return values
+
+
+def _check_unpacked(page: TiffPage, path: Path) -> None:
+    """Refuse parts that unpack to more than the whole image, and all of them to less: tifffile fills up with zeros."""
+    limit, total = max(page.nbytes, CHECKED_FROM), 0
+    with path.open("rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            unpacked = len(_BY_TIFFFILE[page.compression]().decompress(file.read(count), limit + 1))
+            if unpacked > limit:
+                raise damaged(path, f"a part of its image data unpacks to more than {limit} bytes")
+            total += unpacked
+    if total < page.nbytes:
+        raise damaged(path, f"its image data unpack to {total} bytes, too few for its size")
 
 
 def _check_grey_table(page: TiffPage, dtype: np.dtype[Any], path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rgbmidic.errors import RgbmidicError
+from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.stored import damaged
 from rgbmidic.typing import FloatArray
 
@@ -28,6 +28,7 @@ __all__ = [
     "cfa_pattern",
     "is_dng",
     "is_stored_as_is",
+    "missing_data",
     "tag",
     "tiff_pages",
 ]
@@ -36,6 +37,8 @@ __all__ = [
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _BYTE_ORDERS: dict[bytes, Literal["little", "big"]] = {b"II*\0": "little", b"MM\0*": "big"}
+_HEADERS = (*_BYTE_ORDERS, b"II+\0", b"MM\0+")
+"""Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
 _UNCOMPRESSED = 1
 _REDUCED = 1
 _RAW_PHOTOMETRIC = (32803, 34892)
@@ -45,26 +48,22 @@ _ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715
 
 
 @contextmanager
-def tiff_pages(path: Path) -> Iterator[list[TiffPage] | None]:
-    """The images of a TIFF file in full resolution, neither thumbnails nor previews; None for other files.
+def tiff_pages(path: Path) -> Iterator[list[TiffPage]]:
+    """The images of a TIFF file in full resolution, neither thumbnails nor previews.
 
     Raises
     ------
     FrameError
-        Image data that the header announces is not in the file, or what is done inside fails over a damaged header.
+        It is no TIFF file, or what is done inside fails over a damaged header.
     """
     import tifffile
 
+    with path.open("rb") as file:
+        if file.read(4) not in _HEADERS:  # tifffile tries some camera raws that begin as a TIFF file does
+            raise damaged(path, "it is not a TIFF file")
     try:
         with tifffile.TiffFile(path) as tiff:
-            pages = [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
-            for page in pages:
-                _check_complete(page, path)
-            yield pages
-    except tifffile.TiffFileError as error:
-        if "not a TIFF file" not in str(error):
-            raise damaged(path, error) from None
-        yield None
+            yield [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
     except (RgbmidicError, OSError):
         raise
     except Exception as error:  # tifffile meets damaged headers with many kinds of error
@@ -97,15 +96,15 @@ def _pages(tiff: TiffFile) -> Iterator[TiffPage]:
         yield from (child.aspage() for child in page.pages or ())
 
 
-def _check_complete(page: TiffPage, path: Path) -> None:
-    """Raise where image data that the page announces lies outside the file or is empty."""
-    size = path.stat().st_size
+def missing_data(page: TiffPage, size: int) -> str | None:
+    """What image data the page announces that a file of `size` bytes does not hold; None where all is there."""
     parts = list(zip(page.dataoffsets, page.databytecounts, strict=False))
     end = max((offset + count for offset, count in parts), default=0)
     if end > size:
-        raise damaged(path, f"the header announces image data up to byte {end}, the file has {size} bytes")
+        return f"the header announces image data up to byte {end}, the file has {size} bytes"
     if any(count == 0 for _, count in parts):
-        raise damaged(path, "a part of its image data has the length zero")
+        return "a part of its image data has the length zero"
+    return None
 
 
 def is_stored_as_is(page: TiffPage) -> bool:
@@ -151,20 +150,26 @@ class RawStructure:
 
     @classmethod
     def read(cls, path: Path) -> RawStructure | None:
-        """Read and check the skeleton; None for files that are not TIFF inside.
+        """Read and check the skeleton; None for files that are not TIFF inside or that only LibRaw can follow.
 
         Raises
         ------
         FrameError
             Image data that the header announces is not in the file.
         """
-        with tiff_pages(path) as pages:
-            if not pages:
-                return None
-            raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
-            page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
-            area = tag(page, _ACTIVE_AREA) or (0, 0)
-            return cls(stored_as_is=is_stored_as_is(page), black_cell=_black_cell(page), origin=(area[0], area[1]))
+        try:
+            with tiff_pages(path) as pages:
+                raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
+                page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
+                area = tag(page, _ACTIVE_AREA) or (0, 0)
+                black = _black_cell(page)
+                structure = cls(stored_as_is=is_stored_as_is(page), black_cell=black, origin=(area[0], area[1]))
+                missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
+        except FrameError:
+            return None
+        if missing:
+            raise damaged(path, missing[0])
+        return structure
 
     def black_level(self, top: int, left: int) -> FloatArray | None:
         """Black level of each position of the 2x2 cell that starts at row `top`, column `left` of the sensor.

@@ -37,8 +37,8 @@ class IlluminationImages:
         Share of a light that is not diffuse, from a single frame: 0 where its contrast is that of the light with the
         most contrast there, towards 1 in its reflection; None where the separation does not tell.
     texture : TextureModel or None
-        The speckle's autocorrelation that the separation took, to be shared by all frames of a test; None where it
-        needs none.
+        The speckle's autocorrelation as the separation took it: hand it on to the other frames of a test; None where
+        the separation does not use it.
     """
 
     values: FloatImage

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import RegionError
-from rgbmidic.typing import BoolArray
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["Region"]
 
@@ -40,6 +40,12 @@ class Region:
             raise RegionError("the region of interest is empty: no pixel of the image lies in it")
         object.__setattr__(self, "mask", mask)
 
+    @property
+    def width(self) -> int:
+        """Diameter in px of the largest disc within the region."""
+        distance = cv2.distanceTransform(np.pad(self.mask, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        return round(2 * float(np.max(distance))) - 1
+
     @classmethod
     def from_rectangle(cls, rectangle: Sequence[float], shape: tuple[int, int]) -> Region:
         """Rectangle (x0, y0, x1, y1) in px, clipped to the image of `shape` (H, W).
@@ -59,8 +65,7 @@ class Region:
         clipped = (max(x0, 0.0), max(y0, 0.0), min(x1, width - 1.0), min(y1, height - 1.0))
         if clipped[0] >= clipped[2] or clipped[1] >= clipped[3]:
             raise RegionError(f"the rectangle {rectangle!r} does not overlap the image of {width} x {height} px")
-        if max(abs(a - b) for a, b in zip(clipped, (x0, y0, x1, y1), strict=True)) > 1:
-            logger.warning("the rectangle %s is clipped to the image: %s", rectangle, clipped)
+        _tell_clipped("rectangle", corners.reshape(2, 2), shape)
         mask = np.zeros(shape, dtype=bool)
         left, top = (int(np.ceil(value)) for value in clipped[:2])
         mask[top : int(clipped[3]) + 1, left : int(clipped[2]) + 1] = True
@@ -83,6 +88,7 @@ class Region:
         cv2.fillPoly(mask, [np.round(points * 2**shift).astype(np.int32)], 1, shift=shift)
         if not mask.any():
             raise RegionError(f"the polygon {points.tolist()} does not overlap the image of {shape[1]} x {shape[0]} px")
+        _tell_clipped("polygon", points, shape)
         return cls(mask=mask.astype(bool))
 
     @classmethod
@@ -98,3 +104,10 @@ class Region:
         if shape is not None and pixels.shape != shape:
             raise RegionError(f"the mask is {pixels.shape[::-1]} px (width, height), the images are {shape[::-1]}")
         return cls(mask=pixels != 0)
+
+
+def _tell_clipped(what: str, points: FloatArray, shape: tuple[int, int]) -> None:
+    """Tell of corners (M, 2) that lie more than a pixel outside an image."""
+    last = np.array(shape[::-1]) - 1
+    if (points < -1).any() or (points > last + 1).any():
+        logger.warning("the %s %s reaches outside the image of %d x %d px: clipped", what, points.tolist(), *(last + 1))

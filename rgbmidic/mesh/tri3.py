@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import TypedDict
 
@@ -14,6 +15,12 @@ from rgbmidic.mesh.region import Region
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["Tri3Mesh"]
+
+logger = logging.getLogger(__name__)
+
+NARROW = 10
+"""Width (px) under which a region is told to be narrow: speckles are 3 to 5 px wide, and a pixel or two at each border
+serve the filters only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +58,8 @@ class Tri3Mesh:
     def from_region(cls, region: Region, element_size: float) -> Tri3Mesh:
         """Mesh a region with triangles whose legs are about `element_size` px.
 
-        A rectangle gets a regular mesh; other regions a Delaunay mesh that follows their outline and holes.
+        A rectangle gets a regular mesh; other regions a Delaunay mesh that follows their outline and holes. The log
+        tells of a region that is narrow or smaller than an element.
 
         Raises
         ------
@@ -62,6 +70,12 @@ class Tri3Mesh:
         """
         if not (np.isfinite(element_size) and element_size >= 4):
             raise InputError(f"element_size must be at least 4 px; given is {element_size!r}")
+        if region.width < NARROW:
+            logger.warning("the region is %d px across: two or three speckles, hardly enough to measure", region.width)
+        elif region.width < element_size:
+            logger.warning(
+                "the elements of %g px are larger than the region, which is %d px across", element_size, region.width
+            )
         if region.rectangle is not None:
             return cls(**_rectangle_mesh(region.rectangle, element_size))
         return cls(**_outline_mesh(region.mask, element_size))

@@ -7,6 +7,7 @@ brightness of the lights -> record.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from rgbmidic.correlation.light_levels import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.fields import fill
 from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.raw_samples import exposure_fault
 from rgbmidic.pipeline.separation import correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.typing import FloatArray, FloatImage
@@ -59,12 +61,14 @@ def measure_frame(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, St
     except Exception as error:  # whatever it is, the other frames can be measured
         reason = f"unexpected error: {type(error).__name__}: {error}"
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
-    return FrameRecord.failed(reason, nodes=len(plan.reference.mesh.nodes), lights=len(plan.images.names)), start
+    nodes, lights, number = len(plan.reference.mesh.nodes), len(plan.images.names), plan.series.numbers[index]
+    return FrameRecord.failed(reason, nodes=nodes, lights=lights, number=number), start
 
 
 def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
-    images = plan.separation(plan.series.read(index))
+    state = plan.series.read(index)
+    images = plan.separation(state)
     if images.values.shape != reference.images.shape:
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     weights = plan.weights.deformed(images, index)
@@ -74,12 +78,15 @@ def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
     statistics = settings.weights.method == "statistics"
     solution = track(reference, deformed, start, settings.solver, statistics=statistics)
     if solution.status is Status.FAILED:
+        if fault := exposure_fault(state, plan.region.mask):
+            solution = replace(solution, reason=f"{fault} ({solution.reason})")
         logger.warning("frame %d (%s) cannot be measured: %s", index, name, solution.reason)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
     _tell_dark(name, images.names, brightness)
     record = FrameRecord.from_solution(
         kept,
+        number=plan.series.numbers[index],
         brightness=brightness,
         weights_thumbnail=_thumbnail(weights),
         reflection_thumbnail=None if images.reflection_index is None else _thumbnail(images.reflection_index),

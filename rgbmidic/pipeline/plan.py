@@ -14,7 +14,8 @@ from rgbmidic.frames import FrameSeries, open_series, read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.separation import Separation, correlated
+from rgbmidic.pipeline.raw_samples import check_texture, exposure_fault
+from rgbmidic.pipeline.separation import RawState, Separation, correlated
 from rgbmidic.settings import RegionSettings, TestSettings
 from rgbmidic.weights import LightWeights, prepare_weights
 
@@ -33,6 +34,8 @@ class Plan:
         The frames.
     separation
         From a raw frame to one image per light.
+    region
+        What is measured.
     weights
         How much each light counts.
     images
@@ -44,6 +47,7 @@ class Plan:
     settings: TestSettings
     series: FrameSeries
     separation: Separation
+    region: Region
     weights: LightWeights
     images: IlluminationImages
     reference: Reference
@@ -58,9 +62,14 @@ class Plan:
             The settings, the calibration, the region or the reference frames are not usable.
         """
         calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
+        start, *others = settings.frames.reference
         series = open_series(settings.frames, settings.base, calibration)
+        first = series.read(start)
+        if calibration is not None:
+            height, width = first[0].values.shape[-2:]
+            calibration = calibration.cropped(settings.frames.crop_origin, (height, width))
         separation = Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        images, separation = separation.reference(map(series.read, settings.frames.reference))
+        images, separation = separation.reference(first, map(series.read, others))
         region = read_region(settings.region, images.shape)
         mesh = Tri3Mesh.from_region(region, settings.element_size)
         weights = prepare_weights(
@@ -73,19 +82,24 @@ class Plan:
             mesh=mesh,
             prefilter=settings.solver.prefilter,
         )
-        if not reference.pixel_weights.any():
-            names = ", ".join(map(series.name, settings.frames.reference))
-            raise FrameError(
-                f"no light sees the region in the reference ({names}): it is saturated, dark or excluded by the weights"
-            )
+        _check_seen(reference, first, region, ", ".join(map(series.name, settings.frames.reference)))
         return cls(
             settings=settings,
             series=series,
             separation=separation,
+            region=region,
             weights=weights,
             images=images,
             reference=reference,
         )
+
+
+def _check_seen(reference: Reference, state: RawState, region: Region, names: str) -> None:
+    """Refuse a reference that no light sees or that shows no texture; `state` is its first."""
+    if not reference.pixel_weights.any():
+        fault = exposure_fault(state, region.mask) or "it is saturated, dark or excluded by the weights"
+        raise FrameError(f"no light sees the region in the reference ({names}): {fault}")
+    check_texture(state, region.mask, names)
 
 
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:

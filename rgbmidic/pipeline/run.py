@@ -44,7 +44,7 @@ def measure(
     """
     plan = Plan.from_settings(settings)
     names = [plan.series.name(index) for index in range(len(plan.series))]
-    store = ResultStore.create(
+    with ResultStore.create(
         out,
         nodes=plan.reference.mesh.nodes,
         elements=plan.reference.mesh.elements,
@@ -54,14 +54,14 @@ def measure(
         reference=plan.images.values,
         notes=plan.weights.notes,
         overwrite=overwrite,
-    )
-    start = Start(displacement=None)
-    for index, name in enumerate(names):
-        record, start = measure_frame(plan, index, start)
-        store.write_frame(index, record)
-        if progress is not None:
-            progress(index + 1, len(names), _line(name, record))
-    store.finish()
+    ) as store:
+        start = Start(displacement=None)
+        for index, name in enumerate(names):
+            record, start = measure_frame(plan, index, start)
+            store.write_frame(index, record)
+            if progress is not None:
+                progress(index + 1, len(names), _line(name, record))
+        store.finish()
     return Result.open(out)
 
 

@@ -65,10 +65,10 @@ class Separation:
             images = unmix(only, crosstalk)
         return images if known.registration is None else align(images, known.registration)
 
-    def reference(self, states: Iterable[RawState]) -> tuple[IlluminationImages, Separation]:
-        """Mean image of each light over the states of the reference, and the separation that knows their speckle.
+    def reference(self, first: RawState, others: Iterable[RawState] = ()) -> tuple[IlluminationImages, Separation]:
+        """Mean image of each light over the states of the reference, and the separation that knows the first's texture.
 
-        A pixel is valid where it is valid in all of them. The states are taken one by one.
+        A pixel is valid where it is valid in all of them. The others are taken one by one.
 
         Raises
         ------
@@ -77,15 +77,14 @@ class Separation:
         ConfigurationError
             As above.
         """
-        remaining = iter(states)
-        first = self(next(remaining))
-        learnt = replace(self, texture=first.texture)
-        total, valid, count = first.values.astype(np.float64), first.valid, 1
-        for images in map(learnt, remaining):
+        mean = self(first)
+        learnt = replace(self, texture=mean.texture)
+        total, valid, count = mean.values.astype(np.float64), mean.valid, 1
+        for images in map(learnt, others):
             if images.values.shape != total.shape:
                 raise FrameError(f"the reference frames have different shapes: {total.shape}, {images.values.shape}")
             total, valid, count = total + images.values, valid & images.valid, count + 1
-        return replace(first, values=(total / count).astype(np.float32), valid=valid), learnt
+        return replace(mean, values=(total / count).astype(np.float32), valid=valid), learnt
 
     def _crosstalk(self) -> Crosstalk:
         if self.calibration is None or self.calibration.crosstalk is None:

@@ -1,30 +1,30 @@
 """What is made of a finished result: figures, the pictures beside it, pages of text and pictures."""
 
 from rgbmidic.report.figures import (
+    MAPS,
     brightness_figure,
     convergence_figure,
-    displacement_figure,
+    map_figure,
     mask_figure,
     reflection_figure,
     residual_figure,
-    save_figure,
     share_figure,
-    uncertainty_figure,
 )
 from rgbmidic.report.gallery import remove_figures, write_figures
 from rgbmidic.report.page import Page
+from rgbmidic.report.style import save_figure
 
 __all__ = [
+    "MAPS",
     "Page",
     "brightness_figure",
     "convergence_figure",
-    "displacement_figure",
+    "map_figure",
     "mask_figure",
     "reflection_figure",
     "remove_figures",
     "residual_figure",
     "save_figure",
     "share_figure",
-    "uncertainty_figure",
     "write_figures",
 ]

@@ -1,36 +1,41 @@
-"""The pictures that `rgbmidic run` leaves beside a result."""
+"""The pictures that `rgbmidic run` leaves beside a result, and `rgbmidic figures` draws later."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rgbmidic.errors import ResultError
 from rgbmidic.report.figures import (
+    MAPS,
     brightness_figure,
     convergence_figure,
-    displacement_figure,
+    map_figure,
     mask_figure,
     reflection_figure,
     residual_figure,
-    save_figure,
     share_figure,
-    uncertainty_figure,
+    shown_frames,
 )
+from rgbmidic.report.style import save_figure
 from rgbmidic.results import Result
+from rgbmidic.results.files import writing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["remove_figures", "write_figures"]
 
-_FRAMES = 5
-_NAMES = re.compile(
-    r"(convergence|residual|brightness|masks|reflections|(displacement|uncertainty|shares)_[0-9]{6,})\.png"
-)
+_FRAMES = 3
+_OF_FRAMES = (*MAPS, "shares", "masks", "reflections")
+_NAMES = re.compile(rf"(convergence|residual|brightness|({'|'.join(_OF_FRAMES)})_[0-9]{{6,}})\.png")
 
 
-def write_figures(result: Result, folder: Path | str, *, frames: int = _FRAMES) -> tuple[Path, ...]:
-    """Write convergence, residual and brightness of a test, masks or reflections, and maps of a few frames.
+def write_figures(result: Result, folder: Path | str, frames: Sequence[int] | None = None) -> tuple[Path, ...]:
+    """Write convergence, residual and brightness of a test, and of some frames maps, masks and reflections.
 
     Parameters
     ----------
@@ -39,7 +44,7 @@ def write_figures(result: Result, folder: Path | str, *, frames: int = _FRAMES) 
     folder
         Where the pictures go; made where it does not exist. Pictures of the same names are replaced.
     frames
-        Number of frames that get maps of displacement and uncertainty: evenly spaced, the last one included.
+        Indices of the frames that get pictures; None: three deformed ones, evenly spaced, the last one included.
 
     Returns
     -------
@@ -48,34 +53,22 @@ def write_figures(result: Result, folder: Path | str, *, frames: int = _FRAMES) 
 
     Raises
     ------
+    InputError
+        There is no such frame.
     ResultError
         The result is damaged or the folder cannot be written.
     """
     folder = Path(folder)
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultError(f"{folder} cannot be made: {error.strerror or error}") from None
-    image = None if result.reference is None else result.reference[0]
-    figures = {
-        "convergence": convergence_figure(result),
-        "residual": residual_figure(result),
-        "brightness": brightness_figure(result),
-    }
-    first = _reference_index(result)
-    weights = result.frame(first).weights_thumbnail
-    if result.reference is not None and weights.size:
-        figures["masks"] = mask_figure(result.reference, weights / 255, result.lights)
-    if result.reference is not None and (reflections := reflection_figure(result, first, result.reference)) is not None:
-        figures["reflections"] = reflections
-    if len(result.lights) > 1:
-        figures[f"shares_{len(result) - 1:06d}"] = share_figure(result, len(result) - 1, image)
-    for index in _spread(len(result), frames):
-        figures[f"displacement_{index:06d}"] = displacement_figure(result, index, image)
-        figures[f"uncertainty_{index:06d}"] = uncertainty_figure(result, index, image)
-    for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.png")
-    return tuple(folder / f"{name}.png" for name in figures)
+    frames = _spread(shown_frames(result)) if frames is None else frames
+    for frame in frames:
+        result.frame(frame)  # what is wrong with one is told before the first picture
+    files = []
+    for name, figure in _figures(result, frames):
+        files.append(folder / f"{name}.png")
+        save_figure(figure, files[-1])
+    return tuple(files)
 
 
 def remove_figures(folder: Path | str) -> None:
@@ -88,18 +81,22 @@ def remove_figures(folder: Path | str) -> None:
     """
     for file in Path(folder).glob("*.png"):
         if _NAMES.fullmatch(file.name):
-            try:
+            with writing(file):
                 file.unlink()
-            except OSError as error:
-                raise ResultError(f"{file} cannot be removed: {error.strerror or error}") from None
 
 
-def _reference_index(result: Result) -> int:
-    reference: list[int] = result.provenance.get("settings", {}).get("frames", {}).get("reference", [0])
-    return reference[0] if reference[0] < len(result) else 0
+def _figures(result: Result, frames: Sequence[int]) -> Iterator[tuple[str, Figure]]:
+    """Name and content of each picture, one after the other: only one is in memory."""
+    yield "convergence", convergence_figure(result)
+    yield "residual", residual_figure(result)
+    yield "brightness", brightness_figure(result)
+    for frame in frames:
+        made: dict[str, Figure | None] = {kind: map_figure(result, frame, kind) for kind in MAPS}
+        made["shares"] = share_figure(result, frame) if len(result.lights) > 1 else None
+        made |= {"masks": mask_figure(result, frame), "reflections": reflection_figure(result, frame)}
+        yield from ((f"{kind}_{frame:06d}", figure) for kind, figure in made.items() if figure is not None)
 
 
-def _spread(total: int, count: int) -> list[int]:
-    """Indices of `count` frames out of `total`, evenly spaced up to the last one, without the first."""
-    first = min(1, total - 1)
-    return sorted({int(index) for index in np.linspace(total - 1, first, max(min(count, total), 1)).round()})
+def _spread(frames: Sequence[int]) -> list[int]:
+    """Some of the frames, evenly spaced up to the last one."""
+    return sorted({frames[int(i)] for i in np.linspace(len(frames) - 1, 0, min(_FRAMES, len(frames))).round()})

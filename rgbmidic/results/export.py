@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,14 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.files import write_complete
+from rgbmidic.results.files import write_complete, writing
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.results.result import Result
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
 
-_CSV_HEAD = ("frame", "name", "status", "node", "node_status", "x", "y")
-_CSV_FIELDS = tuple(q.name for q in QUANTITIES.values() if q.axes == ("node",) and q.name not in _CSV_HEAD)
+_CSV_HEAD = ("frame", "number", "name", "status", "node", "node_status", "x", "y")
 
 
 def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool = False) -> None:
@@ -52,10 +51,13 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     out = Path(out)
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
-    if out.exists() and not (overwrite and out.is_file()):
-        raise ResultError(f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)")
-    if not out.parent.is_dir():
-        raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
+    with writing(out):
+        if out.exists() and not (overwrite and out.is_file()):
+            raise ResultError(
+                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
+            )
+        if not out.parent.is_dir():
+            raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
     write_complete(out, lambda file: _WRITERS[to](result, file))
 
 
@@ -75,16 +77,17 @@ def _arrays(result: Result) -> Iterator[tuple[str, npt.ArrayLike]]:
 def _write_csv(result: Result, file: BinaryIO) -> None:
     text = io.TextIOWrapper(file, encoding="utf-8", newline="")
     writer = csv.writer(text)
-    writer.writerow((*_CSV_HEAD, *_CSV_FIELDS))
+    fields = [name for name, quantity in QUANTITIES.items() if quantity.axes == ("node",) and name not in _CSV_HEAD]
+    writer.writerow((*_CSV_HEAD, *fields))
     for index in range(len(result)):
-        writer.writerows(_csv_rows(result, index))
+        writer.writerows(_csv_rows(result, index, fields))
     text.detach()  # leaves the file open for whoever opened it
 
 
-def _csv_rows(result: Result, index: int) -> Iterator[list[Any]]:
+def _csv_rows(result: Result, index: int, fields: Iterable[str]) -> Iterator[list[Any]]:
     record = result.frame(index)
-    head = [index, result.names[index], record.status]
-    numbers = np.column_stack([result.nodes, *(record.values[name] for name in _CSV_FIELDS)])
+    head = [index, record.number, result.names[index], record.status]
+    numbers = np.column_stack([result.nodes, *(record.values[name] for name in fields)])
     for node, (status, row) in enumerate(zip(record.node_status, numbers.tolist(), strict=True)):
         yield [*head, node, int(status), *("" if number != number else f"{number:.9g}" for number in row)]
 

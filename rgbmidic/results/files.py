@@ -8,7 +8,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,17 +17,11 @@ import numpy as np
 from rgbmidic.errors import ResultError
 from rgbmidic.typing import AnyArray
 
-__all__ = ["read_arrays", "read_json", "write_arrays", "write_complete", "write_json"]
+__all__ = ["read_arrays", "read_json", "write_arrays", "write_complete", "write_json", "writing"]
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write an npz file, not compressed: its size on disk is what it takes in memory.
-
-    Raises
-    ------
-    ResultError
-        It cannot be written.
-    """
+    """Write an npz file, not compressed: its size on disk is what it takes in memory."""
     write_complete(path, lambda file: np.savez(file, **arrays))
 
 
@@ -65,13 +59,7 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON file.
-
-    Raises
-    ------
-    ResultError
-        It cannot be written.
-    """
+    """Write a JSON file."""
     text = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
     write_complete(path, lambda file: file.write(text.encode()))
 
@@ -95,22 +83,23 @@ def read_json(path: Path) -> Any:
 
 
 def write_complete(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file under another name and rename it when all of it is on the disk.
-
-    Raises
-    ------
-    ResultError
-        It cannot be written; nothing is left of it.
-    """
+    """Write a file under another name and rename it when all of it is on the disk; else nothing is left of it."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        with temporary.open("wb") as file:
+        with writing(path), temporary.open("wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
+            temporary.replace(path)
     finally:
         with contextlib.suppress(OSError):  # a read-only disk refuses even to remove what is not there
             temporary.unlink()
+
+
+@contextlib.contextmanager
+def writing(path: Path | str) -> Iterator[None]:
+    """What the disk refuses inside becomes a `ResultError` that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None

@@ -99,10 +99,13 @@ _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
+    Quantity(
+        "number", (), "", "", "number of the frame: a frame that is missing leaves a gap", dtype=np.int64, blank=-1
+    ),
     Quantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
     Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
     Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
-    Quantity("history", ("iteration",), "px", "history", "largest motion of a node in each iteration"),
+    Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
     Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
     Quantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
     Quantity("u", _NODE, "px", "displacement.0", "displacement in x against the reference"),

@@ -54,7 +54,7 @@ class FrameRecord:
 
     @classmethod
     def from_solution(
-        cls, solution: Solution, *, inputs: Mapping[str, str] | None = None, **given: AnyArray | None
+        cls, solution: Solution, *, inputs: Mapping[str, str] | None = None, **given: AnyArray | int | None
     ) -> FrameRecord:
         """The record of a solved frame.
 
@@ -65,16 +65,18 @@ class FrameRecord:
         inputs
             Path and SHA-256 of the files that the frame was read from.
         given
-            The others: `brightness`, `weights_thumbnail`, `reflection_thumbnail`; None where not known.
+            The others: `number`, `brightness`, `weights_thumbnail`, `reflection_thumbnail`; None where not known.
         """
         nodes, lights = np.shape(solution.light_share)
         solved = {name: entry.of(solution) for name, entry in QUANTITIES.items() if entry.source}
         return cls.of(nodes=nodes, lights=lights, inputs=_pairs(inputs), **solved, **given)
 
     @classmethod
-    def failed(cls, reason: str, *, nodes: int, lights: int, inputs: Mapping[str, str] | None = None) -> FrameRecord:
+    def failed(
+        cls, reason: str, *, nodes: int, lights: int, inputs: Mapping[str, str] | None = None, **given: Any
+    ) -> FrameRecord:
         """The record of a frame that could not be measured at all: NaN everywhere, and the reason."""
-        return cls.of(nodes=nodes, lights=lights, reason=reason, inputs=_pairs(inputs))
+        return cls.of(nodes=nodes, lights=lights, reason=reason, inputs=_pairs(inputs), **given)
 
     def __getattr__(self, name: str) -> Any:
         if name in QUANTITIES:

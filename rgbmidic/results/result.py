@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -89,6 +89,16 @@ class Result:
         """The folder."""
         return self.store.path
 
+    @property
+    def deformed(self) -> tuple[int, ...]:
+        """Indices of the frames that are no reference."""
+        references = self.setting("frames", "reference", [0])
+        return tuple(index for index in range(len(self)) if index not in references)
+
+    def setting(self, section: str, key: str, default: Any = None) -> Any:
+        """A setting of the run, as TEST.toml names it; `default` where it was not kept."""
+        return self.provenance.get("settings", {}).get(section, {}).get(key, default)
+
     def frame(self, index: int) -> FrameRecord:
         """Everything that is kept of one frame.
 
@@ -101,9 +111,10 @@ class Result:
             raise InputError(f"there is no frame {index} in a result of {len(self)} frames (0 to {len(self) - 1})")
         return self.store.read_frame(index)
 
-    def each(self, name: str) -> Iterator[Any]:
-        """One quantity, frame after frame: an array, or a plain number or text."""
-        return (self.store.read(index, [name])[name] for index in range(len(self)))
+    def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
+        """One quantity, frame after frame (None: all): an array, or a plain number or text."""
+        chosen = range(len(self)) if frames is None else frames
+        return (self.store.read(index, [name])[name] for index in chosen)
 
     def stack(self, name: str) -> AnyArray:
         """One quantity of all frames, the frames as first axis."""

@@ -15,15 +15,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames import file_hash
-from rgbmidic.results.files import read_arrays, read_json, write_arrays, write_json
+from rgbmidic.results.files import read_arrays, read_json, write_arrays, write_json, writing
+from rgbmidic.results.lock import release_lock, take_lock
 from rgbmidic.results.quantities import QUANTITIES, SHARED
 from rgbmidic.results.record import FrameRecord
 from rgbmidic.settings import TestSettings
@@ -33,8 +34,10 @@ __all__ = ["SCHEMA_VERSION", "ResultStore"]
 
 SCHEMA_NAME = "rgbmidic-result"
 SCHEMA_VERSION = 3
+"""Goes up with every change of the quantities: a result of another version is refused, not guessed at."""
 
 _PROVENANCE, _MESH, _REFERENCE, _FRAMES = "provenance.json", "mesh.npz", "reference.npz", "solution"
+_LOCK = "in_use.json"
 _FRAME_FILE = re.compile(r"frame_[0-9]{6,}\.npz(\.[0-9]+\.part)?")
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
 
@@ -42,6 +45,8 @@ _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tiff
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultStore:
     """A result folder; small, so that it can be sent to other processes.
+
+    ``with ResultStore.create(...) as store`` keeps other runs out of the folder until the end, however it comes.
 
     Attributes
     ----------
@@ -93,18 +98,37 @@ class ResultStore:
         Raises
         ------
         ResultError
-            The folder holds a result (and `overwrite` is False) or foreign files under a result's names, or cannot be
-            written.
+            The folder is in use by another run, holds a result (and `overwrite` is False) or foreign files under a
+            result's names, or cannot be written.
         """
         path = Path(path)
         mesh = {"nodes": SHARED["nodes"].convert(nodes, {}), "elements": SHARED["elements"].convert(elements, {})}
         provenance = _provenance(settings, names, lights, notes or {})
-        _make_room(path, overwrite=overwrite)
-        write_json(path / _PROVENANCE, provenance)
-        write_arrays(path / _MESH, mesh)
-        if reference is not None:
-            write_arrays(path / _REFERENCE, {"reference": _pictures(np.asarray(reference, dtype=np.float32))})
-        return cls(path=path, frame_count=len(names), sizes={"node": len(mesh["nodes"]), "light": len(lights)})
+        sizes = {"node": len(mesh["nodes"]), "light": len(lights)}
+        with writing(path):
+            path.mkdir(parents=True, exist_ok=True)
+        take_lock(path / _LOCK)
+        store = cls(path=path, frame_count=len(names), sizes=sizes)
+        try:
+            _make_room(path, overwrite=overwrite)
+            write_json(path / _PROVENANCE, provenance)
+            write_arrays(path / _MESH, mesh)
+            if reference is not None:
+                write_arrays(path / _REFERENCE, {"reference": _pictures(np.asarray(reference, dtype=np.float32))})
+        except BaseException:
+            store.release()
+            raise
+        return store
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def release(self) -> None:
+        """Let other runs write into the folder."""
+        release_lock(self.path / _LOCK)
 
     def write_frame(self, index: int, record: FrameRecord) -> None:
         """Keep the result of frame `index`; may be called in any order, from any process.
@@ -123,8 +147,9 @@ class ResultStore:
         write_arrays(self._frame_file(index), record.values)
 
     def finish(self) -> None:
-        """Put the date into the provenance; call once, when every frame is written."""
+        """Put the date into the provenance and release the folder; call once, when every frame is written."""
         write_json(self.path / _PROVENANCE, {**read_provenance(self.path), "finished": _now()})
+        self.release()
 
     def written(self) -> int:
         """Number of frames before the first missing one."""
@@ -190,14 +215,12 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
             )
     elif foreign := [name for name in (_MESH, _REFERENCE, _FRAMES) if (path / name).exists()]:
         raise ResultError(f"{path} holds a {foreign[0]} that is not of a result; give another folder")
-    try:
+    with writing(path):
         frames.mkdir(parents=True, exist_ok=True)
         (path / _REFERENCE).unlink(missing_ok=True)
         for file in frames.glob("*"):
             if _FRAME_FILE.fullmatch(file.name):
                 file.unlink()
-    except OSError as error:
-        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
 def _provenance(
@@ -234,10 +257,11 @@ def read_provenance(path: Path) -> dict[str, Any]:
         raise ResultError(f'{file} does not belong to a result: its "schema" is not "{SCHEMA_NAME}"')
     if (version := document.get("schema_version")) != SCHEMA_VERSION:
         raise ResultError(f"{path} has schema version {version!r}; this version of rgbmidic reads {SCHEMA_VERSION}")
-    for key in ("frames", "lights"):
-        names = document.get(key)
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ResultError(f'{file} is damaged: its "{key}" are not a list of names')
+    names = [document.get("frames"), document.get("lights")]
+    sections = document.get("settings", {})
+    named = all(isinstance(entry, list) and all(isinstance(name, str) for name in entry) for entry in names)
+    if not (named and isinstance(sections, dict) and all(isinstance(keys, dict) for keys in sections.values())):
+        raise ResultError(f"{file} is damaged: the names of frames and lights, or the settings, are not as written")
     return document
 
 

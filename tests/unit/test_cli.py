@@ -53,8 +53,8 @@ def test_version_and_help(command: Run) -> None:
     for arguments in ((), ("--help",)):
         status, out, _ = command(*arguments)
         assert status == 0
-        assert all(word in out for word in ("run", "export", "demo", "virtual", "plan"))
-    for name in ("run", "export", "demo", "virtual", "plan"):
+        assert all(word in out for word in ("run", "export", "figures", "demo", "virtual", "plan"))
+    for name in ("run", "export", "figures", "demo", "virtual", "plan"):
         assert command(name, "--help")[0] == 0
 
 
@@ -113,6 +113,7 @@ def test_bad_frames_are_status_2_and_an_interruption_130(
 def test_run_passes_everything_on_and_tells_what_came_out(
     command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
 ) -> None:
+    monkeypatch.setattr("rgbmidic.report.gallery.save_figure", lambda _, path: path.touch())
     calls: list[dict[str, Any]] = []
 
     def measure(settings: Any, out: Path, *, overwrite: bool, progress: Callable[[int, int, str], None]) -> Result:
@@ -124,7 +125,7 @@ def test_run_passes_everything_on_and_tells_what_came_out(
     out = test_file.parent / "out"
     status, printed, _ = command("run", test_file, "--out", out, "--no-figures")
     assert status == 0
-    assert "2, 1 converged" in printed
+    assert "1 deformed: 0 converged, 1 not converged, 0 failed" in printed
     assert str(out) in printed
     assert not (out / "figures").exists()
     assert command("run", test_file, "--out", out, "--overwrite")[0] == 0
@@ -133,20 +134,64 @@ def test_run_passes_everything_on_and_tells_what_came_out(
     assert {call["path"] for call in calls} == {("f*.tif",)}
 
 
-def test_run_in_which_every_frame_failed_is_a_failure(
-    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
-) -> None:
+def _measure_of(*ends: str) -> Callable[..., Result]:
+    """Instead of the pipeline: f0 is the reference and measured, the others failed for these reasons, "" if not."""
+
     def measure(_: Any, out: Path, **__: Any) -> Result:
+        names = [f"f{index}" for index in range(1 + len(ends))]
         store = ResultStore.create(
-            out, nodes=np.zeros((3, 2)), elements=[[0, 1, 2]], names=["f1"], lights=["light"], overwrite=False
+            out, nodes=np.zeros((4, 2)), elements=[[0, 1, 2]], names=names, lights=["light"], overwrite=True
         )
-        store.write_frame(0, FrameRecord.failed("f1.tif is damaged", nodes=3, lights=1))
+        good = FrameRecord.of(nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_share=np.ones((4, 1)))
+        for index, reason in enumerate(("", *ends)):
+            store.write_frame(index, FrameRecord.failed(reason, nodes=4, lights=1) if reason else good)
+        store.finish()
         return Result.open(out)
 
-    _replace_pipeline(monkeypatch, measure)
-    status, _, error = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
-    assert status == 1
-    assert "f1.tif is damaged" in error
+    return measure
+
+
+def test_run_in_which_no_deformed_frame_is_measured_is_a_failure(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    """The reference matched with itself always converges: it counts for nothing."""
+    for ends, told in ((("dark", "torn"), "f1: dark"), (("torn",), "f1: torn"), ((), "there is none")):
+        _replace_pipeline(monkeypatch, _measure_of(*ends))
+        status, printed, error = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
+        assert status == 1
+        assert error.startswith("error: no deformed frame is measured")
+        assert told in error
+        assert f"{len(ends)} deformed: 0 converged, {len(ends)} failed" in printed
+        assert "75" not in printed
+
+
+def test_run_tells_how_many_deformed_frames_failed(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    _replace_pipeline(monkeypatch, _measure_of("", "torn", ""))
+    status, printed, _ = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
+    assert status == 0
+    assert "3 deformed: 2 converged, 1 failed" in printed
+    assert "50.0% measured" in printed  # 3 of 4 nodes in two frames, none in one; the reference does not count
+
+
+def test_figures_later(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rgbmidic.report.gallery.save_figure", lambda _, path: path.touch())
+    result = make_result(tmp_path / "result", frames=4)
+    status, printed, _ = command("figures", result.path, "--frames", "0,2")
+    assert status == 0
+    drawn = {file.name for file in (result.path / "figures").iterdir()}
+    assert {"convergence.png", "strain_000000.png", "misfit_000002.png"} <= drawn
+    assert not {"strain_000001.png", "strain_000003.png"} & drawn
+    assert set(printed.split()) == {str(result.path / "figures" / name) for name in drawn}
+    (result.path / "solution" / "frame_000002.npz").unlink()
+    assert command("figures", result.path, "--out", tmp_path / "few")[0] == 2
+    assert command("figures", result.path, "--out", tmp_path / "few", "--partial")[0] == 0
+    assert (tmp_path / "few" / "strain_000001.png").is_file()
+    for frames, word in (("0,x", "whole numbers"), ("9", "no frame 9")):
+        status, _, error = command("figures", result.path, "--out", tmp_path / "none", "--frames", frames, "--partial")
+        assert status == 2
+        assert word in error
 
 
 def test_export(command: Run, tmp_path: Path) -> None:
@@ -185,7 +230,7 @@ def test_from_frames_to_export(command: Run, test_file: Path) -> None:
     out = test_file.parent / "out"
     status, printed, error = command("run", test_file, "--out", out, "--no-figures")
     assert status == 0, error
-    assert "3, 3 converged" in printed
+    assert "2 deformed: 2 converged, 0 failed" in printed
     assert command("export", out, "--to", "npz", "--out", out / "fields.npz")[0] == 0
     with np.load(out / "fields.npz") as archive:
         np.testing.assert_allclose(archive["u"].mean(axis=1), [0, 1, 2], atol=0.02)

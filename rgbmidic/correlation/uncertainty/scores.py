@@ -23,7 +23,9 @@ _EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken."""
 _SCORE_RANGE = 30.0
 """Standard deviation (px) of the window over which block sums are averaged."""
-_PRIOR = 0.5 * BLOCK**2
+_LEAST_FREEDOM = 0.25
+"""Least number of blocks, less one, that is taken: in a region of one block the uncertainty is hardly known."""
+_PRIOR = 0.1 * BLOCK**2
 """Pixels for which the region's typical score counts in that window: beside a hole few blocks speak."""
 
 
@@ -73,7 +75,17 @@ def _score_ratios(
         (_blur(product, _SCORE_RANGE / BLOCK) + _PRIOR * expected) / (around + _PRIOR)
         for product, expected in ((x * x, typical), (x * y, 0.0), (y * y, typical))
     ]
-    return np.stack(ratios), level
+    return np.stack(ratios) * _few_blocks(around, count), level
+
+
+def _few_blocks(around: FloatArray, count: FloatArray) -> FloatArray:
+    """Factor on a variance that few blocks tell, so that an error over its stated uncertainty has the variance 1.
+
+    An estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large.
+    """
+    window = 4 * np.pi * (_SCORE_RANGE / BLOCK) ** 2
+    number = np.minimum(window * around, count.sum()) / BLOCK**2
+    return np.asarray(number / np.maximum(number - 1, _LEAST_FREEDOM))
 
 
 def _typical_square(x: FloatArray, y: FloatArray, count: FloatArray) -> float:

@@ -28,7 +28,7 @@ from rgbmidic.lab.inspection.results import BLIND, ChannelFacts, Inspection, Lig
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import read_region
-from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, SolverSettings, TestSettings
+from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["inspect_files", "inspect_frame", "state_frames"]
@@ -82,6 +82,7 @@ def inspect_files(
     paths = [Path(file) for file in files]
     frames = tuple(open_source(path, stated, known).read(0) for path in paths)
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
+    known = known and known.cropped(stated.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
     if place is None and test is not None:
         place = read_region(test.region, shape)
@@ -92,7 +93,7 @@ def inspect_files(
             region=place,
             element_size=element_size or (test.element_size if test else ELEMENT_SIZE),
             demosaic=test.illumination.demosaic if test else "auto",
-            prefilter=(test.solver if test else SolverSettings()).prefilter,
+            prefilter=test.solver.prefilter if test else "binomial",
             name=" + ".join(path.name for path in paths),
             progress=progress,
         )

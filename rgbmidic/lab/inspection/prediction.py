@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import Assembly, factorise
+from rgbmidic.correlation.equations import SEEN
 from rgbmidic.correlation.images import PREFILTERS, apply_prefilter
 from rgbmidic.correlation.node_status import LOST
 from rgbmidic.correlation.uncertainty.propagation import NodeColouring, displacement_functionals, functional_std
@@ -28,9 +29,6 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 __all__ = ["Prediction", "expected_std", "predict"]
 
 
-SEEN = 0.05
-"""Share of the median information under which a node is not measured: that of the solver
-(`rgbmidic.correlation.equations`)."""
 _GRID, _REACH = 64, 16
 """Frequencies on which the kernel is computed, and the distance (px) to which it is kept: speckle's gradients are
 correlated over a speckle or two."""

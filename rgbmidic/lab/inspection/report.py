@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.lab.output import check_folder, write_document
-from rgbmidic.report.figures import _STYLE, _finish_picture, _limits, save_figure
+from rgbmidic.report.style import STYLE, colour_range, finish_picture, save_figure
 from rgbmidic.typing import AnyArray, BoolArray
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def inspection_figure(inspection: Inspection) -> Figure:
     columns, rows = (2, 2) if inspection.reflection_index is None else (max(lights, 3), 3)
     height, width = inspection.region.shape
     panel = 7.4 / columns
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.6, min(rows * (panel * height / width + 0.45) + 0.6, 11.5)))
         figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.06)
         grid = figure.add_gridspec(rows, columns + 1, width_ratios=[*[1.0] * columns, 0.05])
@@ -219,7 +219,7 @@ def _draw_std(figure: Figure, axis: Axes, bar: Axes, inspection: Inspection) -> 
         return
     blank = ~known[inspection.elements].all(axis=1)
     grid = Triangulation(inspection.nodes[:, 0], inspection.nodes[:, 1], triangles=inspection.elements, mask=blank)
-    low, high = _limits(std[known])
+    low, high = colour_range(std[known])
     picture = axis.tripcolor(grid, np.nan_to_num(std), shading="gouraud", cmap="viridis", vmin=low, vmax=high)
     extend = "max" if std[known].max() > high else "neither"
     figure.colorbar(picture, cax=bar, label="px (one sigma)", extend=extend)
@@ -281,4 +281,4 @@ def _frame_axis(axis: Axes, inspection: Inspection, *, first: bool) -> None:
     if not inspection.region.all():
         places = np.arange(left + 0.5, right), np.arange(top + 0.5, bottom)
         axis.contour(*places, inspection.region, [0.5], colors=["#f2c037"], linewidths=0.8)
-    _finish_picture(axis, (left, right), (top, bottom), first=first)
+    finish_picture(axis, (left, right), (top, bottom), first=first)

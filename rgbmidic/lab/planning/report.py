@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.lab.output import check_folder, write_document
 from rgbmidic.lab.planning.lamps import Proposal
 from rgbmidic.lab.planning.plan import Outlook, Plan
-from rgbmidic.report.figures import _LIGHT_COLOURS, _STYLE, save_figure
+from rgbmidic.report.style import LIGHT_COLOURS, STYLE, save_figure
 from rgbmidic.scene.light import Light
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS, Zones
@@ -202,7 +202,7 @@ def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
     levels = levels[np.isfinite(levels)]
     top = float(np.quantile(levels, 0.98)) if levels.size else 1.0
     height, width = plan.scene.camera.shape
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(2.9 * len(panels) + 0.6, 2 * 2.7 * height / width + 0.9), layout="compressed")
         axes = figure.subplots(2, len(panels), squeeze=False, sharex=True, sharey=True)
         for column, (title, (one, outlook)) in enumerate(panels.items()):
@@ -220,7 +220,7 @@ def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
 
 
 def _colours(scene: Scene) -> list[str]:
-    return [_LIGHT_COLOURS.get(light.name, f"C{index}") for index, light in enumerate(scene.lights)]
+    return [LIGHT_COLOURS.get(light.name, f"C{index}") for index, light in enumerate(scene.lights)]
 
 
 def _extent(plan: Plan) -> tuple[float, float, float, float]:

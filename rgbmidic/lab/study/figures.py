@@ -14,7 +14,7 @@ from rgbmidic.lab.study.competitors import METHODS
 from rgbmidic.lab.study.goniometry import Goniometry
 from rgbmidic.lab.study.paper import BLUR, SceneStudy
 from rgbmidic.lab.study.plate import Topography
-from rgbmidic.report.figures import _STYLE, _finish_plot, _shade
+from rgbmidic.report.style import STYLE, finish_plot, shade
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def _styled(draw: Callable[Parameters, Figure]) -> Callable[Parameters, Figure]:
     def styled(*arguments: Parameters.args, **settings: Parameters.kwargs) -> Figure:
         import matplotlib as mpl
 
-        with mpl.rc_context(_STYLE):
+        with mpl.rc_context(STYLE):
             return draw(*arguments, **settings)
 
     return styled
@@ -68,7 +68,7 @@ def images_figure(scene: SceneStudy) -> Figure:
         axes[1][column].plot(100 * _smooth(image)[row], color="k", linewidth=1)
         axes[1][column].set_ylim(0, 100)
         axes[1][column].set_xlim(0, image.shape[1] - 1)
-        _finish_plot(axes[1][column], "x (px)", "% of the range" if column == 0 else "")
+        finish_plot(axes[1][column], "x (px)", "% of the range" if column == 0 else "")
     return figure
 
 
@@ -110,7 +110,7 @@ def mean_figure(scene: SceneStudy) -> Figure:
             scene.bench.areas, _AREA_COLOURS, scene.means("dic")[:, component].T, strict=True
         ):
             axis.plot(scene.angles, series, marker="o", markersize=3, linewidth=1, color=colour, label=area.name)
-        _finish_plot(axis, "angle (°)", f"mean {name} (px)")
+        finish_plot(axis, "angle (°)", f"mean {name} (px)")
     axes[0][0].legend(fontsize=7)
     return figure
 
@@ -125,7 +125,7 @@ def perturbation_figure(scene: SceneStudy) -> Figure:
             axis.semilogy(scene.angles, series, marker="o", markersize=3, linewidth=1, color=colour, label=area.name)
         axis.set_title(f"{METHODS[method].title} ({paper})")
         bottom = axis in axes[1]
-        _finish_plot(axis, "angle (°)" if bottom else "", "P (px)" if axis in axes[:, 0] else "")
+        finish_plot(axis, "angle (°)" if bottom else "", "P (px)" if axis in axes[:, 0] else "")
     axes.flat[0].legend(fontsize=7)
     return figure
 
@@ -151,7 +151,7 @@ def goniometry_figure(turning: Goniometry) -> Figure:
     axis.axvspan(*turning.band, color="0.9", zorder=0, label="erratic band")
     axis.invert_xaxis()
     axis.legend(fontsize=7)
-    _finish_plot(axis, "angle of the light (°)", "grey level (% of the largest)")
+    finish_plot(axis, "angle of the light (°)", "grey level (% of the largest)")
     return figure
 
 
@@ -207,7 +207,7 @@ def threshold_figure(scene: SceneStudy) -> Figure:
     axis.axhline(1500 * zone.unaffected, color="0.5", linewidth=0.8, linestyle="--")
     axis.axvline(zone.radius, color="#c8102e", linewidth=1)
     axis.set_title(f"P (1e-3 px), {scene.chosen:g}°: {zone.radius:.0f} px", fontsize=8)
-    _finish_plot(axis, "distance (px)", "")
+    finish_plot(axis, "distance (px)", "")
     return figure
 
 
@@ -225,7 +225,7 @@ def masks_figure(scene: SceneStudy) -> Figure:
                 vmin=0,
                 vmax=max(0.3, float(np.nanmax(_smooth(scene.reference[column])))),
             )
-            _shade(axis, 1 - shot.weights[column], shot.weights[column].shape)
+            shade(axis, 1 - shot.weights[column])
             _mark_areas(axis, scene)
             axis.set_title(f"{name}, {angle:g}°", fontsize=8)
             axis.set_axis_off()

@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
 from rgbmidic.lab.study import figures as figures
 from rgbmidic.lab.study.causes import RADIUS, Cause
 from rgbmidic.lab.study.claims import Claim, judge
 from rgbmidic.lab.study.competitors import METHODS
 from rgbmidic.lab.study.paper import PaperStudy, SceneStudy
-from rgbmidic.report.figures import save_figure
-from rgbmidic.report.page import Page
+from rgbmidic.report import Page, save_figure
 
 __all__ = ["check_folder", "write_study"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic import __version__
+from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.writers import write_dng, write_tiff

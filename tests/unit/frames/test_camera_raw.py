@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rawpy
+import tifffile
 from frames import colour_mosaic, noisy_mosaic, write_cropped_dng, write_monochrome_dng
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -104,6 +107,68 @@ def test_truncated_real_raws_are_refused(tmp_path: Path, shared_data: Path, kept
         cut.write_bytes(content[:length] + bytes(len(content) - length if zeros else 0))
         with pytest.raises(FrameError, match="damaged"):
             read_frame(cut)
+
+
+def test_an_active_area_beyond_the_samples_is_told(tmp_path: Path) -> None:
+    write_cropped_dng(tmp_path / "f.dng", colour_mosaic((39, 41), "RGGB"), top=2, left=3, cfa="RGGB", black=60)
+    with tifffile.TiffFile(tmp_path / "f.dng", mode="r+") as tiff:
+        tiff.pages.first.tags[50829].overwrite((2, 30, 41, 75))
+    with pytest.raises(FrameError, match=r"visible part \(39 x 45\) reaches beyond its samples"):
+        read_frame(tmp_path / "f.dng")
+
+
+@pytest.mark.parametrize("header", [b"II\x1a\0", b"IIRO", b"IIRS", b"IIU\0"], ids=str)
+def test_raws_that_begin_like_tiff_but_are_none_are_left_to_libraw(tmp_path: Path, dng: Path, header: bytes) -> None:
+    """Headers of Canon CRW, Olympus and Panasonic; LibRaw follows the directory of a DNG behind any of them."""
+    path = tmp_path / "f.raw"
+    path.write_bytes(header + dng.read_bytes()[4:])
+    np.testing.assert_array_equal(read_frame(path).values, read_frame(dng).values)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(FrameError, match="damaged"):
+        read_frame(path)
+
+
+def test_a_canon_crw_is_what_libraw_makes_of_it(tmp_path: Path, dng: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "CRW_0001.CRW"
+    path.write_bytes(b"II\x1a\0\0\0HEAPCCDR\2\0\1\0" + bytes(1000))
+    with pytest.raises(FrameError, match=r"CRW_0001\.CRW"):
+        read_frame(path)
+    opened, imread = [], rawpy.imread
+    monkeypatch.setattr(rawpy, "imread", lambda name: opened.append(name) or imread(str(dng)))
+    np.testing.assert_array_equal(read_frame(path).values, read_frame(dng).values)
+    assert opened[0] == str(path)
+
+
+def test_a_skeleton_that_only_libraw_can_follow_is_left_to_it(
+    dng: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise ValueError("unknown kind of tag")
+
+    whole = read_frame(dng)
+    monkeypatch.setattr(tifffile, "TiffFile", fails)
+    np.testing.assert_array_equal(read_frame(dng).values, whole.values)
+
+
+def test_what_libraw_prints_comes_as_one_warning(
+    dng: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    imread = rawpy.imread
+
+    def talks(name: str) -> rawpy.RawPy:
+        os.write(2, f"{name}: data corrupted at 1378\nprogress of another thread\n".encode())
+        return imread(name)
+
+    monkeypatch.setattr(rawpy, "imread", talks)
+    read_frame(dng)
+    assert [record.getMessage() for record in caplog.records] == [f"LibRaw says: {dng}: data corrupted at 1378"]
+    assert capfd.readouterr().err == "progress of another thread\n"
+
+
+def test_a_real_truncated_raw_is_told_in_one_line(shared_data: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(FrameError, match="damaged"):
+        read_frame(shared_data / "raw_must_reject" / "exiftool_Nikon_truncated.nef")
+    assert capfd.readouterr().err == ""
 
 
 def test_zeros_below_a_positive_black_level_are_no_frame_but_a_computed_dark_frame_is(tmp_path: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+import tracemalloc
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -273,3 +276,93 @@ def test_a_source_is_opened_before_its_file_exists_and_has_one_frame(tmp_path: P
 def test_levels_that_contradict_each_other_are_no_fault_of_the_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^white_level must be above black_level 64"):
         read_frame(tmp_path / "f.tif", black_level=64, white_level=10)
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("f.cine", "export its frames as DNG or 16-bit TIFF, without demosaicing"),
+        ("f.MRAW", "export its frames"),
+        ("f.avi", "compressed or demosaiced: export them from the camera's own file"),
+        ("f.jpg", "no raw frame: let the camera record DNG"),
+        ("f.RAW", "header: state its shape and dtype .*frames.shape and frames.dtype, or --shape and --dtype"),
+    ],
+)
+def test_a_file_that_is_not_read_says_what_to_do(tmp_path: Path, name: str, advice: str) -> None:
+    (tmp_path / name).write_bytes(bytes(100))
+    with pytest.raises(FrameError, match=advice):
+        read_frame(tmp_path / name)
+
+
+def _one_strip(path: Path, shape: tuple[int, int], data: bytes, compression: int) -> Path:
+    """A TIFF of 8 bit whose header may say anything."""
+    tags = {256: shape[1], 257: shape[0], 258: 8, 259: compression, 262: 1, 273: 8, 277: 1, 278: shape[0]}
+    entries = b"".join(struct.pack("<HHII", code, 4, 1, value) for code, value in {**tags, 279: len(data)}.items())
+    path.write_bytes(struct.pack("<4sI", b"II*\0", 8 + len(data)) + data + struct.pack("<H", 9) + entries + bytes(4))
+    return path
+
+
+def _png_of_zeros(path: Path, side: int) -> Path:
+    packer, lines = zlib.compressobj(9), bytes(side + 1)
+    data = b"".join(packer.compress(lines) for _ in range(side)) + packer.flush()
+    head = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
+    parts = ((b"IHDR", head), (b"IDAT", data), (b"IEND", b""))
+    packed = (
+        struct.pack(">I", len(part)) + name + part + struct.pack(">I", zlib.crc32(name + part)) for name, part in parts
+    )
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(packed))
+    return path
+
+
+def test_a_small_file_never_unpacks_to_a_huge_frame(tmp_path: Path) -> None:
+    side, small = 12_000, 3_000
+    packer = zlib.compressobj(9)
+    zeros = b"".join(packer.compress(bytes(10**6)) for _ in range(side**2 // 10**6)) + packer.flush()
+    bombs = {
+        "no frame of a camera": _one_strip(tmp_path / "deflate.tif", (side, side), zeros, 8),
+        "unpacks to more than": _one_strip(tmp_path / "strip.tif", (small, small), zeros, 8),
+        r"allowed are 2147 MB": _one_strip(tmp_path / "header.tif", (60_000, 60_000), zeros, 8),
+        "0.14 MB: no frame": _png_of_zeros(tmp_path / "zeros.png", side),
+    }
+    for reason, path in bombs.items():
+        tracemalloc.start()
+        with pytest.raises(FrameError, match=reason):
+            read_frame(path, kind="monochrome")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 100e6, f"{path.name} took {peak / 1e6:.0f} MB"
+
+
+@pytest.mark.parametrize("strips", [1, 4])
+def test_data_for_fewer_rows_than_the_header_says_are_no_frame(tmp_path: Path, strips: int) -> None:
+    rows = -(-31 // strips)
+    tifffile.imwrite(tmp_path / "f.tif", GREY, compression="zlib", rowsperstrip=rows)
+    with tifffile.TiffFile(tmp_path / "f.tif", mode="r+") as tiff:
+        tiff.pages.first.tags[257].overwrite(31 + rows)
+    with pytest.raises(FrameError, match="too few for its size"):
+        read_frame(tmp_path / "f.tif", kind="monochrome")
+
+
+def test_an_empty_frame_of_usual_size_is_read(tmp_path: Path) -> None:
+    values = np.zeros((4000, 4000), dtype=np.uint16)
+    tifffile.imwrite(tmp_path / "f.tif", values, compression="zlib")
+    assert not read_frame(tmp_path / "f.tif", kind="monochrome").values.any()
+
+
+def test_packbits_is_read_whole_or_refused(tmp_path: Path) -> None:
+    runs = b"".join(bytes([257 - 45, level]) for level in range(31))
+    values = read_frame(_one_strip(tmp_path / "f.tif", (31, 45), runs, 32773), kind="monochrome").values[0]
+    np.testing.assert_array_equal(values, np.repeat(np.arange(31)[:, None], 45, axis=1))
+    with pytest.raises(FrameError, match=r"damaged.*PackBits"):
+        read_frame(_one_strip(tmp_path / "f.tif", (31, 45), runs[:-8], 32773), kind="monochrome")
+
+
+def test_what_opencv_would_turn_round_is_refused(tmp_path: Path) -> None:
+    """OpenCV inverts compressed min-is-white samples of 8 bit, and those of 16 bit not."""
+    path = _png(tmp_path / "f.tif", (GREY % 256).astype(np.uint8))
+    with tifffile.TiffFile(path, mode="r+") as tiff:
+        tiff.pages.first.tags[262].overwrite(0)
+    with pytest.raises(FrameError, match=r"not read \(LZW\); save it as a plain uncompressed TIFF"):
+        read_frame(path, kind="monochrome")
+    with pytest.raises(FrameError, match=r"not read \(.*\); save it as"):
+        read_frame(_one_strip(path, (31, 45), bytes(100), 50000), kind="monochrome")

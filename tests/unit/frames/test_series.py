@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -82,6 +83,77 @@ def test_a_series_gives_frames_names_and_fingerprints(tmp_path: Path) -> None:
     for index in (-1, 2):
         with pytest.raises(IndexError):
             series.read(index)
+
+
+def _series(folder: Path, names: Sequence[str], **options: Any) -> FrameSeries:
+    _write(folder, list(names))
+    return open_series(FrameSettings(path=(str(folder),), cfa="RGGB"), **options)
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers", "missing"),
+    [
+        (["f0", "f1", "f2", "f4"], [0, 1, 2, 4], "3"),
+        (["f_098", "f_099", "f_100", "f_103"], [0, 1, 2, 5], "101, 102"),
+        (["f0", "f10", "f20", "f40"], [0, 1, 2, 4], "30"),
+        (["a3_2", "a3_3", "a3_5"], [0, 1, 3], "4"),
+        (["f0", "f1", "f1000000000000"], [0, 1, 10**12], ""),
+        (["f1", "f2", "f3"], [0, 1, 2], ""),
+        (["load_0", "load_10", "load_20"], [0, 1, 2], ""),
+        (["cfrp_00", "cfrp_04", "cfrp_11"], [0, 4, 11], ""),
+        (["def_1", "def_5", "ref"], [0, 1, 2], ""),
+        (["f1_t100", "f2_t250", "f3_t900"], [0, 1, 2], ""),
+        (["f1", "f01", "f4"], [0, 1, 2], ""),
+        (["frame"], [0], ""),
+    ],
+)
+def test_a_number_missing_in_the_names_is_told_and_kept_as_a_gap(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, names: list[str], numbers: list[int], missing: str
+) -> None:
+    series = _series(tmp_path, [f"{name}.tif" for name in names])
+    assert list(series.numbers) == numbers
+    told = [record.getMessage() for record in caplog.records]
+    assert [message.split("in the numbering, ")[1].split(";")[0] for message in told] == ([missing] if missing else [])
+
+
+def test_captures_in_no_order_have_no_gaps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    series = _series(tmp_path, ["f0.tif", "f1.tif", "f3.tif"], in_order=False)
+    assert list(series.numbers) == [0, 1, 2]
+    assert not caplog.records
+
+
+def test_lights_that_lack_different_frames_are_refused(tmp_path: Path) -> None:
+    _write(tmp_path / "left", ["1.tif", "2.tif", "4.tif"])
+    _write(tmp_path / "right", ["1.tif", "3.tif", "4.tif"])
+    with pytest.raises(FrameError, match=r"same frames.*left: 0, 1, 3; right: 0, 2, 3"):
+        open_series(FrameSettings(path=("left", "right"), kind="monochrome"), tmp_path)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_brackets_in_the_name_of_a_folder_are_no_pattern(tmp_path: Path, absolute: bool) -> None:
+    _write(tmp_path / "run[1]" / "cam*", ["a1.tif", "a2.tif"])
+    _write(tmp_path / "run1" / "cam", ["other.tif"])
+    start = str(tmp_path) + "/" if absolute else ""
+    for pattern in ("run[1]/cam*/*.tif", "run[1]/cam*/a[12].tif", "run[1]/**/*.tif", "run[1]/cam*"):
+        found = list_frames(start + pattern, "elsewhere" if absolute else tmp_path)
+        assert found == (tmp_path / "run[1]/cam*/a1.tif", tmp_path / "run[1]/cam*/a2.tif")
+
+
+@pytest.mark.parametrize("pattern", ["*.tif", "."])
+def test_a_link_to_nothing_keeps_its_place_and_is_told(tmp_path: Path, pattern: str) -> None:
+    _write(tmp_path, ["f1.tif", "f3.tif"])
+    (tmp_path / "f2.tif").symlink_to(tmp_path / "gone.tif")
+    series = open_series(FrameSettings(path=(pattern,), cfa="RGGB"), tmp_path)
+    assert [series.name(index) for index in range(3)] == ["f1.tif", "f2.tif", "f3.tif"]
+    with pytest.raises(FrameError, match=r"f2\.tif is a link to .*gone\.tif, which does not exist"):
+        series.read(1)
+
+
+def test_a_folder_without_frames_says_what_to_do_with_what_it_holds(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "test.cine").touch()
+    with pytest.raises(FrameError, match=r"without frames.*test\.cine is a camera's movie: export .*16-bit TIFF"):
+        list_frames(tmp_path)
 
 
 def test_lights_in_succession_come_together(tmp_path: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import re
+
 import naive_mesh
 import numpy as np
 import pytest
@@ -34,6 +37,22 @@ REGIONS = {
     "mask with a hole": disc_with_hole(),
     "two islands": two_islands(),
 }
+
+
+@pytest.mark.parametrize(
+    ("rectangle", "size", "message"),
+    [
+        ((3, 5, 110, 90), 25.0, ""),
+        ((3, 5, 27, 90), 25.0, ""),
+        ((3, 5, 20, 90), 25.0, "the elements of 25 px are larger than the region, which is 1[78] px across"),
+        ((3, 5, 10, 90), 8.0, "the region is [78] px across: two or three speckles"),
+    ],
+)
+def test_a_region_too_small_to_trust_is_told_in_one_line(caplog, rectangle, size, message):
+    with caplog.at_level(logging.WARNING, logger="rgbmidic.mesh"):
+        Tri3Mesh.from_region(Region.from_rectangle(rectangle, SHAPE), size)
+    assert len(caplog.messages) == bool(message)
+    assert re.search(message, caplog.text)
 
 
 @pytest.mark.parametrize("size", [6.5, 13, 25])
@@ -216,4 +235,4 @@ def test_too_small_regions_and_elements_are_refused():
     line = np.zeros(SHAPE, dtype=bool)
     line[20, 10:60] = True
     with pytest.raises(RegionError, match="too small"):
-        Tri3Mesh.from_region(Region.from_mask(line))
+        Tri3Mesh.from_region(Region.from_mask(line), 25)

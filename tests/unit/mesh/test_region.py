@@ -32,7 +32,25 @@ def test_a_rectangle_beyond_the_image_is_clipped_with_a_warning(caplog):
     with caplog.at_level(logging.WARNING):
         region = Region.from_rectangle((-5, 10, 30, 100), SHAPE)
     assert region.rectangle == (0, 10, 30, 40)
-    assert "clipped" in caplog.text
+    assert "the rectangle [[-5.0, 10.0], [30.0, 100.0]] reaches outside the image of 60 x 41 px" in caplog.text
+
+
+def test_a_polygon_beyond_the_image_is_told(caplog):
+    with caplog.at_level(logging.WARNING):
+        Region.from_polygon([(0, 0), (59.4, 0), (59, 40.5)], SHAPE)
+        assert not caplog.records
+        Region.from_polygon([(10, 10), (90, 10), (30, 30)], SHAPE)
+    assert "polygon" in caplog.text
+    assert "reaches outside the image of 60 x 41 px" in caplog.text
+
+
+@pytest.mark.parametrize(("rectangle", "width"), [((10, 5, 30, 20), 16), ((3, 3, 11, 38), 9), ((0, 0, 59, 40), 41)])
+def test_the_width_of_a_region_is_that_of_the_largest_disc_in_it(rectangle, width):
+    assert Region.from_rectangle(rectangle, SHAPE).width == pytest.approx(width, abs=1)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    assert Region.from_mask(np.hypot(x - 20, y - 20) < 12).width == pytest.approx(23, abs=1)
+    strip = Region.from_mask(abs(x - y) < 5)
+    assert strip.width == pytest.approx(9 / np.sqrt(2), abs=1.5)
 
 
 @pytest.mark.parametrize(

@@ -5,60 +5,71 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from results import LIGHTS, MESH, NODES, make_result
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.report import figures
-from rgbmidic.report.gallery import remove_figures, write_figures
+from rgbmidic.report import figures, gallery, remove_figures, save_figure, style, write_figures
 from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.typing import AnyArray
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
+X, Y = MESH.nodes.T
+EVERY_FRAME = {"displacement", "uncertainty", "strain", "misfit", "shares"}
 
 
-def _linear_result(path: Path, *, blank: bool = False) -> Result:
-    """One frame with u = x / 10 and v = 1 - y / 20; some nodes blank where asked for."""
-    x, y = MESH.nodes.T
-    hidden = (x > 60) & blank
-    store = ResultStore.create(path, nodes=MESH.nodes, elements=MESH.elements, names=["only"], lights=LIGHTS)
-    record = FrameRecord.of(
-        nodes=NODES,
-        lights=len(LIGHTS),
-        u=np.where(hidden, np.nan, x / 10),
-        v=np.where(hidden, np.nan, 1 - y / 20),
-        status=0,
-        node_status=hidden,
-        residual=np.ones(3),
-        history=np.array([1.0, 0.01, 0.0001]),
+def _one_frame(path: Path, reference: AnyArray | None = None, **values: Any) -> Result:
+    """A result of one frame with the quantities given."""
+    store = ResultStore.create(
+        path, nodes=MESH.nodes, elements=MESH.elements, names=["only"], lights=LIGHTS, reference=reference
     )
-    store.write_frame(0, record)
+    store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values))
     return Result.open(path)
 
 
-@pytest.mark.parametrize("image", [None, IMAGE])
-def test_map_has_the_right_value_at_every_place(tmp_path: Path, image: np.ndarray | None) -> None:
-    result = _linear_result(tmp_path / "out")
-    figure = figures.displacement_figure(result, 0, image)
+def _places(picture: Any) -> tuple[AnyArray, AnyArray]:
+    """x and y of the columns and rows of a map."""
+    rows, columns = picture.get_array().shape
+    left, right, bottom, top = picture.get_extent()
+    x = left + (np.arange(columns) + 0.5) * (right - left) / columns
+    return x, top + (np.arange(rows) + 0.5) * (bottom - top) / rows
+
+
+@pytest.mark.parametrize("reference", [None, np.stack([IMAGE] * 3)])
+def test_map_has_the_right_value_at_every_place(tmp_path: Path, reference: AnyArray | None) -> None:
+    result = _one_frame(tmp_path / "out", reference, u=X / 10, v=1 - Y / 20)
+    figure = figures.map_figure(result, 0, "displacement")
     for axis, field in zip(figure.axes[:2], (lambda x, y: x / 10, lambda x, y: 1 - y / 20), strict=True):
         picture = axis.images[-1]
-        values = picture.get_array()
-        left, right, bottom, top = picture.get_extent()
-        x = left + (np.arange(values.shape[1]) + 0.5) * (right - left) / values.shape[1]
-        y = top + (np.arange(values.shape[0]) + 0.5) * (bottom - top) / values.shape[0]
-        np.testing.assert_allclose(values, field(*np.meshgrid(x, y)), atol=1e-9)
+        np.testing.assert_allclose(picture.get_array(), field(*np.meshgrid(*_places(picture))), atol=1e-9)
         assert axis.get_ylim()[0] > axis.get_ylim()[1], "y points down"
         assert axis.get_aspect() == 1
         assert "px" in axis.get_title()
 
 
+@pytest.mark.parametrize("kind", figures.MAPS)
+def test_every_map_shows_its_quantities_around_the_mesh(tmp_path: Path, kind: str) -> None:
+    names = figures.MAPS[kind]
+    values = {name: np.linspace(1, 2, NODES) + index for index, name in enumerate(names)}
+    wide = np.ones((3, 500, 700))
+    figure = figures.map_figure(_one_frame(tmp_path / "out", wide, **values), 0, kind)
+    for axis, name in zip(figure.axes, names, strict=False):
+        assert axis.get_title().split(" ")[0] == name
+        picture = axis.images[-1].get_array()
+        assert values[name].min() <= picture.min() < picture.max() <= values[name].max()
+        (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
+        assert left < 10 < 110 < right < 150
+        assert top < 5 < 75 < bottom < 100
+
+
 def test_blank_where_not_measured(tmp_path: Path) -> None:
-    figure = figures.displacement_figure(_linear_result(tmp_path / "out", blank=True), 0)
-    picture = figure.axes[0].images[-1]
-    hidden = np.ma.getmaskarray(picture.get_array())
-    left, right = picture.get_extent()[:2]
-    x = left + (np.arange(hidden.shape[1]) + 0.5) * (right - left) / hidden.shape[1]
+    result = _one_frame(tmp_path / "out", u=np.where(X > 60, np.nan, X), v=X)
+    picture = figures.map_figure(result, 0, "displacement").axes[0].images[-1]
+    hidden, (x, _) = np.ma.getmaskarray(picture.get_array()), _places(picture)
     # an element is blank as soon as one of its nodes is: from the last measured column of nodes on
     assert hidden[:, x > 60.01].all()
     assert not hidden[:, x < 60 - 20].any()
@@ -66,24 +77,77 @@ def test_blank_where_not_measured(tmp_path: Path) -> None:
 
 def test_one_wild_node_does_not_flatten_the_colours() -> None:
     values = np.linspace(0, 1, 500)
-    assert figures._limits(values) == (0, 1)
-    low, high = figures._limits(np.append(values, 1000))
-    assert (low, high) == pytest.approx((0, 1.1), abs=0.01)
+    assert style.colour_range(values) == (0, 1)
+    assert style.colour_range(np.append(values, 1000)) == pytest.approx((0, 1.1), abs=0.01)
+
+
+def test_outliers_at_the_edge_do_not_turn_the_bulk_of_an_uncertainty_black(tmp_path: Path) -> None:
+    """A third of the nodes 30 times as uncertain: the others still spread over a good part of the colours."""
+    edge = np.isin(X, [X.min(), X.max()])
+    std = np.where(edge, 0.1, 0.003) * np.exp(np.random.default_rng(0).normal(0, 0.2, NODES))
+    figure = figures.map_figure(_one_frame(tmp_path / "out", u_std=std, v_std=std), 0, "uncertainty")
+    colours = np.asarray(figure.axes[0].images[-1].norm(std))
+    assert np.ptp(np.percentile(colours[~edge], [5, 95])) > 0.15
+    assert (colours[edge] >= 1).all()
+
+
+def test_doubtful_nodes_do_not_rule_the_colours(tmp_path: Path) -> None:
+    """A strain of .2 % in the middle shows beside border nodes that scatter by 5 %, and say so."""
+    edge = X < 30
+    exx = np.where(edge, 0.05 * np.random.default_rng(0).normal(size=NODES), 0.002 * (X > 60))
+    result = _one_frame(tmp_path / "out", exx=exx, eyy=exx, exy=exx, exx_std=np.where(edge, 0.05, 1e-4))
+    norm = figures.map_figure(result, 0, "strain").axes[0].images[-1].norm
+    assert (norm.vmin, norm.vmax) == (0, 0.002)
+
+
+@pytest.fixture
+def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures without content: writing them takes most of the time."""
+    monkeypatch.setattr(gallery, "save_figure", lambda _, path: path.touch())
 
 
 def test_all_figures_can_be_written(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
-    files = write_figures(result, tmp_path / "figures", frames=2)
-    names = {file.name for file in files}
-    told_once = {"convergence.png", "residual.png", "brightness.png", "masks.png", "reflections.png"}
-    assert told_once | {"displacement_000011.png", "shares_000011.png"} <= names
-    assert len(names) == len(told_once) + 1 + 2 * 2
+    told_once = {"convergence", "residual", "brightness"}
+    with_pictures = {*EVERY_FRAME, "masks", "reflections"}
+    files = write_figures(result, tmp_path / "figures", [4])
+    assert {file.stem for file in files} == told_once | {f"{name}_000004" for name in with_pictures}
     assert all(file.stat().st_size > 5000 for file in files)
 
 
+@pytest.mark.usefixtures("unsaved")
+def test_each_frame_has_the_pictures_it_can_have(tmp_path: Path) -> None:
+    result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
+    files = write_figures(result, tmp_path / "figures", [3, 4])
+    assert {file.stem.split("_")[0] for file in files if "000004" in file.stem} == {
+        *EVERY_FRAME,
+        "masks",
+        "reflections",
+    }
+    assert {file.stem.split("_")[0] for file in files if "000003" in file.stem} == EVERY_FRAME
+
+
+def test_three_deformed_frames_get_pictures_and_the_reference_none() -> None:
+    assert gallery._spread(tuple(range(1, 12))) == [1, 6, 11]
+    assert gallery._spread((5,)) == [5]
+
+
+def test_the_reference_is_left_out_of_what_happens_over_the_frames(tmp_path: Path) -> None:
+    settings = TestSettings(
+        frames=FrameSettings(path=("*",), reference=(1, 3)), region=RegionSettings(rectangle=(0, 0, 9, 9))
+    )
+    result = make_result(tmp_path / "out", frames=6, settings=settings)
+    for figure in (figures.residual_figure(result), figures.brightness_figure(result)):
+        for line in (line for axis in figure.axes for line in axis.lines):
+            assert line.get_xdata().tolist() == [0, 2, 4, 5]
+    lines = figures.convergence_figure(result).axes[0].lines
+    assert [line.get_label() for line in lines] == [*(f"frame {i}" for i in (0, 2, 4, 5)), "tolerance"]
+
+
+@pytest.mark.usefixtures("unsaved")
 def test_pictures_of_an_earlier_run_are_removed_and_no_others(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=3, reference=np.stack([IMAGE] * 3))
-    files = write_figures(result, tmp_path / "figures")
+    files = write_figures(result, tmp_path / "figures", [2])
     mine = tmp_path / "figures" / "my_displacement.png"
     mine.write_bytes(b"kept")
     remove_figures(tmp_path / "figures")
@@ -92,36 +156,51 @@ def test_pictures_of_an_earlier_run_are_removed_and_no_others(tmp_path: Path) ->
     remove_figures(tmp_path / "nowhere")
 
 
-def test_frame_where_nothing_is_measured_still_has_a_figure(tmp_path: Path) -> None:
-    store = ResultStore.create(tmp_path / "out", nodes=MESH.nodes, elements=MESH.elements, names=["bad"], lights=LIGHTS)
-    store.write_frame(0, FrameRecord.failed("damaged", nodes=NODES, lights=3))
-    for file in write_figures(Result.open(tmp_path / "out"), tmp_path / "figures"):
+def test_frame_where_nothing_is_measured_still_has_figures(tmp_path: Path) -> None:
+    for file in write_figures(_one_frame(tmp_path / "out", reason="damaged"), tmp_path / "figures"):
         assert file.stat().st_size > 2000
 
 
-def test_mask_shades_what_is_excluded() -> None:
-    weights = np.ones((2, 40, 60))
+def test_mask_shades_what_is_excluded(tmp_path: Path) -> None:
+    weights = np.full((3, 40, 60), 255)
     weights[0, :20] = 0
-    figure = figures.mask_figure(np.stack([IMAGE, IMAGE]), weights, ("red", "blue"))
-    shade = figure.axes[0].images[-1]
-    alpha = shade.get_array()[..., 3]
-    assert alpha[:20].min() > 0.5
-    assert alpha[20:].max() == 0
-    assert shade.get_extent() == [-0.5, 119.5, 79.5, -0.5]
-    assert "50.0% excluded" in figure.axes[0].get_title()
-    with pytest.raises(InputError, match="masks need"):
-        figures.mask_figure(np.stack([IMAGE, IMAGE]), weights[:1], ("red", "blue"))
+    still = {"u": 0 * X, "v": 0 * X, "reflection_thumbnail": 255 - weights}
+    result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), weights_thumbnail=weights, **still)
+    for figure in (figures.mask_figure(result, 0), figures.reflection_figure(result, 0)):
+        assert figure is not None
+        shade = figure.axes[0].images[-1]
+        alpha = shade.get_array()[..., 3]
+        assert alpha[:20].min() > 0.5
+        assert alpha[20:].max() == 0
+        assert shade.get_extent() == [-0.5, 119.5, 79.5, -0.5]
+    figure = figures.mask_figure(result, 0)
+    assert figure is not None
+    top, bottom = sorted(figure.axes[0].get_ylim())
+    share = (40 - top) / (bottom - top)
+    told = float(figure.axes[0].get_title().removeprefix("red: ").removesuffix("% excluded"))
+    assert told == pytest.approx(100 * share, abs=2)
+    assert figure.axes[1].get_title() == "green: 0.0% excluded"
+
+
+def test_weights_that_exclude_nothing_have_no_picture(tmp_path: Path) -> None:
+    weights = np.full((3, 40, 60), 255)
+    result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), weights_thumbnail=weights)
+    assert figures.mask_figure(result, 0) is None
+    assert figures.reflection_figure(result, 0) is None
 
 
 def test_impossible_frame_and_file(tmp_path: Path) -> None:
-    result = _linear_result(tmp_path / "out")
-    with pytest.raises(InputError, match="no frame 1"):
-        figures.displacement_figure(result, 1)
+    result = make_result(tmp_path / "out")
+    with pytest.raises(InputError, match="no frame 2"):
+        figures.map_figure(result, 2, "displacement")
+    with pytest.raises(InputError, match="no frame 7"):
+        write_figures(result, tmp_path / "figures", [0, 7])
+    assert not list((tmp_path / "figures").iterdir())
     with pytest.raises(ResultError, match="cannot be written"):
-        figures.save_figure(figures.residual_figure(result), tmp_path / "none" / "a.png")
+        save_figure(figures.residual_figure(result), tmp_path / "none" / "a.png")
 
 
 def test_matplotlib_is_imported_only_for_a_figure() -> None:
-    code = "import sys, rgbmidic.report.gallery, rgbmidic.results.export; print('matplotlib' in sys.modules)"
+    code = "import sys, rgbmidic.report, rgbmidic.results; print({'matplotlib', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+    assert done.stdout.strip() == "set()"

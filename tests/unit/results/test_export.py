@@ -10,7 +10,15 @@ import pytest
 from results import LIGHTS, NODES, make_result
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results import EXPORT_FORMATS, QUANTITIES, Result, export_result
+from rgbmidic.results import (
+    EXPORT_FORMATS,
+    QUANTITIES,
+    FrameRecord,
+    Quantity,
+    Result,
+    ResultStore,
+    export_result,
+)
 
 
 @pytest.fixture
@@ -42,6 +50,24 @@ def test_csv_has_one_row_per_node_and_frame(result: Result, tmp_path: Path) -> N
     np.testing.assert_allclose(np.stack([x, y], axis=1), result.nodes, rtol=1e-8)
     assert [row["status"] for row in rows[::NODES]] == ["0", "1", "0"]
     assert {(row["u"] == "") == (row["node_status"] == "1") for row in rows} == {True}
+
+
+def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(QUANTITIES, "depth", Quantity("depth", ("node",), "px", "", "how deep"))
+    depth = np.arange(3.0)
+    with ResultStore.create(
+        tmp_path / "out", nodes=np.eye(3)[:, :2], elements=[[0, 1, 2]], names=["only"], lights=["one"]
+    ) as store:
+        store.write_frame(0, FrameRecord.of(nodes=3, lights=1, depth=depth))
+    result = Result.open(tmp_path / "out")
+    np.testing.assert_array_equal(result.depth, [depth])
+    for to in EXPORT_FORMATS:
+        export_result(result, to, tmp_path / to)
+    np.testing.assert_array_equal(np.load(tmp_path / "npz")["depth"], [depth])
+    with (tmp_path / "csv").open(encoding="utf-8", newline="") as file:
+        assert [row["depth"] for row in csv.DictReader(file)] == ["0", "1", "2"]
 
 
 @pytest.mark.parametrize("to", EXPORT_FORMATS)

@@ -153,6 +153,16 @@ def test_a_quantity_is_read_without_the_others(tmp_path: Path, monkeypatch: pyte
     assert [index for index, _ in reads[3:]] == [1]
 
 
+def test_the_deformed_frames_are_those_that_are_no_reference(tmp_path: Path) -> None:
+    test = TestSettings(
+        frames=FrameSettings(path=("*",), reference=(1, 2)), region=RegionSettings(rectangle=(0, 0, 9, 9))
+    )
+    assert make_result(tmp_path / "two", frames=4, settings=test).deformed == (0, 3)
+    result = make_result(tmp_path / "untold", frames=3)
+    assert result.deformed == (1, 2)
+    assert [u[0] for u in result.each("u", result.deformed)] == pytest.approx(result.u[1:, 0].tolist(), nan_ok=True)
+
+
 def test_only_what_stacks_is_an_attribute(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out")
     assert {"u", "exy_std", "brightness", "nodes"} <= set(dir(result))
@@ -175,7 +185,9 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
     assert "schema version 9" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 9}')
-    assert "list of names" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 3}')
+    start = b'{"schema": "rgbmidic-result", "schema_version": 3'
+    for rest in (b"}", b', "frames": [1], "lights": []}', b', "frames": [], "lights": [], "settings": {"a": 1}}'):
+        assert "names of frames and lights, or the settings" in damaged("provenance.json", start + rest)
     assert "mesh.npz is missing" in damaged("mesh.npz", None)
     assert "mesh.npz is damaged" in damaged("mesh.npz", b"PK")
     assert "frame 1 (frame 1) of 2 is missing" in damaged("solution/frame_000001.npz", None)

@@ -1,0 +1,139 @@
+"""What all figures share: size, colours, axes, colour ranges. No display is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rgbmidic.results.files import writing
+from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "LIGHT_COLOURS",
+    "STYLE",
+    "colour_range",
+    "colour_scale",
+    "draw_figure",
+    "finish_picture",
+    "finish_plot",
+    "save_figure",
+    "shade",
+    "show_image",
+]
+
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.direction": "out",
+    "ytick.direction": "out",
+    "legend.frameon": False,
+}
+LIGHT_COLOURS = {"red": "#c8102e", "green": "#1a7f37", "blue": "#1f5fbf"}
+_WIDTH = 7.5
+"""Width of a figure in inches."""
+_CLIPPED, _WILD = 0.5, 0.1
+"""Colours span all values but this percentage at each end, and what lies within this share of that span beyond."""
+_SPAN = 4.0
+"""Colours of a positive quantity end at its median over this and times this: else outliers turn the bulk black."""
+
+
+def draw_figure(
+    draw: Callable[[Figure, list[Axes]], None], *, count: int, aspect: float, colour_bars: bool, title: str = ""
+) -> Figure:
+    """A figure of `count` panels whose height is `aspect` times their width: side by side, or stacked when flat."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    stacked = aspect < 0.5 and count > 1
+    rows, columns = (count, 1) if stacked else (1, count)
+    width = min(_WIDTH, max(6.0, 4.5 * columns)) / columns
+    height = (width * (0.8 if colour_bars else 0.9) * aspect + 0.75) * rows + (0.3 if title else 0)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(width * columns, min(height, 9.5)), layout="compressed")
+        axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+        draw(figure, axes)
+        if title:
+            figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
+    """Write a figure; the ending of the name states the format (png, pdf, svg).
+
+    Raises
+    ------
+    ResultError
+        The file cannot be written.
+    """
+    with writing(path):
+        figure.savefig(path, dpi=dpi, bbox_inches="tight", pad_inches=0.08)
+
+
+def colour_range(known: FloatArray) -> tuple[float, float]:
+    """Ends of the colour bar: all values, but for a few wild ones that would hide the field."""
+    core = np.percentile(known, [_CLIPPED, 100 - _CLIPPED])
+    reach = _WILD * np.ptp(core)
+    low, high = float(max(known.min(), core[0] - reach)), float(min(known.max(), core[1] + reach))
+    return (low, high) if high > low else (low - 1e-9, low + 1e-9)
+
+
+def colour_scale(known: FloatArray, *, positive: bool = False) -> Normalize:
+    """Colours over `colour_range`; for a positive quantity logarithmic, around its median."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    if not positive:
+        return Normalize(*colour_range(known))
+    logarithms = np.log(np.maximum(known, np.finfo(float).tiny))
+    middle, reach = np.median(logarithms), np.log(_SPAN)
+    return LogNorm(*np.exp(np.clip(colour_range(logarithms), middle - reach, middle + reach)))
+
+
+def show_image(axis: Axes, image: AnyArray) -> None:
+    """An image in grey, with the extreme percent at either end clipped."""
+    finite = image[np.isfinite(image)]
+    low, high = np.percentile(finite, [1, 99]) if finite.size else (0, 1)
+    axis.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), interpolation="antialiased")
+
+
+def shade(axis: Axes, cover: FloatImage, step: int = 1) -> None:
+    """Cover an image by a picture from 0 (clear) to 1, of which one pixel is `step` pixels of the image."""
+    from matplotlib.colors import to_rgb
+
+    colours = np.empty((*cover.shape, 4), dtype=np.float32)
+    colours[..., :3] = to_rgb("#e8590c")
+    colours[..., 3] = 0.65 * np.clip(cover, 0, 1)
+    rows, columns = (step * size - 0.5 for size in cover.shape)
+    axis.imshow(colours, extent=(-0.5, columns, rows, -0.5), interpolation="nearest")
+
+
+def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *, first: bool) -> None:
+    """Pixel axes, y down, one scale in both directions."""
+    axis.set_aspect("equal")
+    axis.set_xlim(*x)
+    axis.set_ylim(y[1], y[0])
+    axis.set_xlabel("x (px)")
+    if first:
+        axis.set_ylabel("y (px)")
+    axis.locator_params(nbins=5)
+
+
+def finish_plot(axis: Axes, x: str, y: str) -> None:
+    """Named axes, whole numbers along x, a light grid."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.grid(linewidth=0.4, color="0.88")
+    axis.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,123 @@
+"""The stated uncertainty of nodes: at any element size, beside holes, and away from a crack."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from textures import Affine, Texture
+
+from rgbmidic import Region, Tri3Mesh, correlate
+from rgbmidic.correlation import Deformed, Reference
+from rgbmidic.correlation.equations import Equations
+from rgbmidic.correlation.uncertainty.blocks import BLOCK
+from rgbmidic.correlation.uncertainty.propagation import functional_std
+
+NOISE = 3.0
+"""Standard deviation of the noise, 6 % of the texture's contrast."""
+
+
+def noisy(image, seed):
+    return image + np.random.default_rng(seed).normal(0, NOISE, image.shape)
+
+
+@pytest.mark.parametrize("size", [6, 13, 20])
+def test_the_unfitted_share_is_that_of_the_projection(size):
+    shape = (60, 60)
+    region = Region.from_rectangle((4, 4, 55, 55), shape)
+    mesh = Tri3Mesh.from_region(region, size)
+    image = Texture.random(1).image(shape)[None].astype(np.float32)
+    reference = Reference.prepare(image, region, mesh=mesh, prefilter="none")
+    pixels, slopes = reference.pixels, (reference.gradient_x[0], reference.gradient_y[0])
+    columns = np.zeros((pixels.rows.size, len(mesh.nodes), 2))
+    for element, corners in enumerate(mesh.elements):
+        own = slice(pixels.offsets[element], pixels.offsets[element + 1])
+        for node, (constant, in_x, in_y) in zip(corners, pixels.barycentric[element], strict=True):
+            values = constant + in_x * pixels.local_x[own] + in_y * pixels.local_y[own]
+            columns[own, node] = values[:, None] * np.stack([slope[own] for slope in slopes], axis=1)
+    index, grid = pixels.blocks(BLOCK)
+    used = reference.pixel_weights[0] > 0
+    inside = (index[:, None] == np.arange(grid[0] * grid[1])) & used[:, None]
+    scores = np.concatenate([slope[:, None] * inside for slope in slopes], axis=1).astype(float)
+    system = columns.reshape(len(columns), -1) * used[:, None]
+    fitted = system @ np.linalg.lstsq(system, scores, rcond=1e-6)[0]
+    left = 1 - (fitted**2).sum() / (scores**2).sum()
+    assert reference.unfitted == pytest.approx(left, rel=0.1)
+
+
+@pytest.mark.parametrize("size", [5, 8, 12, 20, 32])
+def test_elements_of_any_size_state_their_error(size):
+    image, ratios = Texture.random(2, speckle=3).image((160, 160)), []
+    for seed in range(3):
+        found = correlate(noisy(image, seed), noisy(image, 100 + seed), element_size=size, initial=(0, 0))
+        ratios.append((found.displacement / found.displacement_std)[found.measured].ravel())
+    assert 0.85 < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 1.25
+
+
+def test_the_smallest_element_beside_a_hole_is_told_by_the_common_way(monkeypatch):
+    columns = []
+
+    def counted(solve, covariance, colouring, functionals, nodes):
+        columns.append(len(functionals) * len(colouring.nearest))
+        return functional_std(solve, covariance, colouring, functionals, nodes)
+
+    monkeypatch.setattr("rgbmidic.correlation.uncertainty.nodal.functional_std", counted)
+    image = Texture.random(4, speckle=3).image((96, 96))
+    first = noisy(image, 0)
+    first[30:60, 35:60] = np.nan
+    found = correlate(first, noisy(image, 1), element_size=4, initial=(0, 0))
+    assert 0.6 < found.measured.mean() < 1
+    # triangular solves do not grow with the rim of a hole: a fixed number of colours a pass
+    assert max(columns) <= 3 * 25
+
+
+def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
+    shape = (150, 150)
+    image = Texture.random(6).image(shape)
+    first, weights = noisy(image, 0)[None].astype(np.float32), np.ones((1, *shape), dtype=np.float32)
+    weights[0, 60:90, 55:95] = 0
+    region = Region.from_rectangle((5, 5, 144, 144), shape)
+    mesh = Tri3Mesh.from_region(region, 12)
+    reference = Reference.prepare(first, region, weights, mesh=mesh, prefilter="binomial")
+    deformed = Deformed.prepare(noisy(image, 1)[None].astype(np.float32), weights, prefilter="binomial")
+    rest = np.zeros_like(mesh.nodes)
+    pulled = reference.pull_back(deformed, 0, rest)[None]
+    equations = Equations.build(reference, pulled, np.zeros((2 * len(mesh.nodes), 0)))
+    inner = equations.textured & ~mesh.beside(~equations.textured)
+    assert 0 < inner.sum() < equations.textured.sum() < len(mesh.nodes)
+    strain = reference.functionals[2:]
+    probed = functional_std(equations.solve, equations.hessian, reference.colouring, strain, inner)
+    for number, functional in enumerate(strain):
+        column = equations.solve(functional[inner].T.toarray())
+        exact = np.sqrt((column * (equations.hessian @ column)).sum(axis=0))
+        assert np.median(probed[inner, number] / exact) == pytest.approx(1, abs=0.05)
+        assert (probed[inner, number] / exact).min() > 0.7
+        assert (probed[inner, number] / exact).max() < 1.4
+
+
+def test_a_crack_leaves_intact_material_as_certain_as_before():
+    shape, middle, jump = (300, 300), 150, 6.0
+    texture = Texture.random(8)
+    halves = [texture.image(shape, Affine(shift=(0.3, v))) for v in (jump, -jump)]
+    cracked = np.where(np.arange(shape[1]) < middle, *halves)
+    first = noisy(texture.image(shape), 0)
+    whole = correlate(first, noisy(halves[0], 1))
+    found = correlate(first, noisy(cracked, 1))
+    apart = np.abs(found.nodes[:, 0] - middle)
+    true = np.stack([np.full(len(apart), 0.3), np.where(found.nodes[:, 0] < middle, jump, -jump)], axis=1)
+    intact = (apart > 60) & found.measured
+    assert intact.sum() == (apart > 60).sum()
+    assert (~found.measured[apart < 13]).mean() > 0.4
+    ratio = (found.displacement - true)[intact] / found.displacement_std[intact]
+    assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.3
+    assert np.median(found.displacement_std[intact]) < 1.3 * np.median(whole.displacement_std)
+
+
+def test_stretched_edges_state_their_error():
+    shape, stretch = (300, 300), 0.15
+    texture = Texture.random(9)
+    motion = Affine(gradient=((1 + stretch, 0.0), (0.0, 1.0)))
+    found = correlate(noisy(texture.image(shape), 0), noisy(texture.image(shape, motion), 1), region=(40, 40, 259, 259))
+    error = found.displacement - motion.displacement(found.nodes, shape)
+    edge = np.isin(found.nodes[:, 0], (40.0, 259.0))
+    assert found.measured.all()
+    assert (np.abs(error) < 4.5 * found.displacement_std)[edge].all()

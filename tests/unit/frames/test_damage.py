@@ -1,0 +1,80 @@
+"""Damaged files: a frame of the announced shape or an error of ours comes out, and nothing reaches standard error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from frames import noisy_mosaic
+
+from rgbmidic.errors import FrameError
+from rgbmidic.frames import open_source, write_dng
+from rgbmidic.settings import FrameSettings
+
+SHAPE = (31, 45)
+GREY = noisy_mosaic(SHAPE)
+STATED = FrameSettings(path=("frame",), kind="monochrome")
+COPIES = 150
+HEADER = 600
+
+
+def _tiff(**options: Any) -> Callable[[Path], object]:
+    return lambda path: tifffile.imwrite(path, GREY.values, photometric="minisblack", **options)
+
+
+def _by_opencv(path: Path) -> None:
+    assert cv2.imwrite(str(path), GREY.values)
+
+
+WRITERS: dict[str, tuple[Callable[[Path], object], FrameSettings]] = {
+    "plain.tif": (_tiff(rowsperstrip=8), STATED),
+    "deflate.tif": (_tiff(compression="zlib", predictor=True, tile=(16, 16)), STATED),
+    "lzw.tif": (_by_opencv, STATED),
+    "big.tif": (_tiff(bigtiff=True), STATED),
+    "grey.png": (_by_opencv, STATED),
+    "bayer.dng": (lambda path: write_dng(path, GREY), FrameSettings(path=("frame",))),
+    "samples.raw": (
+        lambda path: GREY.values.tofile(path),
+        FrameSettings(path=("frame",), kind="monochrome", shape=SHAPE, dtype="uint16"),
+    ),
+}
+
+
+def _damaged(content: bytes, random: np.random.Generator) -> bytes:
+    """A copy with some bytes of its header or anywhere changed, cut short, or with a piece zeroed, lost or doubled."""
+    kind, start = random.integers(6), int(random.integers(len(content)))
+    end = start + int(random.integers(1, 64))
+    if kind < 2:
+        copy = bytearray(content)
+        for position in random.integers(0, min(HEADER, len(copy)) if kind == 0 else len(copy), random.integers(1, 6)):
+            copy[position] = random.choice([0, 1, 127, 255, random.integers(256)])
+        return bytes(copy)
+    middle = {2: b"", 3: bytes(end - start), 4: b"", 5: 2 * content[start:end]}[int(kind)]
+    return content[:start] + middle + (b"" if kind == 2 else content[end:])
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_damaged_file_gives_a_frame_of_its_shape_or_our_error(
+    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write, stated = WRITERS[name]
+    path = tmp_path / name
+    write(path)
+    content, random, told = path.read_bytes(), np.random.default_rng(19), set()
+    for _ in range(COPIES):
+        path.write_bytes(_damaged(content, random))
+        source = open_source(path, stated)
+        try:
+            frame = source.read(0)
+        except FrameError as error:
+            told.add(str(error))
+        else:
+            assert frame.values.shape[-2:] == source.shape
+    assert told
+    assert all(name in message for message in told)
+    assert capfd.readouterr().err == ""
