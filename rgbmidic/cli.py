@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import logging
-import sys
 import time
-import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from rgbmidic import command
 from rgbmidic._version import __version__
-from rgbmidic.errors import InputError, RgbmidicError
+from rgbmidic.errors import InputError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
 from rgbmidic.settings import FrameSettings
 
 __all__ = ["app", "main"]
 
-BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 _CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-study = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+study = typer.Typer(rich_markup_mode=None)
 app.add_typer(study, name="study", help="The paper's own analyses.")
 _messages = Console(stderr=True)
 
@@ -38,35 +34,8 @@ Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupt
 
 
 def main() -> None:
-    """Run the command; an error is one line on stderr, with its traceback only where ``--debug`` is given."""
-    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
-    debug = len(arguments) < len(sys.argv) - 1
-    handler = RichHandler(console=_messages, show_time=False, show_path=False, markup=False)
-    logging.getLogger("rgbmidic").addHandler(handler)  # not the root: other libraries talk to programmers
-    sys.exit(_run(arguments, debug=debug))
-
-
-def _run(arguments: list[str], *, debug: bool) -> int:
-    try:
-        status = app(args=arguments, standalone_mode=False) or 0
-        if status != INTERRUPTED:  # typer's own answer to Ctrl-C
-            return int(status)
-        raise KeyboardInterrupt
-    except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted; what was finished is kept", INTERRUPTED)
-    except Exception as error:  # the last resort of a command: whatever it is becomes one line and an exit status
-        if debug:
-            traceback.print_exc()
-        if isinstance(error, RgbmidicError):
-            return _fail(str(error), BAD_INPUT)
-        if (usage := getattr(error, "format_message", None)) is not None:  # typer's own, whichever click it brings
-            return _fail(usage(), BAD_INPUT)
-        return _fail(f"{type(error).__name__}: {error} (run again with --debug for the details)", FAILURE)
-
-
-def _fail(message: str, status: int) -> int:
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
-    return status
+    """Run the command."""
+    command.main(app)
 
 
 @app.callback(invoke_without_command=True)
@@ -78,8 +47,14 @@ def _rgbmidic(
     """Digital Image Correlation that survives light reflections."""
     if version:
         print(f"rgbmidic {__version__}")
-    elif context.invoked_subcommand is None:
-        print(context.get_help())
+    else:
+        command.help_where_alone(context)
+
+
+@study.callback(invoke_without_command=True)
+def _study(context: typer.Context) -> None:
+    """The paper's own analyses."""
+    command.help_where_alone(context)
 
 
 @app.command()
@@ -106,7 +81,7 @@ def run(
     failed = [index for index in result.deformed if result.status[index] == _FAILED]
     if len(failed) == len(result.deformed):
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
-        raise typer.Exit(_fail(f"no deformed frame is measured; {first}", FAILURE))
+        raise typer.Exit(command.fail(f"no deformed frame is measured; {first}", command.FAILURE))
 
 
 @app.command()
@@ -202,8 +177,9 @@ def plan(
     proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
     planning.write_plan(made, proposals, out, overwrite=overwrite)
     title = "share of the field where lights reflect, all of them do, and only one or none is clean"
-    _print_table(title, *planning.zone_rows(made))
-    _print_table("standard uncertainty to expect over the field, px", *planning.uncertainty_rows(made))
+    _print_table(title, *planning.zone_rows(made), planning.ZONE_WORDS)
+    uncertainty = "standard uncertainty to expect over the field, px"
+    _print_table(uncertainty, *planning.uncertainty_rows(made), planning.UNCERTAINTY_WORDS)
     better = {name: proposal.plan for name, proposal in proposals.items() if proposal.gain > 1}
     for name, one in {"lamps as they are": made, **better}.items():
         _print_table(f"{name}: {planning.summary(one)}", *planning.lamp_rows(one))
@@ -221,7 +197,7 @@ def inspect(
     cfa: Annotated[str | None, typer.Option("--cfa", help="Bayer pattern, such as RGGB.")] = None,
     black_level: Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample.")] = None,
     white_level: Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level.")] = None,
-    shape: Annotated[str, typer.Option("--shape", help="ROWS,COLUMNS of a headerless file.")] = "",
+    shape: Annotated[str, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")] = "",
     dtype: Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")] = None,
     region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or the frame.")] = "",
     element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's or 25.")] = None,
@@ -242,19 +218,22 @@ def inspect(
         "black_level": black_level,
         "white_level": white_level,
         "dtype": dtype,
+        "shape": command.read_shape(shape),
     }
-    stated["shape"] = tuple(int(one) for one in _numbers(shape, "--shape")) if shape else None
-    inspection = inspect_files(
-        frames,
-        test=settings,
-        calibration=calibration,
-        frame=state_frames(settings, count=len(frames), **stated),
-        region=_numbers(region, "--region") if region else None,
-        element_size=element_size,
-    )
+    with _progress("inspecting") as progress:
+        inspection = inspect_files(
+            frames,
+            test=settings,
+            calibration=calibration,
+            frame=state_frames(settings, count=len(frames), **stated),
+            region=_numbers(region, "--region") if region else None,
+            element_size=element_size,
+            progress=progress,
+        )
     if out is not None:
         report.write_inspection(inspection, out, overwrite=overwrite)
-    print(f"{inspection.name}: {inspection.kind}, {inspection.region.shape[1]} x {inspection.region.shape[0]} px\n")
+    rows, columns = inspection.frame_shape
+    print(f"{inspection.name}: {inspection.kind}, {columns} x {rows} px\n")
     _print_table("samples in the region, shares of the full scale", *report.channel_rows(inspection))
     _print_table("lights", *report.light_rows(inspection))
     known = "" if inspection.noise_known else " (noise estimated, not calibrated)"
@@ -266,7 +245,9 @@ def inspect(
         print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")
 
 
-def _print_table(title: str, headings: list[str], rows: list[list[str]]) -> None:
+def _print_table(
+    title: str, headings: list[str], rows: list[list[str]], words: Mapping[str, str] | None = None
+) -> None:
     table = Table(box=None, pad_edge=False)
     for number, heading in enumerate(headings):
         table.add_column(heading, justify="right" if number else "left", no_wrap=True)
@@ -274,6 +255,8 @@ def _print_table(title: str, headings: list[str], rows: list[list[str]]) -> None
         table.add_row(*row)
     print(title)
     Console(soft_wrap=True).print(table)
+    for heading, meaning in (words or {}).items():
+        print(f"  {heading}: {meaning}")
     print()
 
 

@@ -7,15 +7,15 @@ from typing import Annotated
 
 import typer
 
-from rgbmidic.errors import RgbmidicError
+from rgbmidic import command
 
 __all__ = ["app", "main"]
 
 app = typer.Typer(
-    help="Calibrate a colour camera and its lamps for rgbmidic. The laboratory procedure: calibration/README.md.",
-    no_args_is_help=True,
+    name="rgbmidic-calibrate",
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -25,7 +25,7 @@ Cfa = Annotated[
 Black = Annotated[float | None, typer.Option(help="Black level in DN, where the files do not tell it.")]
 White = Annotated[float | None, typer.Option(help="Saturation level in DN, where the files do not tell it.")]
 Kind = Annotated[str | None, typer.Option(help="bayer (default unless the files tell), or rgb for a 3-CCD camera.")]
-Shape = Annotated[str | None, typer.Option(help="ROWSxCOLUMNS of headerless files.")]
+Shape = Annotated[str | None, typer.Option(help="ROWSxCOLUMNS of headerless files, such as 512x768.")]
 Dtype = Annotated[str | None, typer.Option(help="Sample type of headerless files: uint8, uint16 or >u2.")]
 Out = Annotated[Path, typer.Option(help="Calibration file to write (JSON).")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing --out.")]
@@ -35,19 +35,17 @@ Allow = Annotated[list[str] | None, typer.Option(help="Waive a plausibility chec
 
 
 def main() -> None:
-    """Run the command; an error of ours is one line and exit status 2, never a traceback."""
-    from rich.console import Console
-
-    try:
-        app(prog_name="rgbmidic-calibrate")
-    except RgbmidicError as error:
-        Console(stderr=True, soft_wrap=True).print(f"[bold red]error:[/] {_plain(str(error))}", highlight=False)
-        raise SystemExit(2) from None
+    """Run the command."""
+    command.main(app)
 
 
-@app.callback()
-def _root() -> None:
-    """Calibrate a colour camera and its lamps for rgbmidic."""
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an error comes from.")] = False,
+) -> None:
+    """Calibrate a colour camera and its lamps for rgbmidic. The laboratory procedure: calibration/README.md."""
+    command.help_where_alone(context)
 
 
 @app.command()
@@ -249,9 +247,3 @@ def show(
         from rgbmidic_calibration.pictures import draw_calibration
 
         draw_calibration(calibration, picture)
-
-
-def _plain(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
+from rgbmidic.command import read_shape
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
@@ -49,10 +50,6 @@ def statement(
     for option, value, allowed in (("--kind", kind, KINDS), ("--dtype", dtype, DTYPES)):
         if value is not None and value not in allowed:
             raise ConfigurationError(f"{option} is one of {', '.join(allowed)}, not {value!r}")
-    size = re.fullmatch(r"(\d+)[x,](\d+)", shape) if shape else None
-    if shape and not size:
-        raise ConfigurationError(f"--shape is ROWSxCOLUMNS, for instance 512x768, not {shape!r}")
-    rows_columns = (int(size[1]), int(size[2])) if size else None
     try:
         return FrameSettings(
             path=("captures",),
@@ -60,7 +57,7 @@ def statement(
             cfa=cfa,
             black_level=black_level,
             white_level=white_level,
-            shape=rows_columns,
+            shape=read_shape(shape),
             dtype=cast(Any, dtype),
         )
     except ConfigurationError as error:

@@ -5,7 +5,7 @@ It goes the way a laboratory goes: raw frames and calibration captures on disk, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,12 +14,10 @@ import numpy as np
 from rgbmidic.correlation import correlate
 from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
-from rgbmidic.frames import list_frames, read_frame
+from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.linearise import LinearMosaic, linearise
-from rgbmidic.illumination.separate import separate
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import measure
+from rgbmidic.pipeline import Separation, measure
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage
@@ -46,13 +44,15 @@ name = "blue"
 position = [10.0, -220.0, 60.0]
 
 [camera]
-shape = [448, 448]
+shape = [{size}, {size}]
 crosstalk = [[1.0, 0.10, 0.02], [0.14, 1.0, 0.16], [0.03, 0.12, 1.0]]
 
 [output]
 seed = 2026
+target = "speckled"
 """
-_ANGLES = (0.33, 1.0, 2.0, 4.0, 8.0)
+ANGLES = (0.33, 1.0, 2.0, 4.0, 8.0)
+"""Rotations of the sphere, degrees."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +88,9 @@ def run_demo(
     say: Say,
     calibrate: Callable[[Path], None],
     progress: Callable[[int, int, str], None] | None = None,
+    *,
+    size: int = 448,
+    angles: Sequence[float] = ANGLES,
 ) -> list[DemoRow]:
     """Make the virtual test in `out`/test, calibrate it, measure it into `out`/result, and compare.
 
@@ -101,6 +104,10 @@ def run_demo(
         Called with the folder of the virtual test; writes calibration.json from the captures there.
     progress
         Called with frames done, their total and a line.
+    size
+        Rows and columns of the frames, px.
+    angles
+        Rotations of the sphere, degrees, one frame each.
 
     Returns
     -------
@@ -116,19 +123,19 @@ def run_demo(
 
     test, scene = out / "test", out / "scene.toml"
     if out.exists() and any(out.iterdir()):
-        raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder with --out")
+        raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder (--out)")
     out.mkdir(parents=True, exist_ok=True)
-    states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in _ANGLES)
-    scene.write_text(_SCENE + states, encoding="utf-8")
-    say(f"virtual test: raw DNG frames, calibration captures and the exact truth in {test}")
+    states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
+    scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")
+    say(f"1 of 4: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
     settings_file = write_dataset(scene, test, progress)
     (test / "calibration.json").rename(test / "true_calibration.json")
-    say("calibration: rgbmidic-calibrate crosstalk, from the captures with one light on at a time")
+    say("2 of 4: calibration, 1 s, as rgbmidic-calibrate crosstalk does it from the captures with one light at a time")
     calibrate(test)
     settings = read_test(settings_file)
-    say(f"measurement: rgbmidic run {settings_file} --out {out / 'result'}")
+    say(f"3 of 4: measurement, some 10 s: rgbmidic run {settings_file} --out {out / 'result'}")
     result = measure(settings, out / "result", progress=progress)
-    say("the same with each colour alone, for comparison")
+    say("4 of 4: the same with each colour alone, for comparison, some 10 s")
     return _compare(settings, result)
 
 
@@ -158,14 +165,9 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
 def _separated(settings: TestSettings) -> list[FloatImage]:
     """The lights (k, H, W) of every frame."""
     assert settings.calibration_file is not None
-    calibration = Calibration.read(settings.calibration_file)
-    assert calibration.crosstalk is not None
-    images = []
-    for path in list_frames(settings.frames.path[0], settings.base):
-        mosaic = linearise(read_frame(path), calibration.noise)
-        assert isinstance(mosaic, LinearMosaic)
-        images.append(separate(mosaic, calibration.crosstalk).values)
-    return images
+    separation = Separation(calibration=Calibration.read(settings.calibration_file))
+    frames = open_series(settings.frames, settings.base)
+    return [separation(frames.read(index)).values for index in range(len(frames))]
 
 
 def _one_light(reference: FloatImage, deformed: FloatImage, settings: TestSettings) -> FloatArray:

@@ -55,7 +55,7 @@ class Separation:
         known = self.calibration or Calibration()
         linear = [linearise(frame, known.noise) for frame in frames]
         if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
-            return _stack_monochrome([one for one in linear if isinstance(one, LinearChannels)])
+            return IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)])
         if len(linear) > 1:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
         crosstalk, (only,) = self._crosstalk(), linear
@@ -97,13 +97,3 @@ def correlated(images: IlluminationImages, settings: IlluminationSettings) -> Fl
     """What the solve correlates (k, H, W): the lights' images, locally normalised unless the settings say no."""
     sigma = settings.normalise
     return normalise(images.values, sigma, images.full_scale) if sigma else images.values
-
-
-def _stack_monochrome(series: list[LinearChannels]) -> IlluminationImages:
-    names = ("light",) if len(series) == 1 else tuple(f"light {i + 1}" for i in range(len(series)))
-    return IlluminationImages(
-        values=np.concatenate([one.values for one in series]),
-        valid=np.concatenate([one.valid for one in series]),
-        names=names,
-        full_scale=series[0].full_scale,
-    )

@@ -15,6 +15,7 @@ import tifffile
 from results import make_result, random_record
 
 from rgbmidic import __version__, cli
+from rgbmidic.command import execute, read_shape
 from rgbmidic.errors import FrameError
 from rgbmidic.results import FrameRecord, Result, ResultStore
 
@@ -28,7 +29,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run the command in this process: exit status, standard output, standard error."""
 
     def run(*arguments: object, debug: bool = False) -> tuple[int, str, str]:
-        status = cli._run([str(argument) for argument in arguments], debug=debug)
+        status = execute(cli.app, [str(argument) for argument in arguments], debug=debug)
         return status, *capsys.readouterr()
 
     return run
@@ -256,3 +257,13 @@ def test_the_package_needs_neither_typer_nor_matplotlib() -> None:
     code = "import sys, rgbmidic; print({'typer', 'rich', 'matplotlib', 'colour'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.parametrize(("text", "shape"), [("512x768", (512, 768)), ("512,768", (512, 768)), ("", None)])
+def test_a_shape_is_written_one_way_and_read_in_two(text: str, shape: tuple[int, int] | None) -> None:
+    assert read_shape(text) == shape
+
+
+def test_a_wrong_shape_is_answered_with_an_example(command: Run, tmp_path: Path) -> None:
+    status, _, error = command("inspect", tmp_path / "a.raw", "--shape", "512 768")
+    assert (status, error) == (2, "error: --shape is ROWSxCOLUMNS, such as 512x768, not '512 768'\n")

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
+import shlex
 import tomllib
 from dataclasses import MISSING, fields
 from pathlib import Path
 
 import pytest
-from small_tests import colour_test
 
-from rgbmidic import NodeStatus, Status, TestSettings
+from rgbmidic import NodeStatus, Status, TestSettings, cli
+from rgbmidic.command import execute
+from rgbmidic.lab.demo import run_demo
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
 from rgbmidic.settings import _place, _sections
+from rgbmidic_calibration import cli as calibrate
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -110,30 +113,44 @@ def test_every_quantity_of_a_result_is_documented(quantities, frames):
         assert f"| `{name}` | {shape} | {quantity.unit} | {quantity.meaning} |".replace("  ", " ") in text, name
 
 
-def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
-    test = colour_test(tmp_path / "test", [(0.0, 0.0), (0.3, 0.1)])
-    monkeypatch.chdir(test.folder)
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """Folder of the demo's files, smaller and with fewer frames than the command makes."""
+    out = tmp_path_factory.mktemp("demo") / "rgbmidic-demo"
+    lines = []
+    rows = run_demo(out, lines.append, cli._calibrate_demo, size=320, angles=(0.33, 1.0, 2.0, 4.0))
+    assert [row.angle_deg for row in rows] == [0.33, 1.0, 2.0, 4.0]
+    assert all(row.rms_px < min(row.single_px) for row in rows)
+    assert len(lines) == 4
+    return out / "test"
+
+
+def commands(page):
+    """The commands of a page's examples, one list of words each, continued lines joined."""
+    text = re.sub(r"```(?:bash)?\n(rgbmidic.*?)```", r"\0\1\0", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    examples = "\n".join(text.split("\0")[1::2]).replace("\\\n", " ")
+    return [shlex.split(line) for line in examples.splitlines() if line.startswith("rgbmidic")]
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "calibration" / "README.md"])
+def test_the_commands_of_a_page_run_on_the_demo_s_files_as_written(page, demo, monkeypatch, capsys):
+    monkeypatch.chdir(demo)
+    programs = {"rgbmidic": cli.app, "rgbmidic-calibrate": calibrate.app}
+    found = commands(page)
+    assert len(found) >= 5
+    for program, *arguments in found:
+        arguments = [part.replace("60,60,390,390", "60,60,260,260") for part in arguments]  # smaller files here
+        assert execute(programs[program], arguments) == 0, (arguments, capsys.readouterr().err)
+
+
+def test_the_python_of_the_readme_runs_on_the_demo_s_files_as_written(demo, monkeypatch):
+    monkeypatch.chdir(demo)
     for text in blocks(ROOT / "README.md", "python"):
         exec(compile(text, "README.md", "exec"), {})
-    assert (test.folder / "result" / "provenance.json").is_file()
+    assert (demo / "python_result" / "provenance.json").is_file()
 
 
 def test_links_between_the_documents_lead_somewhere():
     for page in [ROOT / "README.md", *DOCS.glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
-
-
-def test_commands_of_the_readme_exist():
-    from typer.main import get_command
-
-    from rgbmidic.cli import app
-    from rgbmidic_calibration.cli import app as calibrate
-
-    known = {"rgbmidic": set(get_command(app).commands), "rgbmidic-calibrate": set(get_command(calibrate).commands)}
-    used = re.findall(
-        r"(?:^|&& )(rgbmidic|rgbmidic-calibrate) (\w+)", "\n".join(blocks(ROOT / "README.md", "bash")), re.MULTILINE
-    )
-    assert len(used) >= 4
-    for program, command in used:
-        assert command in known[program]

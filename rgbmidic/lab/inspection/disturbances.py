@@ -105,25 +105,16 @@ class Disturbances:
         noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in frames]).values
         return cls(noise=np.nan_to_num(noisy - quiet), mosaic=np.empty((0, *quiet.shape), dtype=np.float32))
 
-    def map(self, change: Callable[[FloatImage], FloatImage]) -> Disturbances:
-        """The same with both stacks (..., k, H, W) changed."""
-        return Disturbances(noise=change(self.noise), mosaic=change(self.mosaic))
-
-    @property
-    def variance(self) -> FloatImage:
-        """Square (k, H, W) of all of them together, DN squared."""
-        square = self.noise**2
-        return square + (self.mosaic**2).mean(axis=0) if len(self.mosaic) else square
-
 
 def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
     """A Gaussian random image (H, W) with the autocorrelation of `texture`, its offset aside."""
     from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2, rfftfreq
 
     rows, columns = (next_fast_len(side, real=True) for side in shape)
-    frequency = np.hypot(fftfreq(rows)[:, None], rfftfreq(columns))
+    frequency = np.hypot(fftfreq(rows).astype(np.float32)[:, None], rfftfreq(columns).astype(np.float32))
+    table = np.linspace(0, 0.71, 4096)
     spectrum = rfft2(random.standard_normal((rows, columns), dtype=np.float32))
-    spectrum *= np.sqrt(texture.spectrum(frequency)).astype(np.float32)
+    spectrum *= np.interp(frequency, table, np.sqrt(texture.spectrum(table))).astype(np.float32)
     return np.asarray(irfft2(spectrum, s=(rows, columns))[: shape[0], : shape[1]], dtype=np.float32)
 
 

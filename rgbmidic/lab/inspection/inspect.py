@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,10 +33,15 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["inspect_files", "inspect_frame", "state_frames"]
 
+Frame = Mosaic | ChannelFrame
 Linear = Sequence[LinearMosaic | LinearChannels]
+Progress = Callable[[int, int, str], None]
 
 CONTRAST_WIDTH = (10.0, 40.0)
 """Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
+MARGIN = 96
+"""Surroundings (px) of the region that are looked at with it: three standard deviations of the window over which the
+model of the frame is averaged (`rgbmidic.lab.inspection.disturbances.SETTLED`)."""
 
 
 def inspect_files(
@@ -47,6 +52,7 @@ def inspect_files(
     frame: FrameSettings | None = None,
     region: Sequence[float] | None = None,
     element_size: float | None = None,
+    progress: Progress | None = None,
 ) -> Inspection:
     """Inspect one frame on disk, or the frames of one state of lights fired in succession.
 
@@ -62,6 +68,8 @@ def inspect_files(
         What the file does not tell (its `path` is not used); instead of the test's.
     region, element_size
         (x0, y0, x1, y1) and side of the elements in px; instead of the test's, else the whole frame and 25.
+    progress
+        As in `inspect_frame`.
 
     Raises
     ------
@@ -87,13 +95,14 @@ def inspect_files(
             demosaic=test.illumination.demosaic if test else "auto",
             prefilter=test.solver.prefilter if test else "binomial",
             name=" + ".join(path.name for path in paths),
+            progress=progress,
         )
     except InputError as error:
         raise FrameError(f"{' + '.join(map(str, paths))}: {error}") from None
 
 
 def inspect_frame(
-    frame: Mosaic | ChannelFrame | Sequence[Mosaic | ChannelFrame],
+    frame: Frame | Sequence[Frame],
     *,
     calibration: Calibration | None = None,
     region: Region | Sequence[float] | None = None,
@@ -102,6 +111,7 @@ def inspect_frame(
     prefilter: str = "binomial",
     name: str = "frame",
     seed: int = 0,
+    progress: Progress | None = None,
 ) -> Inspection:
     """What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect.
 
@@ -116,7 +126,7 @@ def inspect_frame(
         Crosstalk, noise and registration as far as they are known. Without crosstalk the channels stand for the lights,
         without noise it is estimated from the frame.
     region
-        What will be measured; None: the whole frame.
+        What will be measured; None: the whole frame. Of the frame only this and its surroundings are looked at.
     element_size
         Side of the elements in px.
     demosaic, prefilter
@@ -125,27 +135,38 @@ def inspect_frame(
         Of the frame, for reports.
     seed
         Of what is drawn for the prediction.
+    progress
+        Called with the steps done, their number and what comes next.
 
     Raises
     ------
     InputError
         The frame is too small, saturated everywhere in the region, or of another kind than the calibration.
+    CalibrationError
+        The calibration varies over frames of another size.
     RegionError
         The region is empty, outside the frame or too small for one element.
     """
     frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
-    known = calibration or Calibration()
-    linear = [linearise(shot, known.noise) for shot in frames]
-    _check_frames(linear)
-    shape = linear[0].values.shape[-2:]
+    shape = _checked_shape(frames)
+    known = (calibration or Calibration()).cropped(None, shape)
     if not isinstance(region, Region):
         region = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1) if region is None else region, shape)
-    mesh, channels = Tri3Mesh.from_region(region, element_size), channels_of(linear)
+    tell = progress or (lambda done, total, line: None)
+    mesh, view = Tri3Mesh.from_region(region, element_size), _View.around(region)
+    region = view.region(region)
+    linear = [linearise(view.frame(shot), known.noise) for shot in frames]
+    channels = channels_of(linear)
     _check_light(channels, region.mask)
+    tell(0, 3, "exposure, speckle and noise")
     samples = _Samples.of(channels, region.mask, known.noise, linear[0].full_scale)
-    crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
+    crosstalk = view.crosstalk(known.crosstalk or Crosstalk.identity(("red", "green", "blue")))
+    tell(1, 3, "lights, and what separating them gets wrong")
     separated = _separated(linear, crosstalk, demosaic, samples.noise, np.random.default_rng(seed))
-    images = separated.images if known.registration is None else align(separated.images, known.registration)
+    images = separated.images
+    if known.registration is not None:
+        images = align(images, known.registration.cropped(view.origin))
+    tell(2, 3, "uncertainty to expect")
     level, contrast = _level_and_contrast(images, _contrast_window(samples.facts))
     index = separated.images.reflection_index
     if index is None and len(contrast) > 1:
@@ -154,7 +175,7 @@ def inspect_frame(
     prediction = Prediction.unknown(len(mesh.nodes), len(images.names))
     if (autocorrelation := texture or samples.texture) is not None:
         prediction = predict(
-            mesh,
+            replace(mesh, nodes=mesh.nodes - view.origin),
             region,
             contrast=contrast,
             level=level,
@@ -162,12 +183,15 @@ def inspect_frame(
             texture=autocorrelation,
             prefilter=prefilter,
         )
+    tell(3, 3, "done")
     single = not isinstance(linear[0], LinearMosaic) and len(linear[0].values) == 1
     return Inspection(
         name=name,
         kind="bayer" if isinstance(linear[0], LinearMosaic) else "monochrome" if single else "rgb",
         channels=samples.facts,
         lights=_light_facts(images, contrast, index, prediction.alone, region.mask),
+        frame_shape=shape,
+        origin=view.origin,
         images=images,
         reflection_index=index,
         saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
@@ -206,6 +230,52 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
     if test is not None:
         return replace(test.frames, **given)
     return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _View:
+    """The part of a frame that is looked at.
+
+    Attributes
+    ----------
+    origin
+        Its first column and row, both even, so that the pattern of a mosaic stays what it is.
+    shape
+        Its rows and columns.
+    """
+
+    origin: tuple[int, int]
+    shape: tuple[int, int]
+
+    @classmethod
+    def around(cls, region: Region) -> _View:
+        """A region with its surroundings."""
+        spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0)]
+        first = [max(int(span[0]) - MARGIN, 0) // 2 * 2 for span in spans]
+        last = [min(int(span[-1]) + 1 + MARGIN, side) for span, side in zip(spans, region.mask.shape, strict=True)]
+        return cls(origin=(first[1], first[0]), shape=(last[0] - first[0], last[1] - first[1]))
+
+    def frame(self, frame: Frame) -> Frame:
+        """The part of a frame."""
+        return replace(frame, values=np.ascontiguousarray(frame.values[..., *self._slices]))
+
+    def region(self, region: Region) -> Region:
+        """The region in it."""
+        x, y = self.origin
+        corners = None
+        if region.rectangle is not None:
+            x0, y0, x1, y1 = region.rectangle
+            corners = x0 - x, y0 - y, x1 - x, y1 - y
+        return Region(mask=region.mask[self._slices], rectangle=corners)
+
+    def crosstalk(self, crosstalk: Crosstalk) -> Crosstalk:
+        """The crosstalk in it."""
+        return crosstalk.cropped(self.origin, self.shape)
+
+    @property
+    def _slices(self) -> tuple[slice, slice]:
+        (x, y), (rows, columns) = self.origin, self.shape
+        return slice(y, y + rows), slice(x, x + columns)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -277,17 +347,19 @@ def _separated(
     return _Separated(images=lights(full), disturbances=Disturbances.of_channels(full, lights, noise, random))
 
 
-def _check_frames(linear: Linear) -> None:
-    shapes = {frame.values.shape for frame in linear}
+def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
+    """Rows and columns of frames that can be inspected."""
+    first, shapes = frames[0], {frame.values.shape for frame in frames}
     if len(shapes) > 1:
         raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")
-    if len(linear) > 1 and (isinstance(linear[0], LinearMosaic) or len(linear[0].values) > 1):
-        raise InputError(f"{len(linear)} frames are for lights in succession before a monochrome camera")
-    rows, columns = linear[0].values.shape[-2:]
+    if len(frames) > 1 and (isinstance(first, Mosaic) or len(first.values) > 1):
+        raise InputError(f"{len(frames)} frames are for lights in succession before a monochrome camera")
+    rows, columns = first.values.shape[-2:]
     if min(rows, columns) < SMALLEST_FRAME:
         raise InputError(
             f"an inspection needs at least {SMALLEST_FRAME} x {SMALLEST_FRAME} px; the frame has {columns} x {rows}"
         )
+    return rows, columns
 
 
 def _check_light(channels: list[Channel], inside: BoolArray) -> None:

@@ -8,7 +8,7 @@ the root of the spectrum of the speckle's gradient. Every light counts with the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -26,7 +26,7 @@ from rgbmidic.lab.inspection.disturbances import Disturbances
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Prediction", "nodal_std", "predict"]
+__all__ = ["Prediction", "expected_std", "predict"]
 
 
 _GRID, _REACH = 64, 16
@@ -86,50 +86,60 @@ def predict(
     prefilter
         Of the solve (`rgbmidic.correlation.images.PREFILTERS`).
     """
-    relative = disturbances.map(lambda images: np.divide(images, level, out=np.zeros_like(images), where=contrast > 0))
-    own = contrast**2 - _smooth(relative.variance, region.mask, mesh.size)
-    contrast = np.sqrt(np.maximum(own, 0) * (contrast > 0))
-    residual = relative.map(lambda images: _each(images, lambda image: apply_prefilter(image, prefilter))).variance
-    variance = _smooth(residual, region.mask, mesh.size)
-    pull = np.divide(contrast, variance, out=np.zeros_like(contrast), where=variance > 0)
+    light = contrast > 0
     energy, kernel = _gradient(texture, prefilter)
-    scores = relative.map(
-        lambda images: _each(images, lambda image: np.asarray(cv2.filter2D(image, -1, kernel), dtype=np.float32))
-    )
+
+    def filtered(draws: FloatImage, change: Callable[[FloatImage], FloatImage]) -> Iterator[FloatImage]:
+        """Draws (n, k, H, W) relative to the level of the light, one (k, H, W) after the other, every image changed."""
+        for draw in draws:
+            relative = np.divide(draw, level, out=np.zeros_like(draw), where=light)
+            yield np.stack([change(image) for image in relative])
+
+    def variance(change: Callable[[FloatImage], FloatImage]) -> FloatImage:
+        """Local mean square (k, H, W) of all disturbances of one state."""
+        total = np.zeros_like(contrast)
+        for draws in parts:
+            for images in filtered(draws, change):
+                total += images**2 / np.float32(len(draws))
+        return _smooth(total, region.mask, mesh.size)
+
+    parts = disturbances.noise[None], disturbances.mosaic
+    own = np.sqrt(np.maximum(contrast**2 - variance(lambda image: image), 0) * light)
+    residual = variance(lambda image: apply_prefilter(image, prefilter))
+    pull = np.divide(own, residual, out=np.zeros_like(own), where=residual > 0)
     pixels = PixelMap.from_mesh(mesh, region)
 
-    def std(pull: FloatImage, *parts: FloatImage) -> FloatArray:
-        """Of lights that pull so much, from some of the draws (n, k, H, W)."""
-        square = sum(((pull * part).sum(axis=1) ** 2).mean(axis=0) for part in parts if len(part))
-        score = 2 * _smooth(np.asarray(square, dtype=np.float32)[None], region.mask, mesh.size)[0]
-        information = energy * (pull * contrast).sum(axis=0)
-        return nodal_std(mesh, _element_means(information, pixels), _element_means(score, pixels))
+    def scores(draws: FloatImage) -> FloatArray:
+        """Score (1 + k, E) of all lights together and of each alone, between two states."""
+        total = np.zeros((1 + len(pull), *pull.shape[1:]), dtype=np.float32)
+        for images in filtered(draws, lambda image: np.asarray(cv2.filter2D(image, -1, kernel), dtype=np.float32)):
+            images *= pull
+            total[0] += images.sum(axis=0) ** 2 / np.float32(len(draws))
+            total[1:] += images**2 / np.float32(len(draws))
+        return 2 * _element_means(_smooth(total, region.mask, mesh.size), pixels)
 
-    noise, mosaic = scores.noise[None], scores.mosaic
-    each = [np.where(np.arange(len(pull))[:, None, None] == light, pull, 0) for light in range(len(pull))]
-    return Prediction(
-        std=std(pull, noise, mosaic),
-        noise=std(pull, noise),
-        mosaic=std(pull, mosaic) if len(mosaic) else np.zeros(len(mesh.nodes)),
-        alone=tuple(std(alone, noise, mosaic) for alone in each),
-    )
+    noise, mosaic = (scores(draws) for draws in parts)
+    information = energy * _element_means(pull * own, pixels)
+    together = expected_std(mesh, information.sum(axis=0), noise[0] + mosaic[0], noise[0], mosaic[0])
+    alone = [expected_std(mesh, info, score)[0] for info, score in zip(information, (noise + mosaic)[1:], strict=True)]
+    return Prediction(std=together[0], noise=together[1], mosaic=together[2], alone=tuple(alone))
 
 
-def nodal_std(mesh: Tri3Mesh, information: FloatArray, score: FloatArray) -> FloatArray:
-    """Standard uncertainty (N,) of a displacement component at the nodes, px; NaN where they see too little.
+def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -> FloatArray:
+    """Standard uncertainty (n, N) of a displacement component at the nodes, px; NaN where they see too little.
 
     Parameters
     ----------
     mesh
         The mesh.
-    information, score : ndarray, shape (E,)
-        Per pixel of each element: of the Hessian, and of the variance of the right-hand side.
+    information, *scores : ndarray, shape (E,)
+        Per pixel of each element: of the Hessian, and n variances of the right-hand side.
     """
     area = mesh.to_nodes(mesh.areas)
     density = mesh.to_nodes(information * mesh.areas) / area
     seen = density > SEEN * np.median(density[density > 0]) if (density > 0).any() else np.zeros(len(density), bool)
     if not seen.any():
-        return np.full(len(density), np.nan)
+        return np.full((len(scores), len(density)), np.nan)
     assembly = Assembly.from_mesh(mesh)
     mass = ((1 + np.eye(3)) / 12)[..., None] * np.array([1.0, 0.0, 1.0])
 
@@ -138,8 +148,8 @@ def nodal_std(mesh: Tri3Mesh, information: FloatArray, score: FloatArray) -> Flo
 
     # elements that no light sees must not make the system singular
     solve = factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
-    along_x = displacement_functionals(len(density))[:1]
-    std = functional_std(solve, assembled(score), NodeColouring.from_mesh(mesh), along_x, seen)[:, 0]
+    along_x, colouring = displacement_functionals(len(density))[:1], NodeColouring.from_mesh(mesh)
+    std = np.stack([functional_std(solve, assembled(score), colouring, along_x, seen)[:, 0] for score in scores])
     return np.where(seen & (std < LOST), std, np.nan)
 
 
@@ -158,18 +168,13 @@ def _gradient(texture: TextureModel, prefilter: str) -> tuple[float, FloatImage]
     return float((gradient * filtered).mean()), kernel[near, near].astype(np.float32)
 
 
-def _each(images: FloatImage, change: Callable[[FloatImage], FloatImage]) -> FloatImage:
-    """Every image (H, W) of a stack (..., H, W) changed."""
-    flat = [change(image) for image in images.reshape(-1, *images.shape[-2:])]
-    return np.array(flat, dtype=np.float32).reshape(images.shape)
-
-
 def _smooth(images: FloatImage, inside: BoolArray, width: float) -> FloatImage:
     """Local means of images (n, H, W) over what lies inside the region, over about an element and its neighbours."""
     return np.stack([np.nan_to_num(local_mean(np.where(inside, image, np.float32(np.nan)), width)) for image in images])
 
 
-def _element_means(image: FloatImage, pixels: PixelMap) -> FloatArray:
-    """Mean (E,) of an image (H, W) over the pixels of each element; 0 for one without pixels."""
-    total = np.concatenate([[0.0], np.cumsum(pixels.gather(image), dtype=np.float64)])[pixels.offsets]
-    return np.asarray(np.diff(total) / np.maximum(np.diff(pixels.offsets), 1))
+def _element_means(images: FloatImage, pixels: PixelMap) -> FloatArray:
+    """Means (n, E) of images (n, H, W) over the pixels of each element; 0 for one without pixels."""
+    total = np.cumsum(pixels.gather(images), axis=1, dtype=np.float64)
+    ends = np.pad(total, ((0, 0), (1, 0)))[:, pixels.offsets]
+    return np.asarray(np.diff(ends, axis=1) / np.maximum(np.diff(pixels.offsets), 1))

@@ -153,7 +153,8 @@ def inspection_figure(inspection: Inspection) -> Figure:
         _draw_trouble(figure.add_subplot(grid[-1, 0]), inspection)
         _draw_std(figure, figure.add_subplot(grid[-1, columns - 1]), figure.add_subplot(grid[-1, -1]), inspection)
         _write_summary(figure.add_subplot(grid[0, 1] if columns == 2 else grid[-1, 1]), inspection)
-        figure.suptitle(f"{inspection.name}, {width} x {height} px", fontsize=10)
+        rows_px, columns_px = inspection.frame_shape
+        figure.suptitle(f"{inspection.name}, {columns_px} x {rows_px} px", fontsize=10)
     return figure
 
 
@@ -270,13 +271,14 @@ def _reduced(image: AnyArray) -> AnyArray:
 
 
 def _extent(inspection: Inspection) -> tuple[float, float, float, float]:
-    height, width = inspection.region.shape
-    return (-0.5, width - 0.5, height - 0.5, -0.5)
+    (height, width), (x, y) = inspection.region.shape, inspection.origin
+    return (x - 0.5, x + width - 0.5, y + height - 0.5, y - 0.5)
 
 
 def _frame_axis(axis: Axes, inspection: Inspection, *, first: bool) -> None:
     """Pixel axes, and the outline of the region where it is not the whole frame."""
-    height, width = inspection.region.shape
+    left, right, bottom, top = _extent(inspection)
     if not inspection.region.all():
-        axis.contour(inspection.region, [0.5], colors=["#f2c037"], linewidths=0.8)
-    finish_picture(axis, (-0.5, width - 0.5), (-0.5, height - 0.5), first=first)
+        places = np.arange(left + 0.5, right), np.arange(top + 0.5, bottom)
+        axis.contour(*places, inspection.region, [0.5], colors=["#f2c037"], linewidths=0.8)
+    finish_picture(axis, (left, right), (top, bottom), first=first)

@@ -129,6 +129,10 @@ class Inspection:
         ``"bayer"``, ``"rgb"`` or ``"monochrome"``.
     channels : tuple of ChannelFacts
     lights : tuple of LightFacts
+    frame_shape : tuple of int
+        Rows and columns of the frame. Of it the region and its surroundings were looked at, H rows and W columns.
+    origin : tuple of int
+        Column and row of the frame at which the images below begin.
     images : IlluminationImages
         The separated lights (k, H, W), DN.
     reflection_index : ndarray, shape (k, H, W), float32, or None
@@ -146,7 +150,7 @@ class Inspection:
     element_size : float
         px.
     nodes : ndarray, shape (N, 2), float64
-        Of the mesh, (x, y) in px.
+        Of the mesh, (x, y) in px of the frame.
     elements : ndarray, shape (E, 3), int32
     std : ndarray, shape (N,), float64
         Predicted standard uncertainty of u, and of v, px, all lights together, camera noise and separation; NaN where
@@ -161,6 +165,8 @@ class Inspection:
     kind: str
     channels: tuple[ChannelFacts, ...]
     lights: tuple[LightFacts, ...]
+    frame_shape: tuple[int, int]
+    origin: tuple[int, int]
     images: IlluminationImages
     reflection_index: FloatImage | None
     saturated: BoolArray

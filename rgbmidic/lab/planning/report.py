@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FILES",
+    "UNCERTAINTY_WORDS",
+    "ZONE_WORDS",
     "lamp_rows",
     "plan_document",
     "plan_figure",
@@ -78,6 +80,20 @@ def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
         values = [std["median"], std["q95"], one["random_px"], one["feigned_by_domes_px"], one["mesh_px"]]
         rows.append([label, *("-" if value is None else f"{value:.4f}" for value in values)])
     return ["state", "median", "95 %", "random", "feigned", "mesh"], rows
+
+
+ZONE_WORDS = {
+    "all": "every light reflects",
+    "one, none": "a single light is clean, no light is",
+    "clipped": "white paint saturates a channel",
+}
+"""What the headings of `zone_rows` mean."""
+UNCERTAINTY_WORDS = {
+    "random": "camera noise, what demosaicing leaves of the mosaic, reflections that change",
+    "feigned": "droplets whose lit sides change look as if they moved",
+    "mesh": "what linear elements cannot follow; not part of median and 95 %",
+}
+"""What the headings of `uncertainty_rows` mean."""
 
 
 def _labelled(plan: Plan) -> list[tuple[str, dict[str, Any]]]:

@@ -1,4 +1,4 @@
-"""What a laboratory records before the test: one light at a time on a target, and dark frames."""
+"""What a laboratory records beside the test: one light at a time on a target, dark frames, a white card, checks."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from rgbmidic.scene.light import Light
 from rgbmidic.scene.scene import Plate, Scene
 from rgbmidic.scene.scenefile import Target
 from rgbmidic.scene.surface import Finish, Surface
+from rgbmidic.typing import FloatImage
 
-__all__ = ["dark_frames", "single_light_frames", "target_scene"]
+__all__ = ["check_frames", "dark_frames", "flat_frames", "single_light_frames", "target_scene"]
 
 Frame = Mosaic | ChannelFrame
+EXPOSURES = (0.06, 0.15, 0.3, 0.5, 0.8, 1.3)
+"""Share of the full scale that the brightest sample of a white card reaches; in the last it saturates."""
 _NO_LIGHT = Light(name="off", position=(0.0, 0.0, 0.0), power=0.0)
 
 
@@ -68,3 +71,39 @@ def dark_frames(camera: Camera, *, count: int = 3, seed: int) -> list[Frame]:
     lightless = replace(camera, crosstalk=np.ones((camera.channels, 1)))
     seeds = np.random.SeedSequence(seed).generate_state(count)
     return [record(darkness, lightless, (_NO_LIGHT,), seed=int(s)) for s in seeds]
+
+
+def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]:
+    """Frames of a white card under all lights together: `count` at each of the `EXPOSURES`."""
+    images = render(target_scene(scene, "white"))
+    brightest = float(np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images).max())
+    steps = np.random.SeedSequence(seed).spawn(len(EXPOSURES))
+    taken = []
+    for share, step in zip(EXPOSURES, steps, strict=True):
+        exposed = images * np.float32(share * scene.camera.full_scale / brightest)
+        taken.append([record(exposed, scene.camera, scene.lights, seed=int(s)) for s in step.generate_state(count)])
+    return taken
+
+
+def check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
+    """Frames of the specimen at rest: each light alone, all together ("all"), and "dark".
+
+    Parameters
+    ----------
+    scene
+        Its lights and camera.
+    images : ndarray, shape (k, H, W)
+        What each light alone gives.
+    count
+        Frames of each kind.
+    seed
+        Of the noise.
+    """
+    lit = {light.name: (light.name,) for light in scene.lights} | {"all": tuple(light.name for light in scene.lights)}
+    steps = np.random.SeedSequence(seed).spawn(len(lit) + 1)
+    frames = {"dark": dark_frames(scene.camera, count=count, seed=int(steps[-1].generate_state(1)[0]))}
+    for (name, on), step in zip(lit.items(), steps, strict=False):
+        frames[name] = [
+            record(images, scene.camera, scene.lights, seed=int(s), on=on) for s in step.generate_state(count)
+        ]
+    return frames

@@ -16,7 +16,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.virtual.capture import dark_frames, single_light_frames
+from rgbmidic.lab.virtual.capture import check_frames, dark_frames, flat_frames, single_light_frames
 from rgbmidic.lab.virtual.recording import record
 from rgbmidic.lab.virtual.rendering import render
 from rgbmidic.scene.camera import Camera
@@ -37,7 +37,8 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
     """Render what a SCENE.toml describes.
 
     Written to `out`: ``frames/`` (frame 0 shows the body at rest; a monochrome camera gets one folder per light),
-    ``dark/`` and ``light_NAME/`` for `rgbmidic-calibrate`, ``calibration.json`` (the true crosstalk and noise),
+    ``dark/``, ``light_NAME/``, ``flat_1/`` and so on and ``check/`` for `rgbmidic-calibrate`, ``calibration.json`` (the
+    true crosstalk and noise),
     ``truth.npz`` (displacement (T, 2, H, W) px of the material points at the pixels of frame 0, NaN where there is
     none), ``test.toml`` for `rgbmidic run`, and a copy of the scene.
 
@@ -74,10 +75,11 @@ def write_experiment(experiment: Experiment, out: Path, progress: Progress | Non
     _make_folder(out)
     scene, settings = experiment.scene, experiment.output
     states = (State(), *experiment.states)
-    seeds = np.random.SeedSequence(settings.seed).spawn(3)
+    seeds = np.random.SeedSequence(settings.seed).spawn(5)
     frame_seeds = seeds[0].generate_state(len(states) * len(scene.lights)).reshape(len(states), -1)
+    at_rest = render(scene)
     for index, state in enumerate(states):
-        images = render(scene, state)
+        images = render(scene, state) if index else at_rest
         _write_state(out, scene, settings, index, images, frame_seeds[index])
         if settings.noise_free:
             _save(out / "noise_free" / f"frame_{index:04d}.npz", images=images)
@@ -85,7 +87,7 @@ def write_experiment(experiment: Experiment, out: Path, progress: Progress | Non
             progress(index + 1, len(states), f"frame {index}: turned by {state.angle_deg:g} degrees")
     displacement = np.stack([truth(scene, state) for state in states])
     _save(out / "truth.npz", displacement=displacement.astype(np.float32), angle_deg=[s.angle_deg for s in states])
-    _write_captures(out, scene, settings, [int(seed.generate_state(1)[0]) for seed in seeds[1:]])
+    _write_captures(out, scene, settings, at_rest, [int(seed.generate_state(1)[0]) for seed in seeds[1:]])
     _true_calibration(scene).write(out / "calibration.json")
     test = out / "test.toml"
     test.write_text(_test_settings(scene, settings, _region(settings, displacement)), encoding="utf-8")
@@ -96,6 +98,8 @@ def _check_names_of_lights(scene: Scene) -> None:
     for light in scene.lights:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", light.name):
             raise InputError(f"a light's name becomes a folder's: letters, digits, - and _ only, not {light.name!r}")
+        if light.name in ("all", "dark"):
+            raise InputError(f"a light cannot be called {light.name!r}: that is the name of a folder of captures")
 
 
 def _make_folder(out: Path) -> None:
@@ -138,18 +142,20 @@ def _suffix(camera: Camera, settings: DatasetSettings) -> str:
 
 
 def _write_frame(folder: Path, index: int, frame: Frame, settings: DatasetSettings) -> None:
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     if isinstance(frame, Mosaic) and settings.format == "dng":
         write_dng(folder / f"frame_{index:04d}.dng", frame)
     else:
         write_tiff(folder / f"frame_{index:04d}.tif", frame)
 
 
-def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, seeds: list[int]) -> None:
+def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest: FloatImage, seeds: list[int]) -> None:
     count = settings.calibration_frames
     captures = single_light_frames(scene, count=count, seed=seeds[0], target=settings.target)
     groups = {f"light_{name}": frames for name, frames in captures.items()}
     groups["dark"] = dark_frames(scene.camera, count=count, seed=seeds[1])
+    groups |= {f"flat_{i}": frames for i, frames in enumerate(flat_frames(scene, seed=seeds[2]), start=1)}
+    groups |= {f"check/{name}": frames for name, frames in check_frames(scene, at_rest, seed=seeds[3]).items()}
     for folder, frames in groups.items():
         for index, frame in enumerate(frames):
             _write_frame(out / folder, index, frame, settings)

@@ -194,3 +194,24 @@ def test_design_lists_the_best_set(run, tmp_path):
     code, _, error = run("design", "--camera", "no.json", *lamps)
     assert code == 2
     assert "not found" in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["crosstalk"], "Missing option '--light'"),
+        (["crosstalks"], "No such command"),
+        (["crosstalk", *LIGHTS, "--shape", "512"], "--shape is ROWSxCOLUMNS, such as 512x768, not '512'"),
+    ],
+)
+def test_a_wrong_use_is_one_line_as_of_the_other_command(run, arguments, said):
+    code, _, error = run(*arguments)
+    assert (code, error.count("\n")) == (2, 1)
+    assert error.startswith("error: ")
+    assert said in error
+
+
+def test_without_arguments_it_shows_its_help(run):
+    code, shown, _ = run()
+    assert code == 0
+    assert "crosstalk" in shown

@@ -15,17 +15,20 @@ from small_tests import REGION, colour_test, grey_frame
 
 import rgbmidic
 from rgbmidic import cli
+from rgbmidic.command import execute
 from rgbmidic.correlation import correlate
 from rgbmidic.errors import FrameError, InputError, RegionError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import CrosstalkField
 from rgbmidic.illumination.linearise import NoiseModel, linearise
+from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
 from rgbmidic.lab.inspection.disturbances import gaussian_field
-from rgbmidic.lab.inspection.prediction import nodal_std
+from rgbmidic.lab.inspection.prediction import expected_std
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -42,7 +45,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run the command in this process: exit status, standard output, standard error."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
-        status = cli._run([str(argument) for argument in arguments], debug=False)
+        status = execute(cli.app, [str(argument) for argument in arguments], debug=False)
         return status, *capsys.readouterr()
 
     return run
@@ -141,13 +144,13 @@ def test_inner_nodes_of_an_even_field_follow_the_closed_form_of_plan():
     side, information, score = 20.0, 0.03, 7e-6
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 240, 240), (241, 241)), side)
     everywhere = np.ones(len(mesh.elements))
-    std = nodal_std(mesh, information * everywhere, score * everywhere)
+    (std,) = expected_std(mesh, information * everywhere, score * everywhere)
     inner = ((mesh.nodes > 60) & (mesh.nodes < 180)).all(axis=1)
     closed = np.sqrt(node_constant() * score) / (side * information)
     assert np.sqrt(np.mean(std[inner] ** 2)) == pytest.approx(closed, rel=0.01)
     assert std[~inner].max() > 1.4 * closed
     blind = np.where((mesh.nodes[mesh.elements].mean(axis=1)[:, 0] < 100), 0.0, information)
-    assert np.isnan(nodal_std(mesh, blind, score * everywhere)).mean() == pytest.approx(5 / 13, abs=0.01)
+    assert np.isnan(expected_std(mesh, blind, score * everywhere)).mean() == pytest.approx(5 / 13, abs=0.01)
 
 
 def test_noise_is_estimated_from_a_flat_or_coarsely_painted_frame():
@@ -209,6 +212,37 @@ def test_more_noise_and_smaller_elements_mean_more_uncertainty():
     assert np.nanmedian(noisy.noise_std) / np.nanmedian(mat().noise_std) == pytest.approx(ratio, rel=0.2)
     small = inspect_frame(raw(mat_lights()), calibration=CALIBRATION, element_size=16)
     assert 1.2 < np.nanmedian(small.std) / np.nanmedian(mat().std) < 2.0
+
+
+def test_only_the_region_and_its_surroundings_are_looked_at_where_they_are():
+    """Registration and crosstalk that vary over the frame hold at the frame's own coordinates."""
+    shape = (420, 440)
+    lights = mat_lights(shape=shape)
+    centre, radius = frame_geometry(shape)
+    parameters = np.array([[0, 0, 0, 0, 0], [0.2, 0, 0, 2e-3, 0], [0, -0.3, 0, -1e-3, 0.0]])
+    varying = np.zeros((2, 3, 3))
+    varying[0, 1, 0] = 0.08
+    calibration = Calibration(
+        crosstalk=replace(CROSSTALK, field=CrosstalkField(order=1, coefficients=varying, shape=shape)),
+        noise=NOISE,
+        registration=Registration(lights=CROSSTALK.lights, parameters=parameters, centre=centre, radius=radius),
+    )
+    steps = []
+    part = inspect_frame(
+        raw(lights), calibration=calibration, region=(251, 231, 330, 300), progress=lambda *step: steps.append(step)
+    )
+    assert part.origin == (154, 134)
+    assert part.images.shape == (300 + 97 - 134, 330 + 97 - 154)
+    assert part.frame_shape == shape
+    assert part.nodes.min(axis=0) == pytest.approx((251, 231))
+    assert part.nodes.max(axis=0) == pytest.approx((330, 300))
+    assert [done for done, _, _ in steps] == [0, 1, 2, 3]
+    whole = inspect_frame(raw(lights), calibration=calibration)
+    inside = np.s_[:, 231:301, 251:331]
+    moved = np.s_[:, 231 - 134 : 301 - 134, 251 - 154 : 331 - 154]
+    difference = part.images.values[moved] - whole.images.values[inside]
+    # the texture is learnt from another part of the frame; half a pixel beside, it would be 30 % of the contrast
+    assert np.sqrt(np.nanmean(difference**2)) < 0.02 * np.nanstd(whole.images.values[inside])
 
 
 def test_the_same_frame_gives_the_same_figures():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rgbmidic import cli
+from rgbmidic.command import execute
 from rgbmidic.errors import ResultError
 from rgbmidic.lab.planning.lamps import propose_lamps
 from rgbmidic.lab.planning.plan import make_plan
@@ -95,11 +96,12 @@ def test_nothing_is_overwritten_unless_asked(made, tmp_path):
 
 def test_the_command_prints_the_tables_and_writes_the_files(made, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     scene, plan, _ = made
-    assert cli._run(["plan", str(scene), "--out", str(tmp_path / "out")], debug=False) == 0
+    assert execute(cli.app, ["plan", str(scene), "--out", str(tmp_path / "out")], debug=False) == 0
     printed = capsys.readouterr().out
     assert max(len(line) for line in printed.splitlines() if "plan.json" not in line) <= 100
     assert "lamps as they are: reflections overlap on up to" in printed
     assert f"u_std {plan.std:.4f} px" in printed
+    assert all(f"  {word}: " in printed for word in ("random", "feigned", "mesh", "clipped"))
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["plan.json", "plan.png"]
-    assert cli._run(["plan", str(scene), "--out", str(tmp_path / "out")], debug=False) == 2
+    assert execute(cli.app, ["plan", str(scene), "--out", str(tmp_path / "out")], debug=False) == 2
     assert "--overwrite" in capsys.readouterr().err

@@ -66,7 +66,7 @@ def test_same_scene_gives_the_same_bytes(tmp_path):
     for name in ("a", "b"):
         write_dataset(path, tmp_path / name)
     files = sorted(file.relative_to(tmp_path / "a") for file in (tmp_path / "a").rglob("*.tif"))
-    assert len(files) == 2 + 4 * 2
+    assert len(files) == 2 + 4 * 2 + 6 * 2 + 5 * 2
     assert all((tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes() for file in files)
 
 
