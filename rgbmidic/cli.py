@@ -70,6 +70,7 @@ def run(
 
     started = time.perf_counter()
     settings = read_test(test)
+    _tell_first_run()
     from rgbmidic.report import remove_figures, write_figures
 
     with _progress("measuring") as progress:
@@ -120,12 +121,17 @@ def demo(
     ),
 ) -> None:
     """Make a small virtual test, calibrate, measure it, and compare with the known truth."""
+    _messages.print(
+        f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}", soft_wrap=True
+    )
+    _tell_first_run()
     from rgbmidic.lab.demo import run_demo
     from rgbmidic.report import write_figures
 
     started = time.perf_counter()
     with _progress("demo") as progress:
-        rows = run_demo(out, _messages.print, _calibrate_demo, progress)
+        rows = run_demo(out, lambda line: _messages.print(line, soft_wrap=True), _calibrate_demo, progress)
+    _messages.print(f"5 of 5: pictures of the result in {out / 'figures'}", soft_wrap=True)
     write_figures(Result.open(out / "result"), out / "figures")
     table = Table(title="Displacement error against the exact truth, px (a sphere turning under moving reflections)")
     for heading in ("angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"):
@@ -155,6 +161,7 @@ def virtual(
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.lab.virtual.dataset import write_dataset
 
+    _tell_first_run()
     with _progress("rendering") as progress:
         write_dataset(scene, out, progress)
 
@@ -212,6 +219,7 @@ def inspect(
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
     settings = None if test is None else read_test(test)
+    _tell_first_run()
     stated: dict[str, object] = {
         "kind": kind,
         "cfa": cfa,
@@ -300,6 +308,18 @@ def _whole_numbers(text: str, option: str) -> list[int]:
         return [int(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"{option} are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
+
+
+def _tell_first_run() -> None:
+    """Say why the first use takes longer."""
+    from rgbmidic._kernels import are_compiled
+
+    if not are_compiled():
+        _messages.print(
+            "first run on this machine: kernels are compiled for its processor as they are needed, in all about a "
+            "minute and a half on two cores; later runs take them from a cache",
+            soft_wrap=True,
+        )
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -267,3 +268,23 @@ def test_a_shape_is_written_one_way_and_read_in_two(text: str, shape: tuple[int,
 def test_a_wrong_shape_is_answered_with_an_example(command: Run, tmp_path: Path) -> None:
     status, _, error = command("inspect", tmp_path / "a.raw", "--shape", "512 768")
     assert (status, error) == (2, "error: --shape is ROWSxCOLUMNS, such as 512x768, not '512 768'\n")
+
+
+def test_the_first_run_says_that_kernels_are_compiled(
+    command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    (taken / "file").touch()
+    for compiled in (False, True):
+        monkeypatch.setattr("rgbmidic._kernels.are_compiled", lambda compiled=compiled: compiled)
+        status, _, said = command("demo", "--out", taken)
+        assert status == 2
+        assert ("first run on this machine" in said) == (not compiled)
+
+
+def test_kernels_are_not_compiled_where_the_cache_is_empty(tmp_path: Path) -> None:
+    code = "from rgbmidic._kernels import are_compiled; print(are_compiled())"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout.strip() == "False"
