@@ -1,6 +1,6 @@
 """Whether displacement and stated uncertainty hold without tuning: reflections, noise alone, spoiled frames.
 
-    python benchmarks/uncertainty.py [sphere areas scenes noise spoiled curvature texture] [--quick] [--cache FOLDER]
+    python benchmarks/uncertainty.py [TABLE ...] [--quick] [--cache FOLDER]
 
 Scenes of `rgbmidic.lab.virtual` with exact truth, seen by a raw Bayer camera (reflection-aware) and by an ideal
 3-CCD one; every setting is the default of `rgbmidic.correlation.correlate` with images divided by their local mean
@@ -458,6 +458,32 @@ def texture(quick: bool) -> None:
             )
 
 
+def elements(quick: bool) -> None:
+    """Elements and regions of any size: a plain texture at rest, noise of 8 % of its contrast."""
+    image = 100 + 50 * _speckle(160, 3.5)
+    heading("elements, px", "region, px", "lights", "measured", "ratio", "covered", "stated / observed")
+    cases = [(size, 160, lights) for size in (40, 25, 20, 16, 12, 10, 8, 6, 5, 4) for lights in (1, 3)]
+    cases += [(25, side, 3) for side in (12, 16, 25, 40, 60)]
+    for size, side, lights in cases:
+        draws, corner = [], (160 - side) // 2
+        for draw in range(4 if quick else 12):
+            random = np.random.default_rng(draw)
+            first, second = (image + 4 * random.normal(size=(lights, 160, 160)) for _ in (0, 1))
+            region = (corner, corner, corner + side - 1, corner + side - 1)
+            draws.append(correlate(first, second, region=region, element_size=size, initial=(0.0, 0.0)))
+        error, std = (np.array([getattr(one, name) for one in draws]) for name in ("displacement", "displacement_std"))
+        ratio = error / std
+        spread = np.sqrt(np.nanmean(std**2, axis=0) / np.nanmean(error**2, axis=0))
+        share = np.isfinite(ratio).mean()
+        row(size, side, lights, f"{share:.1%}", rms(ratio), f"{covered(ratio):.1%}", float(np.nanmedian(spread)))
+
+
+def _speckle(size: int, width: float) -> FloatArray:
+    """Gaussian speckle of unit contrast; `width` (px) of the autocorrelation at half maximum."""
+    blurred = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(size + 40, size + 40)), (0, 0), width / 3.33)
+    return np.asarray(blurred[20:-20, 20:-20] / blurred.std())
+
+
 def main() -> None:
     """Read the command line and print the tables asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -479,6 +505,7 @@ TABLES: dict[str, Callable[[bool], None]] = {
     "spoiled": spoiled,
     "curvature": curvature,
     "texture": texture,
+    "elements": elements,
 }
 
 if __name__ == "__main__":

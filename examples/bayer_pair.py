@@ -45,8 +45,9 @@ with tempfile.TemporaryDirectory() as folder:
 
     found = np.stack([result.u[1], result.v[1]], axis=-1)
     std = np.stack([result.u_std[1], result.v_std[1]], axis=-1)
+    iterations = result.iterations[1]
 
 error = found - at_nodes(truth(scene, states[1]), result.nodes)
-print(f"lights {', '.join(result.lights)}; frame 1 in {result.iterations[1]} iterations")
+print(f"lights {', '.join(result.lights)}; frame 1 in {iterations} iterations")
 print(f"predicted uncertainty: {np.sqrt(np.mean(std**2)):.4f} px")
 print(f"rms error: {np.sqrt(np.mean(error**2)):.4f} px")

@@ -31,6 +31,7 @@ def random_record(seed: int) -> FrameRecord:
     pictures = random.integers(0, 256, (2, 3, 8, 12)).astype(np.uint8) if seed % 2 == 0 else (None, None)
     history = 0.5 * 0.1 ** np.arange(1 + seed % 5)
     values |= {
+        "number": seed,
         "status": seed % 2,
         "reason": "did not converge: é" if seed % 2 else "",
         "iterations": len(history),

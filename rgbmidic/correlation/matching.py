@@ -13,8 +13,10 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["matching_elements", "misfit"]
 
-_MATCHED = (0.4, 0.9)
+_MATCHED = (0.4, 0.6)
 """Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
+_MATCHED_PRECISE = (0.4, 0.9)
+"""The same where the lights count by their precision, so that a reflection in one of them is no mismatch."""
 _WORSE = 8.0
 """In between: how many times farther from 1 than the median of the elements around."""
 _AROUND = 61
@@ -39,7 +41,8 @@ def matching_elements(
     if least is not None:
         return np.asarray(coefficient >= least)
     typical = _median_around(mesh, coefficient, ff > 0)
-    return np.asarray(coefficient >= np.clip(1 - _WORSE * (1 - typical), *_MATCHED))
+    limits = _MATCHED if precision is None else _MATCHED_PRECISE
+    return np.asarray(coefficient >= np.clip(1 - _WORSE * (1 - typical), *limits))
 
 
 def _median_around(mesh: Tri3Mesh, values: FloatArray, textured: BoolArray) -> FloatArray:

@@ -99,10 +99,11 @@ def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
     return np.select(applied, [np.uint8(rule.status) for rule in RULES], np.uint8(NodeStatus.MEASURED))
 
 
-def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray) -> BoolArray:
+def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray, one_sided: BoolArray) -> BoolArray:
     """Elements (E,) to leave out of the next pass for a node that its own pixels do not hold.
 
-    A node whose own pixels match nothing wanders, though its elements match as a whole.
+    A node whose own pixels match nothing wanders, though its elements match as a whole; so does one whose texture is
+    `one_sided` (N,), but that is no mismatch.
 
     Parameters
     ----------
@@ -113,7 +114,7 @@ def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray) -> BoolAr
     motion : ndarray, shape (N,)
         Motion in the last iteration, px.
     """
-    lost = (std.max(axis=1) > LOST) | (motion > _WANDERING)
+    lost = ~one_sided & ((std.max(axis=1) > LOST) | (motion > _WANDERING))
     return np.asarray(lost[mesh.elements].any(axis=1))
 
 

@@ -10,7 +10,7 @@ from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.grey_level import corrected_values
 from rgbmidic.correlation.iteration import Estimate, Problem, compare
 from rgbmidic.correlation.matching import matching_elements
-from rgbmidic.correlation.node_status import lost_elements
+from rgbmidic.correlation.node_status import lost_elements, one_sided_texture
 from rgbmidic.correlation.precision import Precision, learn_precision
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.nodal import nodal_std
@@ -90,7 +90,8 @@ def next_weighting(
         exhausted = len(estimate.increments) >= problem.options.max_iterations
         motion = np.zeros(len(estimate.displacement)) if exhausted else estimate.increments[-1]
         std = standard_uncertainty(residual, equations, last.precision, 2)
-        matched &= ~lost_elements(problem.reference.mesh, std, motion)
+        one_sided = one_sided_texture(equations, residual)
+        matched &= ~lost_elements(problem.reference.mesh, std, motion, one_sided)
     # where elements have come back, what was learnt from their wrong match must be learnt anew, and once more: in
     # the pass that brings them back the residual is still that of a wrong match
     returned = number + 1 if (matched & ~last.matched).any() else last.returned

@@ -163,7 +163,7 @@ def test_run_in_which_no_deformed_frame_is_measured_is_a_failure(
         assert error.startswith("error: no deformed frame is measured")
         assert told in error
         assert f"{len(ends)} deformed: 0 converged, {len(ends)} failed" in printed
-        assert "75" not in printed
+        assert "75.0%" not in printed
 
 
 def test_run_tells_how_many_deformed_frames_failed(

@@ -21,7 +21,7 @@ _MANY = 2000
 _ANCHOR = 1e-6
 """Multiple of the identity, over the mean diagonal entry, that holds nodes without texture."""
 _LEAST = 0.05
-"""Least share: what rounding would make of it must not blow the uncertainty up (elements of 4 px leave 0.1)."""
+"""Share under which the residual tells nothing of the noise: a region of one block (elements of 4 px leave 0.1)."""
 
 
 def unfitted_share(pixels: PixelMap, assembly: Assembly, gradient_x: FloatImage, gradient_y: FloatImage) -> float:
@@ -30,7 +30,7 @@ def unfitted_share(pixels: PixelMap, assembly: Assembly, gradient_x: FloatImage,
     The residual is the noise less its projection P on the columns ``J = grad f phi`` of the least-squares problem. The
     score of block b is the product with ``c = grad f 1_b``, so ``1 - |P c|^2 / |c|^2`` of its variance is left, with
     ``|P c|^2 = (J^T c)^T (J^T J)^-1 (J^T c)``; the mean over the blocks is returned. It falls from 0.85 for elements of
-    40 px to 0.1 for 4 px.
+    40 px to 0.1 for 4 px, and is not known (NaN) where nothing is left, in a region of about one block.
 
     Parameters
     ----------
@@ -66,4 +66,5 @@ def unfitted_share(pixels: PixelMap, assembly: Assembly, gradient_x: FloatImage,
             element_vector(first * chosen, second * chosen, *geometry, parts)
             column = assembly.vector(parts)
             fitted += float(column @ solve(column))
-    return max(1 - fitted / max(total, 1e-300), _LEAST)
+    share = 1 - fitted / max(total, 1e-300)
+    return share if share > _LEAST else float("nan")
