@@ -31,6 +31,7 @@ __all__ = [
     "check_names",
     "convert_value",
     "read_test",
+    "read_toml",
 ]
 
 FrameKind = Literal["bayer", "rgb", "monochrome"]
@@ -328,6 +329,24 @@ class TestSettings:
         return document
 
 
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """The sections of a TOML file.
+
+    Raises
+    ------
+    ConfigurationError
+        The file, `what` in words, is missing or not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise ConfigurationError(f"{what} not found") from None
+    except (OSError, ValueError) as error:  # text that is no UTF-8 or no TOML, a number of too many digits
+        raise ConfigurationError(f"not a readable {what} (TOML): {error}") from None
+    except RecursionError:
+        raise ConfigurationError(f"not a readable {what} (TOML): nested too deeply") from None
+
+
 def read_test(path: Path | str) -> TestSettings:
     """Read the settings of a test from a TOML file; paths in it are relative to it.
 
@@ -338,13 +357,7 @@ def read_test(path: Path | str) -> TestSettings:
     """
     path = Path(path)
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise ConfigurationError(f"settings file not found: {path}") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigurationError(f"{path} is not a readable settings file (TOML): {error}") from None
-    try:
-        return TestSettings.from_mapping(document, path.parent)
+        return TestSettings.from_mapping(read_toml(path, "settings file"), path.parent)
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from None
 
@@ -422,6 +435,8 @@ def convert_value(value: Any, hint: Any, where: str, base: Path) -> Any:
         raise ConfigurationError(f"{where} must be one of {', '.join(map(_quoted, kinds))}, not {_quoted(value)}")
     if hint is Path and isinstance(value, str):
         return base / value
+    if type(value) is int and abs(value) >= 2**63:
+        raise ConfigurationError(f"{where} is a number of {len(str(abs(value)))} digits: TOML has up to 2**63")
     if (hint is float and type(value) is int) or type(value) is hint:
         return hint(value)
     raise ConfigurationError(f"{where} must be {_WORDS[hint]}, not {_quoted(value)}")

@@ -26,6 +26,8 @@ __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk"]
 
 SCHEMA_NAME = "rgbmidic-calibration"
 SCHEMA_VERSION = 1
+_LARGEST = 1e30
+"""Beyond it squares and products of figures would be infinite."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,10 +136,11 @@ class Calibration:
         """
         path = Path(path)
         try:
-            document = json.loads(path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            document = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole_number)
         except FileNotFoundError:
             raise CalibrationError(f"calibration file not found: {path}") from None
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise CalibrationError(f"{path} is not a readable calibration file: {error}") from None
         if not isinstance(document, dict) or document.get("schema") != SCHEMA_NAME:
             raise CalibrationError(f'{path} is not a calibration file: its "schema" is not "{SCHEMA_NAME}"')
@@ -148,28 +151,29 @@ class Calibration:
             )
         try:
             return cls._from_document(document)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             reason = f"missing key {error}" if isinstance(error, KeyError) else error
             raise CalibrationError(f"{path} is damaged: {reason}") from None
 
     @classmethod
     def _from_document(cls, document: dict[str, Any]) -> Calibration:
         known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
-        camera = document.get("camera", {})
+        camera, noise = (_section(document, name) or {} for name in ("camera", "noise"))
         if (cfa := camera.get("cfa")) is not None and cfa not in BAYER_PATTERNS:
             raise ValueError(f"camera.cfa is {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
-        noise = document.get("noise")
         shape = camera.get("shape")
         return cls(
-            crosstalk=_read_crosstalk(document.get("crosstalk")),
-            noise=noise and NoiseModel(gain=_positive(noise, "gain"), read_noise=_positive(noise, "read_noise")),
-            camera_noise=CameraNoise.from_document(noise["planes"]) if noise and "planes" in noise else None,
-            registration=_read_registration(document.get("registration")),
+            crosstalk=_read_crosstalk(_section(document, "crosstalk")),
+            noise=NoiseModel(gain=_positive(noise, "gain"), read_noise=_positive(noise, "read_noise"))
+            if noise
+            else None,
+            camera_noise=CameraNoise.from_document(noise["planes"]) if "planes" in noise else None,
+            registration=_read_registration(_section(document, "registration")),
             cfa=cfa,
             black_level=_level(camera, "black_level"),
             white_level=_level(camera, "white_level"),
             shape=None if shape is None else (int(shape[0]), int(shape[1])),
-            provenance=document.get("provenance", {}),
+            provenance=_section(document, "provenance") or {},
             extra={key: value for key, value in document.items() if key not in known},
         )
 
@@ -209,14 +213,15 @@ class Calibration:
 def _read_crosstalk(section: dict[str, Any] | None) -> Crosstalk | None:
     if section is None:
         return None
-    variation = section.get("field")
+    variation = _section(section, "field")
     return Crosstalk(
         matrix=section["matrix"],
-        lights=tuple(section["lights"]),
+        lights=_names(section["lights"]),
         std=section.get("std"),
         covariance=section.get("covariance"),
-        field=variation
-        and CrosstalkField(
+        field=None
+        if variation is None
+        else CrosstalkField(
             order=int(variation["order"]),
             coefficients=variation["coefficients"],
             shape=tuple(variation["shape"]),
@@ -248,7 +253,7 @@ def _read_registration(section: dict[str, Any] | None) -> Registration | None:
     if section is None:
         return None
     return Registration(
-        lights=tuple(section["lights"]),
+        lights=_names(section["lights"]),
         parameters=section["parameters"],
         centre=tuple(section["centre"]),
         radius=_positive(section, "radius"),
@@ -273,6 +278,33 @@ def _size(shape: tuple[int, int]) -> str:
 
 def _listed(values: FloatArray | None) -> Any:
     return None if values is None else values.tolist()
+
+
+def _section(document: dict[str, Any], name: str) -> dict[str, Any] | None:
+    """A section of the file, None where it is not there."""
+    section = document.get(name)
+    if section is not None and not isinstance(section, dict):
+        raise ValueError(f"{name} must be a section of keys, not {section!r}")
+    return section
+
+
+def _names(lights: Any) -> tuple[str, ...]:
+    if not isinstance(lights, list) or not all(isinstance(name, str) for name in lights):
+        raise ValueError(f"lights must be a list of names, not {lights!r}")
+    return tuple(lights)
+
+
+def _number(text: str) -> float:
+    """A number of the file; JSON knows neither NaN nor infinity, and no figure of a camera is beyond `_LARGEST`."""
+    value = float(text)
+    if not abs(value) <= _LARGEST:
+        raise ValueError(f"{text[:40]} is not a number of a calibration")
+    return value
+
+
+def _whole_number(text: str) -> int:
+    _number(text)
+    return int(text)
 
 
 def _positive(section: dict[str, Any], key: str) -> float:

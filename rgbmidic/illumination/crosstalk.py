@@ -75,6 +75,8 @@ class CrosstalkField:
             )
         object.__setattr__(self, "coefficients", values)
         object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
+        if min(self.shape) < 2:
+            raise CalibrationError(f"a crosstalk field spans frames of 2 x 2 px and more, not {self.shape}")
         if self.std is not None:
             object.__setattr__(self, "std", np.asarray(self.std, dtype=np.float64).reshape(values.shape))
 

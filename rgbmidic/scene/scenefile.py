@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
@@ -17,7 +16,12 @@ from rgbmidic.scene.in_plane import AffineField, InPlaneField, MeshField
 from rgbmidic.scene.light import Light, three_lights
 from rgbmidic.scene.scene import Body, Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface
-from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value  # the one strict reader of TOML values
+from rgbmidic.settings import (  # the one strict reader of TOML values
+    ELEMENT_SIZE,
+    check_names,
+    convert_value,
+    read_toml,
+)
 
 __all__ = ["DatasetSettings", "Experiment", "Target", "read_scene"]
 
@@ -89,13 +93,7 @@ def read_scene(path: Path | str) -> Experiment:
     """
     path = Path(path)
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise ConfigurationError(f"scene file not found: {path}") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigurationError(f"{path} is not a readable scene file (TOML): {error}") from None
-    try:
-        return _experiment(document, path.parent)
+        return _experiment(read_toml(path, "scene file"), path.parent)
     except (ConfigurationError, InputError) as error:
         raise ConfigurationError(f"{path}: {error}") from None
 
@@ -182,6 +180,8 @@ def _camera(table: dict[str, Any], body: Body, base: Path) -> Camera:
     if "model" in table:
         ready["sensitivities"] = Sensitivities.from_colour(convert_value(table.pop("model"), str, "camera.model", base))
     pixel = convert_value(table.pop("mm_per_pixel", PIXEL), float, "camera.mm_per_pixel", base)
+    if not pixel > 0:
+        raise ConfigurationError(f"camera.mm_per_pixel must be positive, not {pixel}")
     table.setdefault("shape", list(_SIZE))
     table.setdefault("focal_px", body.front[2] / pixel)
     camera: Camera = _build(Camera, table, "camera", base, **ready)
