@@ -36,7 +36,7 @@ from rgbmidic.lab.inspection.view import Frame, View
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
-from rgbmidic.typing import BoolArray
+from rgbmidic.typing import BoolArray, FloatImage
 
 __all__ = ["inspect_files", "inspect_frame", "state_frames"]
 
