@@ -340,11 +340,11 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
-        raise ConfigurationError(f"{what} not found") from None
+        raise ConfigurationError(f"{what} not found: {path}") from None
     except (OSError, ValueError) as error:  # text that is no UTF-8 or no TOML, a number of too many digits
-        raise ConfigurationError(f"not a readable {what} (TOML): {error}") from None
+        raise ConfigurationError(f"{path} is not a readable {what} (TOML): {error}") from None
     except RecursionError:
-        raise ConfigurationError(f"not a readable {what} (TOML): nested too deeply") from None
+        raise ConfigurationError(f"{path} is not a readable {what} (TOML): nested too deeply") from None
 
 
 def read_test(path: Path | str) -> TestSettings:
@@ -356,8 +356,9 @@ def read_test(path: Path | str) -> TestSettings:
         The file is missing, not TOML, or has an entry that `TestSettings.from_mapping` refuses; the file is named.
     """
     path = Path(path)
+    document = read_toml(path, "settings file")
     try:
-        return TestSettings.from_mapping(read_toml(path, "settings file"), path.parent)
+        return TestSettings.from_mapping(document, path.parent)
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from None
 

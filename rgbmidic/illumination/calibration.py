@@ -8,7 +8,6 @@ that sees it best.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,18 +15,25 @@ from typing import Any
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
+from rgbmidic.illumination.calibration_file import (
+    crosstalk_document,
+    read_crosstalk,
+    read_json,
+    read_level,
+    read_positive,
+    read_registration,
+    read_section,
+    registration_document,
+)
 from rgbmidic.illumination.camera_noise import CameraNoise
-from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.registration import Registration
-from rgbmidic.typing import FloatArray
 
 __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk"]
 
 SCHEMA_NAME = "rgbmidic-calibration"
 SCHEMA_VERSION = 1
-_LARGEST = 1e30
-"""Beyond it squares and products of figures would be infinite."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,8 +142,7 @@ class Calibration:
         """
         path = Path(path)
         try:
-            text = path.read_text(encoding="utf-8")
-            document = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole_number)
+            document = read_json(path)
         except FileNotFoundError:
             raise CalibrationError(f"calibration file not found: {path}") from None
         except (OSError, ValueError, RecursionError) as error:
@@ -158,22 +163,22 @@ class Calibration:
     @classmethod
     def _from_document(cls, document: dict[str, Any]) -> Calibration:
         known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
-        camera, noise = (_section(document, name) or {} for name in ("camera", "noise"))
+        camera, noise = (read_section(document, name) or {} for name in ("camera", "noise"))
         if (cfa := camera.get("cfa")) is not None and cfa not in BAYER_PATTERNS:
             raise ValueError(f"camera.cfa is {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
         shape = camera.get("shape")
         return cls(
-            crosstalk=_read_crosstalk(_section(document, "crosstalk")),
-            noise=NoiseModel(gain=_positive(noise, "gain"), read_noise=_positive(noise, "read_noise"))
+            crosstalk=read_crosstalk(read_section(document, "crosstalk")),
+            noise=NoiseModel(gain=read_positive(noise, "gain"), read_noise=read_positive(noise, "read_noise"))
             if noise
             else None,
             camera_noise=CameraNoise.from_document(noise["planes"]) if "planes" in noise else None,
-            registration=_read_registration(_section(document, "registration")),
+            registration=read_registration(read_section(document, "registration")),
             cfa=cfa,
-            black_level=_level(camera, "black_level"),
-            white_level=_level(camera, "white_level"),
+            black_level=read_level(camera, "black_level"),
+            white_level=read_level(camera, "white_level"),
             shape=None if shape is None else (int(shape[0]), int(shape[1])),
-            provenance=_section(document, "provenance") or {},
+            provenance=read_section(document, "provenance") or {},
             extra={key: value for key, value in document.items() if key not in known},
         )
 
@@ -184,13 +189,13 @@ class Calibration:
         camera["shape"] = None if self.shape is None else list(self.shape)
         document["camera"] = {key: value for key, value in camera.items() if value is not None}
         if self.crosstalk is not None:
-            document["crosstalk"] = _crosstalk_document(self.crosstalk)
+            document["crosstalk"] = crosstalk_document(self.crosstalk)
         if self.noise is not None:
             document["noise"] = {"gain": self.noise.gain, "read_noise": self.noise.read_noise}
             if self.camera_noise is not None:
                 document["noise"]["planes"] = self.camera_noise.to_document()
         if self.registration is not None:
-            document["registration"] = _registration_document(self.registration)
+            document["registration"] = registration_document(self.registration)
         return {**document, **self.extra, "provenance": dict(self.provenance)}
 
     def write(self, path: Path | str) -> None:
@@ -210,112 +215,5 @@ class Calibration:
             raise CalibrationError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
-def _read_crosstalk(section: dict[str, Any] | None) -> Crosstalk | None:
-    if section is None:
-        return None
-    variation = _section(section, "field")
-    return Crosstalk(
-        matrix=section["matrix"],
-        lights=_names(section["lights"]),
-        std=section.get("std"),
-        covariance=section.get("covariance"),
-        field=None
-        if variation is None
-        else CrosstalkField(
-            order=int(variation["order"]),
-            coefficients=variation["coefficients"],
-            shape=tuple(variation["shape"]),
-            std=variation.get("std"),
-        ),
-    )
-
-
-def _crosstalk_document(crosstalk: Crosstalk) -> dict[str, Any]:
-    document: dict[str, Any] = {
-        "lights": list(crosstalk.lights),
-        "matrix": crosstalk.matrix.tolist(),
-        "std": _listed(crosstalk.std),
-        "covariance": _listed(crosstalk.covariance),
-        "condition_number": crosstalk.condition_number,
-        "noise_amplification": crosstalk.noise_amplification.tolist(),
-    }
-    if (variation := crosstalk.field) is not None:
-        document["field"] = {
-            "order": variation.order,
-            "shape": list(variation.shape),
-            "coefficients": variation.coefficients.tolist(),
-            "std": _listed(variation.std),
-        }
-    return document
-
-
-def _read_registration(section: dict[str, Any] | None) -> Registration | None:
-    if section is None:
-        return None
-    return Registration(
-        lights=_names(section["lights"]),
-        parameters=section["parameters"],
-        centre=tuple(section["centre"]),
-        radius=_positive(section, "radius"),
-        covariance=section.get("covariance"),
-    )
-
-
-def _registration_document(registration: Registration) -> dict[str, Any]:
-    return {
-        "lights": list(registration.lights),
-        "parameter_names": ["shift_x_px", "shift_y_px", "rotation_rad", "scale", "radial_at_radius"],
-        "parameters": registration.parameters.tolist(),
-        "centre": list(registration.centre),
-        "radius": registration.radius,
-        "covariance": _listed(registration.covariance),
-    }
-
-
 def _size(shape: tuple[int, int]) -> str:
     return f"{shape[1]} x {shape[0]}"
-
-
-def _listed(values: FloatArray | None) -> Any:
-    return None if values is None else values.tolist()
-
-
-def _section(document: dict[str, Any], name: str) -> dict[str, Any] | None:
-    """A section of the file, None where it is not there."""
-    section = document.get(name)
-    if section is not None and not isinstance(section, dict):
-        raise ValueError(f"{name} must be a section of keys, not {section!r}")
-    return section
-
-
-def _names(lights: Any) -> tuple[str, ...]:
-    if not isinstance(lights, list) or not all(isinstance(name, str) for name in lights):
-        raise ValueError(f"lights must be a list of names, not {lights!r}")
-    return tuple(lights)
-
-
-def _number(text: str) -> float:
-    """A number of the file; JSON knows neither NaN nor infinity, and no figure of a camera is beyond `_LARGEST`."""
-    value = float(text)
-    if not abs(value) <= _LARGEST:
-        raise ValueError(f"{text[:40]} is not a number of a calibration")
-    return value
-
-
-def _whole_number(text: str) -> int:
-    _number(text)
-    return int(text)
-
-
-def _positive(section: dict[str, Any], key: str) -> float:
-    value = section[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"{key} must be a positive number, not {value!r}")
-    return float(value)
-
-
-def _level(camera: dict[str, Any], key: str) -> float | None:
-    value = camera.get(key)
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
-        raise ValueError(f"camera.{key} must be a number, not {value!r}")
-    return None if value is None else float(value)

@@ -92,8 +92,9 @@ def read_scene(path: Path | str) -> Experiment:
         The file is missing, not TOML, or has an entry that is unknown, of the wrong type or impossible; named.
     """
     path = Path(path)
+    document = read_toml(path, "scene file")
     try:
-        return _experiment(read_toml(path, "scene file"), path.parent)
+        return _experiment(document, path.parent)
     except (ConfigurationError, InputError) as error:
         raise ConfigurationError(f"{path}: {error}") from None
 

@@ -12,7 +12,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.lab.study import METHODS, run_paper_study
 from rgbmidic.lab.study.causes import VARIATIONS, find_causes
 from rgbmidic.lab.study.claims import judge
-from rgbmidic.lab.study.paper import PaperStudy
+from rgbmidic.lab.study.results import PaperStudy
 
 ANGLES = (1.0, 8.0)
 

@@ -250,7 +250,7 @@ def test_installed_command_ends_with_the_status_and_without_traceback(tmp_path: 
             text=True,
         )
         assert done.returncode == 2
-        assert done.stderr.splitlines()[-1] == "error: none.toml: settings file not found"
+        assert done.stderr.splitlines()[-1] == "error: settings file not found: none.toml"
         assert ("Traceback" in done.stderr) is traces
 
 

@@ -16,32 +16,32 @@ from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import ReflectionAwareDemosaicer
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
-from rgbmidic.illumination.images import REFLECTING, IlluminationImages
+from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel, linearise
-from rgbmidic.illumination.normalise import DARK, local_mean
 from rgbmidic.illumination.separate import DEFAULT_METHOD, reconstructed_lights, separate
-from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.lab.inspection.disturbances import Disturbances
-from rgbmidic.lab.inspection.prediction import Prediction, predict
-from rgbmidic.lab.inspection.results import BLIND, ChannelFacts, Inspection, LightFacts, Spread
-from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
+from rgbmidic.lab.inspection.facts import (
+    SampleFacts,
+    contrast_window,
+    green_difference,
+    hidden,
+    level_and_contrast,
+    light_facts,
+)
+from rgbmidic.lab.inspection.prediction import predict
+from rgbmidic.lab.inspection.results import Inspection
+from rgbmidic.lab.inspection.samples import Channel, channels_of
+from rgbmidic.lab.inspection.view import Frame, View
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatImage
 
 __all__ = ["inspect_files", "inspect_frame", "state_frames"]
 
-Frame = Mosaic | ChannelFrame
 Linear = Sequence[LinearMosaic | LinearChannels]
 Progress = Callable[[int, int, str], None]
-
-CONTRAST_WIDTH = (10.0, 40.0)
-"""Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
-MARGIN = 96
-"""Surroundings (px) of the region that are looked at with it: three standard deviations of the window over which the
-model of the frame is averaged (`rgbmidic.lab.inspection.disturbances.SETTLED`)."""
 
 
 def inspect_files(
@@ -153,13 +153,13 @@ def inspect_frame(
     if not isinstance(region, Region):
         region = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1) if region is None else region, shape)
     tell = progress or (lambda done, total, line: None)
-    mesh, view = Tri3Mesh.from_region(region, element_size), _View.around(region)
+    mesh, view = Tri3Mesh.from_region(region, element_size), View.around(region)
     region = view.region(region)
     linear = [linearise(view.frame(shot), known.noise) for shot in frames]
     channels = channels_of(linear)
     _check_light(channels, region.mask)
     tell(0, 3, "exposure, speckle and noise")
-    samples = _Samples.of(channels, region.mask, known.noise, linear[0].full_scale)
+    samples = SampleFacts.of(channels, region.mask, known.noise, linear[0].full_scale)
     crosstalk = view.crosstalk(known.crosstalk or Crosstalk.identity(("red", "green", "blue")))
     tell(1, 3, "lights, and what separating them gets wrong")
     separated = _separated(linear, crosstalk, demosaic, samples.noise, np.random.default_rng(seed))
@@ -167,37 +167,32 @@ def inspect_frame(
     if known.registration is not None:
         images = align(images, known.registration.cropped(view.origin))
     tell(2, 3, "uncertainty to expect")
-    level, contrast = _level_and_contrast(images, _contrast_window(samples.facts))
-    index = separated.images.reflection_index
-    if index is None and len(contrast) > 1:
-        index = np.asarray(1 - contrast / np.maximum(contrast.max(axis=0), 1e-6), dtype=np.float32)
-    texture = separated.images.texture
-    prediction = Prediction.unknown(len(mesh.nodes), len(images.names))
-    if (autocorrelation := texture or samples.texture) is not None:
-        prediction = predict(
-            replace(mesh, nodes=mesh.nodes - view.origin),
-            region,
-            contrast=contrast,
-            level=level,
-            disturbances=separated.disturbances,
-            texture=autocorrelation,
-            prefilter=prefilter,
-        )
+    level, contrast = level_and_contrast(images, contrast_window(samples.facts))
+    index = _reflection_index(separated.images, contrast)
+    prediction = predict(
+        replace(mesh, nodes=mesh.nodes - view.origin),
+        region,
+        contrast=contrast,
+        level=level,
+        disturbances=separated.disturbances,
+        texture=separated.images.texture or samples.texture,
+        prefilter=prefilter,
+    )
     tell(3, 3, "done")
     single = not isinstance(linear[0], LinearMosaic) and len(linear[0].values) == 1
     return Inspection(
         name=name,
         kind="bayer" if isinstance(linear[0], LinearMosaic) else "monochrome" if single else "rgb",
         channels=samples.facts,
-        lights=_light_facts(images, contrast, index, prediction.alone, region.mask),
+        lights=light_facts(images, contrast, index, prediction.alone, region.mask),
         frame_shape=shape,
         origin=view.origin,
         images=images,
         reflection_index=index,
         saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
         region=region.mask,
-        hidden=_hidden(contrast, region.mask),
-        texture=texture,
+        hidden=hidden(contrast, region.mask),
+        texture=separated.images.texture,
         noise=samples.noise,
         noise_known=known.noise is not None,
         crosstalk_known=single or known.crosstalk is not None,
@@ -207,7 +202,7 @@ def inspect_frame(
         std=prediction.std,
         noise_std=prediction.noise,
         sampling_std=prediction.mosaic,
-        greens=_greens(linear[0]) if isinstance(linear[0], LinearMosaic) else 0.0,
+        greens=green_difference(linear[0]) if isinstance(linear[0], LinearMosaic) else 0.0,
     )
 
 
@@ -230,92 +225,6 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
     if test is not None:
         return replace(test.frames, **given)
     return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _View:
-    """The part of a frame that is looked at.
-
-    Attributes
-    ----------
-    origin
-        Its first column and row, both even, so that the pattern of a mosaic stays what it is.
-    shape
-        Its rows and columns.
-    """
-
-    origin: tuple[int, int]
-    shape: tuple[int, int]
-
-    @classmethod
-    def around(cls, region: Region) -> _View:
-        """A region with its surroundings."""
-        spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0)]
-        first = [max(int(span[0]) - MARGIN, 0) // 2 * 2 for span in spans]
-        last = [min(int(span[-1]) + 1 + MARGIN, side) for span, side in zip(spans, region.mask.shape, strict=True)]
-        return cls(origin=(first[1], first[0]), shape=(last[0] - first[0], last[1] - first[1]))
-
-    def frame(self, frame: Frame) -> Frame:
-        """The part of a frame."""
-        return replace(frame, values=np.ascontiguousarray(frame.values[..., *self._slices]))
-
-    def region(self, region: Region) -> Region:
-        """The region in it."""
-        x, y = self.origin
-        corners = None
-        if region.rectangle is not None:
-            x0, y0, x1, y1 = region.rectangle
-            corners = x0 - x, y0 - y, x1 - x, y1 - y
-        return Region(mask=region.mask[self._slices], rectangle=corners)
-
-    def crosstalk(self, crosstalk: Crosstalk) -> Crosstalk:
-        """The crosstalk in it."""
-        return crosstalk.cropped(self.origin, self.shape)
-
-    @property
-    def _slices(self) -> tuple[slice, slice]:
-        (x, y), (rows, columns) = self.origin, self.shape
-        return slice(y, y + rows), slice(x, x + columns)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Samples:
-    """What the samples of the channels tell: figures, the camera noise, and the autocorrelation of the speckle."""
-
-    facts: tuple[ChannelFacts, ...]
-    noise: NoiseModel
-    texture: TextureModel | None
-
-    @classmethod
-    def of(
-        cls, channels: list[Channel], inside: BoolArray, calibrated: NoiseModel | None, full_scale: float
-    ) -> _Samples:
-        """Of the samples inside the region; `calibrated` is the noise where it is known."""
-        textures = [speckle_texture(channel, inside, calibrated) for channel in channels]
-        estimates = noise_estimate(channels, inside) if calibrated is None else []
-        known = [estimate for estimate in estimates if np.isfinite(estimate)]
-        typical = float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
-        noise = calibrated or NoiseModel(gain=float("inf"), read_noise=typical)
-        facts = []
-        for number, channel in enumerate(channels):
-            samples = channel.values[inside & np.isfinite(channel.values)] / full_scale
-            low, high = np.quantile(samples, [0.05, 0.95])
-            level, texture = float(samples.mean()), textures[number]
-            facts.append(
-                ChannelFacts(
-                    name=channel.name,
-                    mean=level,
-                    low=float(low),
-                    high=float(high),
-                    saturated=float(channel.saturated[inside].sum() / samples.size),
-                    speckle_px=float("nan") if texture is None else texture.diameter,
-                    noise_dn=estimates[number]
-                    if estimates
-                    else float(noise.variance(np.array(level * full_scale))) ** 0.5,
-                )
-            )
-        sharpest = sorted((texture for texture in textures if texture), key=lambda texture: texture.diameter)
-        return cls(facts=tuple(facts), noise=noise, texture=sharpest[len(sharpest) // 2] if sharpest else None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -347,6 +256,13 @@ def _separated(
     return _Separated(images=lights(full), disturbances=Disturbances.of_channels(full, lights, noise, random))
 
 
+def _reflection_index(images: IlluminationImages, contrast: FloatImage) -> FloatImage | None:
+    """What the separation tells of reflections, else the contrast that a light lacks to the best one's."""
+    if images.reflection_index is not None or len(contrast) == 1:
+        return images.reflection_index
+    return np.asarray(1 - contrast / np.maximum(contrast.max(axis=0), 1e-6), dtype=np.float32)
+
+
 def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     """Rows and columns of frames that can be inspected."""
     first, shapes = frames[0], {frame.values.shape for frame in frames}
@@ -370,59 +286,3 @@ def _check_light(channels: list[Channel], inside: BoolArray) -> None:
         raise InputError("every sample of the region is saturated: there is nothing to inspect")
     if all(float(np.ptp(values)) == 0 for values in samples):
         raise InputError("every channel of the region is constant: there is nothing to inspect")
-
-
-def _contrast_window(channels: tuple[ChannelFacts, ...]) -> float:
-    """Standard deviation (px) of a window that holds many speckles."""
-    sizes = [channel.speckle_px for channel in channels if np.isfinite(channel.speckle_px)]
-    return float(np.clip(2.5 * np.median(sizes) if sizes else 0.0, *CONTRAST_WIDTH))
-
-
-def _level_and_contrast(images: IlluminationImages, window: float) -> tuple[FloatImage, FloatImage]:
-    """Local mean of each light (k, H, W), and its local standard deviation over it, 0 where it is dark or unknown."""
-    level, contrast = np.zeros((2, *images.values.shape), dtype=np.float32)
-    for image, mean, relative in zip(images.values, level, contrast, strict=True):
-        mean[:] = np.nan_to_num(local_mean(image, window))
-        lit = np.isfinite(image) & (mean > DARK * images.full_scale)
-        square = local_mean(image**2, window)
-        relative[lit] = np.sqrt(np.maximum(square[lit] - mean[lit] ** 2, 0)) / mean[lit]
-    return level, contrast
-
-
-def _hidden(contrast: FloatImage, inside: BoolArray) -> BoolArray:
-    best = contrast.max(axis=0)
-    return np.asarray(best < BLIND * np.quantile(best[inside], 0.9))
-
-
-def _light_facts(
-    images: IlluminationImages,
-    contrast: FloatImage,
-    index: FloatImage | None,
-    alone: Sequence[FloatArray],
-    inside: BoolArray,
-) -> tuple[LightFacts, ...]:
-    facts = []
-    for j, light in enumerate(images.names):
-        values, valid = images.values[j][inside], images.valid[j][inside]
-        mean = local_mean(images.values[j], CONTRAST_WIDTH[0])[inside]
-        facts.append(
-            LightFacts(
-                name=light,
-                mean=float(values[valid].mean() / images.full_scale) if valid.any() else float("nan"),
-                contrast=float(np.median(contrast[j][inside])),
-                reflecting=None if index is None else float((index[j][inside] > REFLECTING).mean()),
-                valid=float(valid.mean()),
-                negative=float((mean < -0.002 * images.full_scale).mean()),
-                alone=Spread.of(alone[j]),
-            )
-        )
-    return tuple(facts)
-
-
-def _greens(mosaic: LinearMosaic) -> float:
-    """Difference of the two greens' means over their mean."""
-    red = int(np.flatnonzero(np.array(list(mosaic.cfa)) == "R")[0])
-    diagonal = red in (0, 3)
-    places = ((0, 1), (1, 0)) if diagonal else ((0, 0), (1, 1))
-    first, second = (float(mosaic.values[p::2, q::2].mean()) for p, q in places)
-    return abs(first - second) / max((first + second) / 2, 1e-6)

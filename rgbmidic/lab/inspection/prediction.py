@@ -53,12 +53,6 @@ class Prediction:
     mosaic: FloatArray
     alone: tuple[FloatArray, ...]
 
-    @classmethod
-    def unknown(cls, nodes: int, lights: int) -> Prediction:
-        """That nothing is measured: there is no texture."""
-        nothing = np.full(nodes, np.nan)
-        return cls(std=nothing, noise=nothing, mosaic=nothing, alone=(nothing,) * lights)
-
 
 def predict(
     mesh: Tri3Mesh,
@@ -67,7 +61,7 @@ def predict(
     contrast: FloatImage,
     level: FloatImage,
     disturbances: Disturbances,
-    texture: TextureModel,
+    texture: TextureModel | None,
     prefilter: str,
 ) -> Prediction:
     """What a second state of a frame is expected to be measured with.
@@ -82,10 +76,13 @@ def predict(
     disturbances
         Of one state, DN; those of the other are as large and independent.
     texture
-        The speckle's autocorrelation.
+        The speckle's autocorrelation; None: there is none, and nothing can be measured.
     prefilter
         Of the solve (`rgbmidic.correlation.images.PREFILTERS`).
     """
+    if texture is None:
+        nothing = np.full(len(mesh.nodes), np.nan)
+        return Prediction(std=nothing, noise=nothing, mosaic=nothing, alone=(nothing,) * len(contrast))
     light = contrast > 0
     energy, kernel = _gradient(texture, prefilter)
 

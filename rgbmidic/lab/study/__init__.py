@@ -3,7 +3,7 @@
 from rgbmidic.lab.study.bench import BENCHES, Bench, lamp_for_reflection
 from rgbmidic.lab.study.competitors import METHODS, Competitor, Method
 from rgbmidic.lab.study.goniometry import Goniometry, Lobe, fit_lobe, goniometry, pixel_levels
-from rgbmidic.lab.study.paper import ANGLES, Measurement, PaperStudy, SceneStudy, run_paper_study
+from rgbmidic.lab.study.paper import ANGLES, run_paper_study
 from rgbmidic.lab.study.perturbation import (
     Area,
     area_means,
@@ -12,6 +12,7 @@ from rgbmidic.lab.study.perturbation import (
     perturbation,
     residual_percent,
 )
+from rgbmidic.lab.study.results import Measurement, PaperStudy, SceneStudy
 from rgbmidic.lab.study.topography import (
     detrend,
     local_slope,

@@ -2,50 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 
-from rgbmidic.lab.study.paper import PaperStudy, SceneStudy
+from rgbmidic.lab.study.claim import Claim, Verdict, verdict
+from rgbmidic.lab.study.results import PaperStudy, SceneStudy
+from rgbmidic.lab.study.specimen_claims import judge_noise, judge_specimen
 from rgbmidic.typing import FloatArray
 
-__all__ = ["Claim", "Verdict", "judge"]
-
-Verdict = Literal["reproduced", "in part", "not reproduced", "not measured"]
+__all__ = ["judge"]
 
 SMALL, LARGE = 2.0, 6.0
 """Degrees: what the paper calls small (up to) and large (from)."""
 TREND = 1.3
 """An area follows the trend of A0 where its P is at most this multiple of that of A0."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
-    """A statement and what became of it.
-
-    Attributes
-    ----------
-    figure
-        Where the paper makes it.
-    scene
-        On which virtual scene it was tested; empty: on the flat specimen.
-    statement
-        The paper's words, shortened.
-    measured
-        The figures of the virtual experiment.
-    verdict
-        The outcome.
-    reason
-        Why it differs, where it does and where a reason was found.
-    """
-
-    figure: str
-    scene: str
-    statement: str
-    measured: str
-    verdict: Verdict
-    reason: str = ""
 
 
 def judge(study: PaperStudy) -> tuple[Claim, ...]:
@@ -56,7 +25,7 @@ def judge(study: PaperStudy) -> tuple[Claim, ...]:
         claims += [test(data) for test in _ON_EVERY_SCENE]
         if scene.bench.name == "sequential":
             claims += [test(data) for test in _ON_THE_PAPERS_SCENE]
-    claims += [*_of_specimen(study), _noise(study)]
+    claims += [*judge_specimen(study), judge_noise(study)]
     return tuple(sorted(claims, key=lambda claim: (claim.scene == "bayer", _number(claim.figure))))
 
 
@@ -95,7 +64,7 @@ def _displacement_of_reflection(data: _Data) -> Claim:
         "Fig. 4",
         "the reflection moves from A4 at 0° to A2 at 14°, about 200 px",
         f"the brightest point of the blurred image moves by {way:.0f} px at {angle:g}° ({expected:.0f} px by geometry)",
-        _verdict(abs(way - expected) < 20),
+        verdict(abs(way - expected) < 20),
         "The brightest point is that of reflection and diffuse light together, and of the speckle that is left.",
     )
 
@@ -106,7 +75,7 @@ def _residual(data: _Data) -> Claim:
         "Sec. 2.2",
         "the residual of plain DIC is about 2 % of the effective dynamic range at every angle",
         f"{residual.min():.1f} to {residual.max():.1f} %",
-        "in part" if (residual < 3).any() and (residual > 3).any() else _verdict(bool((residual < 3).all())),
+        "in part" if (residual < 3).any() and (residual > 3).any() else verdict(bool((residual < 3).all())),
         "The residual grows with the angle because it holds the reflection itself, which stays with the lamps while "
         "the paint moves on. A reflection as bright as here cannot leave 2 % at 14°.",
     )
@@ -127,7 +96,7 @@ def _linear_mean(data: _Data) -> Claim:
         "Fig. 6",
         "the mean U_y of every area is linear in the angle",
         f"largest deviation from a straight line {worst:.1%} of the largest displacement of any area",
-        _verdict(worst < 0.1),
+        verdict(worst < 0.1),
         "The reflection's error adds to a small displacement.",
     )
 
@@ -140,7 +109,7 @@ def _unaffected(data: _Data) -> Claim:
         "P of A0 is 0.004 px at small angles and rises slowly, tenfold at 14°",
         f"{a0[0]:.4f} px at {data.angles[data.moved][0]:g}°, {a0[-1]:.4f} px at {data.angles[-1]:g}°: "
         f"{growth:.1f} times",
-        _verdict(0.001 < a0[0] < 0.008 and growth > 2),
+        verdict(0.001 < a0[0] < 0.008 and growth > 2),
     )
 
 
@@ -152,7 +121,7 @@ def _at_once(data: _Data) -> Claim:
         "P of A4 is up to 4 times that of A0 from the smallest angle (0.33°) on",
         f"at {data.angles[first]:g}° {data.ratio('dic')[first, 4]:.1f} times in A4 and "
         f"{data.ratio('dic')[first, 3]:.1f} times in A3",
-        _verdict(ratio >= 3) if ratio >= 3 or ratio < 1.5 else "in part",
+        verdict(ratio >= 3) if ratio >= 3 or ratio < 1.5 else "in part",
         "At this angle the camera's noise makes most of P; without it P is several times larger in the reflection than "
         "beside it (causes: camera without noise). Sharper facets or more gloss bring the paper's factor at once.",
     )
@@ -196,7 +165,7 @@ def _only_then(data: _Data) -> Claim:
         "areas that the reflection has not reached have the P of A0; once it crosses them P rises up to 5 times",
         f"A1, A2 at {data.angles[first]:g}°: {ratio[0]:.1f}, {ratio[1]:.1f} times A0; at {LARGE:g}° and more up to "
         f"{later[0]:.1f}, {later[1]:.1f} times",
-        "not measured" if not data.large.any() else _verdict(bool((ratio < 1.6).all() and np.nanmax(later) > 2)),
+        "not measured" if not data.large.any() else verdict(bool((ratio < 1.6).all() and np.nanmax(later) > 2)),
         "In small frames the areas stand closer together than in the paper, and A2 lies in the disturbed zone.",
     )
 
@@ -231,7 +200,7 @@ def _glc_large(data: _Data) -> Claim:
         "Fig. 8, A1 to A4",
         statement,
         f"P of GLC-DIC over plain DIC {np.nanmedian(ratio):.2f} (median); still up to {np.nanmax(left):.1f} times A0",
-        _verdict(bool(np.nanmedian(ratio) < 0.75 and np.nanmax(left) > 1.5)),
+        verdict(bool(np.nanmedian(ratio) < 0.75 and np.nanmax(left) > 1.5)),
     )
 
 
@@ -241,7 +210,7 @@ def _glc_a0(data: _Data) -> Claim:
         "Fig. 8, A0",
         "in A0 the grey-level correction lowers P slightly",
         f"P of GLC-DIC over plain DIC: {_per_angle(data.angles[data.moved], ratio)}",
-        _verdict(bool(np.median(ratio) < 1)),
+        verdict(bool(np.median(ratio) < 1)),
     )
 
 
@@ -255,7 +224,7 @@ def _unweighted(data: _Data) -> Claim:
         "all lights without weights are only slightly better than one",
         f"P over plain DIC {median:.2f} (median of areas and angles; noise alone: {noise:.2f}); still up to {left:.1f} "
         "times that of A0",
-        _verdict(bool(0.9 * noise < median < 1.05 and left > 2)),
+        verdict(bool(0.9 * noise < median < 1.05 and left > 2)),
     )
 
 
@@ -354,80 +323,6 @@ def _frontier(data: _Data) -> Claim:
 
 
 _FRONTIER = "no band of high uncertainty along the frontiers of the masks (here all lights share one point of view)"
-
-
-def _of_specimen(study: PaperStudy) -> list[Claim]:
-    turning, relief = study.goniometry, study.topography
-    first, last = turning.band
-    range_um = float(np.nanpercentile(relief.height, 99.9) - np.nanpercentile(relief.height, 0.1))
-    white = (relief.intensity > np.median(relief.intensity)) & np.isfinite(relief.height)
-    step = float(relief.height[~white].mean() - relief.height[white].mean())
-    steepest = float(np.nanpercentile(relief.slope, 99.9))
-    peak = int(np.argmin(abs(turning.angles_deg - turning.lobe.centre_deg)))
-    return [
-        _plate(
-            "Fig. 9",
-            "diffuse above 30°, none at 90°, two bundles (white, black); a reflection from 0 to 30°, largest at 15°",
-            f"erratic from {first:.0f} to {last:.0f}°; lobe at {turning.lobe.centre_deg:.1f} ± "
-            f"{turning.lobe.std[2]:.1f}°, standard deviation {turning.lobe.width_deg:.1f} ± "
-            f"{turning.lobe.std[3]:.1f}°, {turning.white.sum()} white and {(~turning.white).sum()} black pixels",
-            _verdict(-10 <= first <= 10 and 20 <= last <= 40 and abs(turning.lobe.centre_deg - 15) < 2),
-        ),
-        _plate(
-            "Fig. 9",
-            "the single pixels are very noisy in the reflection",
-            f"pixels of one paint differ by {turning.spread[peak] / turning.lobe.specular:.0%} of the lobe's height",
-            "in part",
-            "They differ from each other, but each follows a smooth curve: a pixel holds some five wrinkles, each with "
-            "a lobe of 4°. Facets that are much sharper would make the single curves noisy.",
-        ),
-        _plate(
-            "Fig. 10",
-            "heights follow the droplets and vary by less than 10 um",
-            f"range {range_um:.1f} um, black paint {step:.1f} um above white",
-            _verdict(range_um < 10 and step > 0.5),
-        ),
-        _plate(
-            "Fig. 11",
-            "wrinkles about 25 um apart, below the pixel of 55 um",
-            f"{relief.spacing[0]:.1f} ± {relief.spacing[1]:.1f} um",
-            _verdict(abs(relief.spacing[0] - 25) < 3),
-        ),
-        _plate(
-            "Fig. 11",
-            "slopes up to 15°, with an uncertainty of 0.23° for heights good to 0.1 um",
-            f"99.9th percentile {steepest:.1f}° (rms {relief.white_deg:.1f}° on white, "
-            f"{relief.black_deg:.1f}° on black); uncertainty {relief.slope_std:.2f}°",
-            "in part",
-            f"The paint has 6° rms and 15° at its steepest; central differences at a pitch of {relief.pitch:g} um show "
-            "three quarters of the slope of waves 25 um long, so that slopes read from such a map, the paper's "
-            "included, are too small. The uncertainty of a central difference is 0.1 um / (sqrt(2) 5 um) = 0.81°; "
-            "0.23° is that of 0.1 um over 25 um.",
-        ),
-    ]
-
-
-def _noise(study: PaperStudy) -> Claim:
-    noise = study.noise
-    ratios = noise.single / noise.together
-    return Claim(
-        figure="Sec. 4",
-        scene="sequential",
-        statement="k = 2 pairs divide the noise by the square root of 2",
-        measured=f"one lamp {' and '.join(f'{s:.4f}' for s in noise.single)} px, both {noise.together:.4f} px: "
-        f"{' and '.join(f'{r:.2f}' for r in ratios)} times less, {np.sqrt((ratios**2).mean()):.2f} on average; "
-        f"the best combination would give {noise.expected:.4f} px",
-        verdict=_verdict(bool(abs(np.sqrt((ratios**2).mean()) - np.sqrt(2)) < 0.2)),
-    )
-
-
-def _plate(figure: str, statement: str, measured: str, verdict: Verdict, reason: str = "") -> Claim:
-    reason = "" if verdict == "reproduced" else reason
-    return Claim(figure=figure, scene="", statement=statement, measured=measured, verdict=verdict, reason=reason)
-
-
-def _verdict(holds: bool) -> Verdict:
-    return "reproduced" if holds else "not reproduced"
 
 
 def _per_angle(angles: FloatArray, values: FloatArray) -> str:

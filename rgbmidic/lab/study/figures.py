@@ -12,8 +12,9 @@ import numpy as np
 from rgbmidic.fields import high_pass
 from rgbmidic.lab.study.competitors import METHODS
 from rgbmidic.lab.study.goniometry import Goniometry
-from rgbmidic.lab.study.paper import BLUR, SceneStudy
+from rgbmidic.lab.study.paper import BLUR
 from rgbmidic.lab.study.plate import Topography
+from rgbmidic.lab.study.results import SceneStudy
 from rgbmidic.report.style import STYLE, finish_plot, shade
 from rgbmidic.typing import AnyArray
 

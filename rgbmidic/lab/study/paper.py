@@ -8,33 +8,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.correlation import NodeStatus
 from rgbmidic.errors import InputError
-from rgbmidic.fields import at_pixels, high_pass
+from rgbmidic.fields import high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.study.bench import BENCHES, SMALLEST, Bench
-from rgbmidic.lab.study.causes import VARIATIONS, Cause, NoiseOfLights, find_causes, noise_of_lights
+from rgbmidic.lab.study.causes import VARIATIONS, find_causes, noise_of_lights
 from rgbmidic.lab.study.competitors import METHODS, Competitor
-from rgbmidic.lab.study.goniometry import Goniometry
-from rgbmidic.lab.study.perturbation import area_means, area_stds, residual_percent
-from rgbmidic.lab.study.plate import Topography, virtual_goniometry, virtual_topography
-from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.settings import ELEMENT_SIZE
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.lab.study.plate import virtual_goniometry, virtual_topography
+from rgbmidic.lab.study.results import Measurement, PaperStudy, SceneStudy, Snapshot
+from rgbmidic.lab.study.state import field_at_pixels, measure_state
+from rgbmidic.typing import FloatImage
 from rgbmidic.weights.disturbed_zone import SetUpThreshold, set_up_threshold
 from rgbmidic.weights.threshold import blurred, threshold_weights
 
-__all__ = [
-    "ANGLES",
-    "BLUR",
-    "CLEAR",
-    "Measurement",
-    "PaperStudy",
-    "SceneStudy",
-    "Snapshot",
-    "measure_state",
-    "run_paper_study",
-]
+__all__ = ["ANGLES", "BLUR", "CLEAR", "run_paper_study"]
 
 logger = logging.getLogger(__name__)
 
@@ -52,139 +39,6 @@ paper's smallest angle gives 4; where the disturbance hardly exceeds the camera'
 top, the zone comes out too small and the threshold too high."""
 NO_THRESHOLD = 1.0
 """Threshold where the reflection disturbs nothing: only saturated pixels are excluded."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measurement:
-    """One method at one angle.
-
-    Attributes
-    ----------
-    perturbation : ndarray, shape (5,)
-        P of U_y in A0 to A4, px.
-    error : ndarray, shape (5,)
-        Standard deviation in the areas of the measured minus the true U_y, high-passed alike, px.
-    mean : ndarray, shape (2, 5)
-        Mean of (U_x, U_y) in the areas, px.
-    residual
-        % of the effective dynamic range, light by light averaged.
-    measured
-        Share of the nodes that were measured.
-    frontier
-        P along the frontiers of the masks over P beside them; NaN without masks.
-    status
-        How the solve ended.
-    """
-
-    perturbation: FloatArray
-    error: FloatArray
-    mean: FloatArray
-    residual: float
-    measured: float
-    frontier: float
-    status: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Snapshot:
-    """What is kept of one state for the figures.
-
-    Attributes
-    ----------
-    images : ndarray, shape (k, H, W), float32
-        Illumination images over full scale.
-    displacement : dict of ndarray, shape (2, H, W), float32
-        Of every method.
-    weights : ndarray, shape (k, H, W), float32
-        The masks of the reference and of this state together (not brought back by the displacement).
-    """
-
-    images: FloatImage
-    displacement: dict[str, FloatImage]
-    weights: FloatImage
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SceneStudy:
-    """The four methods on one scene.
-
-    Attributes
-    ----------
-    bench
-        The scene.
-    angles : tuple of float
-        Degrees, in order.
-    reference : ndarray, shape (k, H, W), float32
-        Reference images over full scale.
-    names
-        The lights.
-    thresholds
-        The weighting threshold found at each of the set-up angles that was tried.
-    chosen
-        That whose threshold is used: the smallest at which the reflection clearly disturbs plain DIC (`CLEAR`), or
-        where it does so most; None where it nowhere does.
-    measurements
-        By method and angle.
-    snapshots
-        Of the smallest and the largest angle above 0.
-    peaks : ndarray, shape (n, 2)
-        Brightest point (x, y) of the blurred image of the light that crosses the areas, at every angle.
-    """
-
-    bench: Bench
-    angles: tuple[float, ...]
-    reference: FloatImage
-    names: tuple[str, ...]
-    thresholds: dict[float, SetUpThreshold]
-    chosen: float | None
-    measurements: dict[tuple[str, float], Measurement]
-    snapshots: dict[float, Snapshot]
-    peaks: FloatArray
-
-    @property
-    def threshold(self) -> SetUpThreshold | None:
-        """The weighting threshold that is used."""
-        return None if self.chosen is None else self.thresholds[self.chosen]
-
-    def perturbation(self, method: str) -> FloatArray:
-        """P (n angles, 5 areas) of a method, px."""
-        return np.array([self.measurements[method, angle].perturbation for angle in self.angles])
-
-    def means(self, method: str) -> FloatArray:
-        """Mean (U_x, U_y) of a method, shape (n angles, 2, 5 areas), px."""
-        return np.array([self.measurements[method, angle].mean for angle in self.angles])
-
-    def series(self, method: str, quantity: str) -> FloatArray:
-        """One scalar of `Measurement` at every angle."""
-        return np.array([getattr(self.measurements[method, angle], quantity) for angle in self.angles])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PaperStudy:
-    """All that the paper's figures show, as the virtual bench gives it.
-
-    Attributes
-    ----------
-    angles, size, seed
-        What was asked for.
-    scenes
-        The sphere, one entry per way to light and record.
-    goniometry, topography
-        The flat specimen.
-    noise
-        How much two lamps reduce the noise.
-    causes
-        The variations; empty where they were not asked for.
-    """
-
-    angles: tuple[float, ...]
-    size: int
-    seed: int
-    scenes: tuple[SceneStudy, ...]
-    goniometry: Goniometry
-    topography: Topography
-    noise: NoiseOfLights
-    causes: tuple[Cause, ...]
 
 
 def run_paper_study(
@@ -333,7 +187,7 @@ def _thresholds(
         shot = shots.get(angle)
         if shot is None:
             shot = bench.photograph(bench.render(angle) * gain, _EXTRA_SHOTS + number)
-        ripple = high_pass(_grid(competitor, shot)[0][1])
+        ripple = high_pass(field_at_pixels(competitor, shot)[0][1])
         try:
             found[angle] = set_up_threshold(ripple, reference, light=bench.light, blur=BLUR)
         except InputError as error:
@@ -346,96 +200,6 @@ def _thresholds(
 
 _EXTRA_SHOTS = 1000
 """Number of the first shot that is taken for the threshold alone."""
-
-
-def measure_state(
-    competitor: Competitor,
-    reference: IlluminationImages,
-    images: IlluminationImages,
-    bench: Bench,
-    truth: FloatArray,
-) -> tuple[Measurement, FloatImage]:
-    """Measure one state with one method.
-
-    Parameters
-    ----------
-    competitor
-        The method, prepared with `reference`.
-    reference, images
-        Reference and state.
-    bench
-        The scene, with its areas.
-    truth : ndarray, shape (2, H, W)
-        Exact displacement.
-
-    Returns
-    -------
-    tuple
-        The measurement, and the displacement (2, H, W) at the pixels.
-    """
-    field, measured, status = _grid(competitor, images)
-    none = np.full(len(bench.areas), np.nan)
-    perturbation = error = none
-    if np.isfinite(field[1]).sum() > 10:
-        ripple = high_pass(field[1])
-        perturbation = area_stds(ripple, bench.areas)
-        error = area_stds(high_pass(field[1] - truth[1]), bench.areas)
-        residual = np.mean(
-            [
-                residual_percent(reference.values[i], images.values[i], np.asarray(field, dtype=np.float64))
-                for i in competitor.lights
-            ]
-        )
-        frontier = _frontier(ripple, competitor, images)
-    else:
-        residual, frontier = np.float64(np.nan), float("nan")
-    measurement = Measurement(
-        perturbation=perturbation,
-        error=error,
-        mean=np.stack([area_means(part, bench.areas) for part in field]),
-        residual=float(residual),
-        measured=measured,
-        frontier=frontier,
-        status=status,
-    )
-    return measurement, field
-
-
-def _grid(competitor: Competitor, images: IlluminationImages) -> tuple[FloatImage, float, str]:
-    """Displacement at the pixels, share of the nodes measured, and how the solve ended."""
-    solution = competitor.measure(images)
-    mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
-    field = at_pixels(mesh, solution.displacement, images.shape)
-    return field, float((solution.node_status == NodeStatus.MEASURED).mean()), solution.status.name.lower()
-
-
-def _frontier(ripple: FloatArray, competitor: Competitor, images: IlluminationImages) -> float:
-    """P within an element of the masks' frontiers, over P beside it: on the side where it is larger.
-
-    On either side of a frontier other lights are seen, and fewer lights give more noise; a band that the frontier
-    itself disturbs is worse than both. The mask of the deformed state is taken where it is, within a few px of where
-    the displacement brings it.
-    """
-    import cv2
-
-    if competitor.threshold is None:
-        return float("nan")
-    after = threshold_weights(images, threshold=competitor.threshold, blur=competitor.blur)
-    masks = ((competitor.reference.weights > 0) & (after > 0)).astype(np.uint8)
-    edge = np.zeros(images.shape, dtype=np.uint8)
-    for mask in masks:
-        edge |= np.asarray(cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)), dtype=np.uint8)
-    distance = cv2.distanceTransform(1 - edge, cv2.DIST_L2, 5) if edge.any() else np.full(images.shape, np.inf)
-    known = np.isfinite(ripple)
-    beside = known & (distance > ELEMENT_SIZE) & (distance <= 3 * ELEMENT_SIZE)
-    sides = [beside & (masks.sum(axis=0) == count) for count in range(len(masks) + 1)]
-    level = max(
-        (float((ripple[side] ** 2).mean()) for side in sides if side.sum() >= 20 * ELEMENT_SIZE**2), default=0.0
-    )
-    band = known & (distance <= ELEMENT_SIZE)
-    if level == 0 or band.sum() < 20 * ELEMENT_SIZE**2:
-        return float("nan")
-    return float(np.sqrt((ripple[band] ** 2).mean() / level))
 
 
 def _relative(images: IlluminationImages) -> FloatImage:

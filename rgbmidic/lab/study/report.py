@@ -13,9 +13,10 @@ from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
 from rgbmidic.lab.study import figures as figures
 from rgbmidic.lab.study.causes import RADIUS, Cause
-from rgbmidic.lab.study.claims import Claim, judge
+from rgbmidic.lab.study.claim import Claim
+from rgbmidic.lab.study.claims import judge
 from rgbmidic.lab.study.competitors import METHODS
-from rgbmidic.lab.study.paper import PaperStudy, SceneStudy
+from rgbmidic.lab.study.results import PaperStudy, SceneStudy
 from rgbmidic.report import Page, save_figure
 
 __all__ = ["check_folder", "write_study"]
