@@ -64,7 +64,9 @@ class Region:
             raise RegionError(f"a rectangle (x0, y0, x1, y1) needs x0 < x1 and y0 < y1; given is {rectangle!r}")
         clipped = (max(x0, 0.0), max(y0, 0.0), min(x1, width - 1.0), min(y1, height - 1.0))
         if clipped[0] >= clipped[2] or clipped[1] >= clipped[3]:
-            raise RegionError(f"the rectangle {rectangle!r} does not overlap the image of {width} x {height} px")
+            raise RegionError(
+                f"the region's rectangle {rectangle!r} does not overlap the image of {width} x {height} px"
+            )
         _tell_clipped("rectangle", corners.reshape(2, 2), shape)
         mask = np.zeros(shape, dtype=bool)
         left, top = (int(np.ceil(value)) for value in clipped[:2])
@@ -87,7 +89,9 @@ class Region:
         shift = 8  # fixed-point bits of OpenCV's coordinates
         cv2.fillPoly(mask, [np.round(points * 2**shift).astype(np.int32)], 1, shift=shift)
         if not mask.any():
-            raise RegionError(f"the polygon {points.tolist()} does not overlap the image of {shape[1]} x {shape[0]} px")
+            raise RegionError(
+                f"the region's polygon {points.tolist()} does not overlap the image of {shape[1]} x {shape[0]} px"
+            )
         _tell_clipped("polygon", points, shape)
         return cls(mask=mask.astype(bool))
 
