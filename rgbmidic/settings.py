@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
@@ -30,6 +31,7 @@ __all__ = [
     "WeightSettings",
     "check_names",
     "convert_value",
+    "read_range",
     "read_test",
     "read_toml",
 ]
@@ -61,7 +63,13 @@ class FrameSettings:
     cfa, black_level, white_level
         None: what the file tells. A statement that contradicts the file is an error.
     reference
-        Indices of the frames whose average is the reference.
+        Indices of the frames whose average is the reference, or a range of them: ``"0:20"`` are the first twenty.
+    first, last, step
+        The frames that are measured: from the first to the last (None: there is), every one or every `step`-th. Frames
+        count from 0 over all files; the reference need not be among them.
+    lights
+        Number of lights that fire in turn before a monochrome camera which records one series: frame i shows light
+        i mod `lights`, and so many frames make one state, which is what the other keys count.
     shape, dtype
         Rows and columns, and sample type, of headerless files.
     crop_origin
@@ -75,6 +83,10 @@ class FrameSettings:
     black_level: float | None = _bounded(None, at_least=0)
     white_level: float | None = _bounded(None, above=0)
     reference: tuple[int, ...] = _bounded((0,), at_least=0)
+    first: int = _bounded(0, at_least=0)
+    last: int | None = _bounded(None, at_least=0)
+    step: int = _bounded(1, at_least=1)
+    lights: int = _bounded(1, at_least=1)
     shape: tuple[int, int] | None = _bounded(None, at_least=1)
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
     crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)
@@ -88,6 +100,13 @@ class FrameSettings:
                 f"frames.path with {len(self.path)} entries means as many lights fired in succession before a "
                 'monochrome camera: state kind = "monochrome", or give a single path'
             )
+        if self.lights > 1 and (len(self.path) > 1 or self.kind != "monochrome"):
+            raise ConfigurationError(
+                f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
+                'them in one series: state kind = "monochrome" and a single path'
+            )
+        if self.last is not None and self.last < self.first:
+            raise ConfigurationError(f"frames.last must be at least frames.first ({self.first}), not {self.last}")
         if not self.reference or len(set(self.reference)) < len(self.reference):
             raise ConfigurationError(f"frames.reference must name different frames, not {list(self.reference)}")
         if self.cfa is not None and self.cfa.upper() not in BAYER_PATTERNS:
@@ -443,7 +462,23 @@ def convert_value(value: Any, hint: Any, where: str, base: Path) -> Any:
     raise ConfigurationError(f"{where} must be {_WORDS[hint]}, not {_quoted(value)}")
 
 
+def read_range(text: str, where: str) -> range:
+    """The whole numbers that ``"a:b"`` stands for: a and all up to b, without b.
+
+    Raises
+    ------
+    ConfigurationError
+        It is something else, or nothing is in it.
+    """
+    found = re.fullmatch(r"\s*(\d{1,18})\s*:\s*(\d{1,18})\s*", text)
+    if not found or int(found[1]) >= int(found[2]):
+        raise ConfigurationError(f'{where} must be a range such as "0:20" (0 to 19), not {_quoted(text)}')
+    return range(int(found[1]), int(found[2]))
+
+
 def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path) -> tuple[Any, ...]:
+    if kinds == (int, Ellipsis) and isinstance(value, str):
+        return tuple(read_range(value, where))
     if len(kinds) == 2 and kinds[1] is Ellipsis:
         entries = value if isinstance(value, list | tuple) else [value]  # a single one needs no brackets
         return tuple(convert_value(entry, kinds[0], where, base) for entry in entries)

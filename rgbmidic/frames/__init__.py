@@ -2,8 +2,9 @@
 
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels, shift_cfa
 from rgbmidic.frames.formats import open_source, read_frame
+from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.series import FrameSeries, list_frames, open_series
-from rgbmidic.frames.source import FrameSource, file_hash
+from rgbmidic.frames.source import FrameSource, Movie, file_fingerprint, file_hash
 from rgbmidic.frames.writers import write_dng, write_tiff
 
 __all__ = [
@@ -12,7 +13,10 @@ __all__ = [
     "FrameSeries",
     "FrameSource",
     "Mosaic",
+    "Movie",
+    "Recording",
     "cfa_channels",
+    "file_fingerprint",
     "file_hash",
     "list_frames",
     "open_series",

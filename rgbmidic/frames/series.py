@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import hashlib
 import logging
 import math
 import re
@@ -15,7 +16,8 @@ from pathlib import Path
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.formats import FRAME_ENDINGS, Camera, advice, open_source
-from rgbmidic.frames.source import FrameSource
+from rgbmidic.frames.recording import Recording
+from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.settings import FrameSettings
 
 logger = logging.getLogger(__name__)
@@ -25,29 +27,41 @@ __all__ = ["FrameSeries", "list_frames", "open_series"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSeries:
-    """The states of a test, read one by one, in any order.
+    """The states of a test, read one by one, in any order; they count from 0 over all files.
 
     Attributes
     ----------
     lights : tuple of tuple of FrameSource
-        The sources of each light fired in succession; a single tuple for simultaneous coloured lights.
+        The sources of each light fired in succession; a single tuple for simultaneous coloured lights, and for lights
+        that fire in turn before a camera which records one series.
     numbers
         Number of the frame that each state is, from 0 and with gaps where frames are missing; by default the states
         are numbered through.
+    turn
+        Number of lights that fire in turn in one series.
+    begins
+        Index in that series of the frame that each state begins with; by default every `turn`-th.
+    chosen
+        The states that are to be measured; by default all.
     """
 
     lights: tuple[tuple[FrameSource, ...], ...]
     numbers: Sequence[int] = ()
+    turn: int = 1
+    begins: Sequence[int] = ()
+    chosen: range = range(0)
     _ends: tuple[tuple[int, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         ends = tuple(tuple(accumulate(len(source) for source in sources)) for sources in self.lights)
         object.__setattr__(self, "_ends", ends)
+        object.__setattr__(self, "begins", self.begins or range(0, ends[0][-1] - self.turn + 1, self.turn))
         object.__setattr__(self, "numbers", self.numbers or range(len(self)))
+        object.__setattr__(self, "chosen", self.chosen or range(len(self)))
 
     def __len__(self) -> int:
         """Number of mechanical states."""
-        return self._ends[0][-1]
+        return len(self.begins)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -61,6 +75,18 @@ class FrameSeries:
         for _, shape in self.shapes():
             return shape
         return self.lights[0][0].shape
+
+    @property
+    def recording(self) -> Recording:
+        """How the frames were recorded, as the first file tells it."""
+        return self.lights[0][0].recording
+
+    @property
+    def lost(self) -> int:
+        """Number of frames missing between the first and the last of those that are chosen."""
+        numbers = [self.numbers[index] for index in self.chosen]
+        step = self.chosen.step
+        return max((numbers[-1] - numbers[0]) // step + 1 - len(numbers), 0) if numbers else 0
 
     def shapes(self) -> Iterator[tuple[FrameSource, tuple[int, int]]]:
         """Every source whose header can be read, with its rows and columns."""
@@ -86,16 +112,33 @@ class FrameSeries:
         """Name of state `index`; of several lights in succession joined by " + "."""
         return " + ".join(source.name(inner) for source, inner in self._locate(index))
 
+    def time_ns(self, index: int) -> int | None:
+        """When state `index` was taken (the first light's frame), in ns from the trigger; None where no file tells."""
+        source, inner = next(self._locate(index))
+        times = source.recording.times_ns
+        return None if times is None else int(times[inner])
+
     def inputs(self, index: int) -> dict[str, str]:
         """Path and fingerprint of every file that state `index` comes from."""
         return {str(source.path): source.fingerprint for source, _ in self._locate(index)}
 
+    def fingerprint(self) -> str:
+        """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order."""
+        digest = hashlib.sha256()
+        for source in (source for sources in self.lights for source in sources):
+            content = file_fingerprint(source.path) if source.path.is_file() else "missing"
+            digest.update(f"{source.path.name}\0{content}\n".encode())
+        return digest.hexdigest()
+
     def _locate(self, index: int) -> Iterator[tuple[FrameSource, int]]:
+        """Source, and frame in it, of every light of a state."""
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in a series of {len(self)}")
-        for sources, ends in zip(self.lights, self._ends, strict=True):
-            position = bisect_right(ends, index)
-            yield sources[position], index - (ends[position - 1] if position else 0)
+        begin = self.begins[index]
+        for light in range(max(self.turn, len(self.lights))):
+            series, frame = (0, begin + light) if self.turn > 1 else (light, begin)
+            position = bisect_right(self._ends[series], frame)
+            yield self.lights[series][position], frame - (self._ends[series][position - 1] if position else 0)
 
 
 def open_series(
@@ -112,38 +155,71 @@ def open_series(
     camera
         Pattern and levels, as a calibration knows them, where neither the files nor the settings tell them.
     in_order
-        Whether the frames follow one another in time, so that numbers missing in their names are told (as a warning)
-        and kept as gaps in `FrameSeries.numbers`.
+        Whether the frames follow one another in time, so that numbers missing in their names or in the camera's count
+        are told (as a warning) and kept as gaps in `FrameSeries.numbers`.
 
     Raises
     ------
     FrameError
-        No file matches, a frame has another size than the first, the lights have different frames, or a reference
-        frame does not exist. A damaged file is left for `FrameSeries.read` to tell.
+        No file matches, a movie's header is damaged, a frame has another size than the first, the lights have different
+        frames, or a reference frame or the first or last frame does not exist. A damaged file of one frame is left for
+        `FrameSeries.read` to tell.
     """
     files = [list_frames(text, base) for text in settings.path]
     lights = tuple(tuple(open_source(path, settings, camera) for path in paths) for paths in files)
-    series = FrameSeries(lights=lights)
-    _check_counts(settings, series)
+    _check_counts(settings, lights)
+    numbers = _numbers(settings, lights) if in_order else ()
+    if settings.lights > 1:
+        begins, numbers = _turns(numbers or range(sum(map(len, lights[0]))), settings.lights)
+        series = FrameSeries(lights=lights, numbers=numbers, turn=settings.lights, begins=begins)
+    else:
+        series = FrameSeries(lights=lights, numbers=numbers)
     _check_sizes(series)
-    return replace(series, numbers=_numbers(settings, lights)) if in_order else series
+    return replace(series, chosen=_chosen(settings, len(series)))
 
 
-def _check_counts(settings: FrameSettings, series: FrameSeries) -> None:
-    counts = [sum(len(source) for source in sources) for sources in series.lights]
+def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """First frame and number of every state of which no light's frame is lost, where the lights fire in turn."""
+    place = {number: index for index, number in enumerate(numbers)}
+    whole = [
+        (place[number], number // lights)
+        for number in numbers
+        if number % lights == 0 and all(number + light in place for light in range(lights))
+    ]
+    if not whole:
+        raise FrameError(f"frames.lights states {lights} lights in turn, but no {lights} frames make a state")
+    begins, states = zip(*whole, strict=True)
+    return begins, tuple(state - states[0] for state in states)
+
+
+def _chosen(settings: FrameSettings, count: int) -> range:
+    """The states that the settings choose.
+
+    Raises
+    ------
+    FrameError
+        The first, the last or a frame of the reference does not exist.
+    """
+    last = count - 1 if settings.last is None else settings.last
+    for key, index in (("reference", max(settings.reference)), ("last", last), ("first", settings.first)):
+        if index >= count:
+            raise FrameError(f"frames.{key} names frame {index}, but there are {count} (0 to {count - 1})")
+    return range(settings.first, last + 1, settings.step)
+
+
+def _check_counts(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -> None:
+    counts = [sum(map(len, sources)) for sources in lights]
     if len(set(counts)) > 1:
         told = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
         raise FrameError(f"lights fired in succession need equal numbers of frames; given are {told}")
-    if (last := max(settings.reference)) >= counts[0]:
-        raise FrameError(f"frames.reference names frame {last}, but there are {counts[0]} (0 to {counts[0] - 1})")
 
 
 def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -> Sequence[int]:
-    """Frame numbers that the names of all lights tell; empty where they tell none."""
+    """Frame numbers that the names or the headers of all lights tell; empty where they tell none."""
     found: dict[str, tuple[int, ...]] = {}
     for text, sources in zip(settings.path, lights, strict=True):
         if counts := _counts(sources):
-            step = math.gcd(*(count - counts[0] for count in counts))
+            step = math.gcd(*(count - counts[0] for count in counts)) or 1
             found[text] = tuple((count - counts[0]) // step for count in counts)
             _tell_gaps(text, counts, step)
     if len(set(found.values())) > 1:
@@ -153,7 +229,12 @@ def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -
 
 
 def _counts(sources: Sequence[FrameSource]) -> tuple[int, ...]:
-    """Numbers in the names; empty where they are no counter: a counter is the only thing in which the names differ."""
+    """The camera's numbers in a movie's header, else those in the names.
+
+    Empty where there are none: a counter is the only thing in which the names differ.
+    """
+    if len(sources) == 1 and len(sources[0]) > 1:
+        return tuple(sources[0].recording.numbered.tolist())
     names = [re.split(r"([0-9]+)", str(source.path)) for source in sources]
     if any(len(source) > 1 for source in sources) or len({len(name) for name in names}) > 1:
         return ()

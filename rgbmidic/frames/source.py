@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.stored import StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings
 
-__all__ = ["FrameSource", "file_hash"]
+__all__ = ["FrameSource", "Movie", "file_fingerprint", "file_hash", "remembered"]
+
+_T = TypeVar("_T")
+_SAMPLES, _PIECE = 64, 4096
+"""Pieces of a file, and their bytes, that its fingerprint is made of."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSource(ABC):
     """A file of one frame or several, read in any order; frames count from 0.
 
-    A format says how header and samples are read; one of several frames overrides `__len__` and `name` too.
+    A format says how header and samples are read; one of several frames is a `Movie`.
 
     Attributes
     ----------
@@ -50,9 +55,14 @@ class FrameSource(ABC):
         """SHA-256 of the file."""
         return file_hash(self.path)
 
+    @property
+    def recording(self) -> Recording:
+        """How the frames were recorded, from the header alone; a file of one frame tells nothing and is not read."""
+        return Recording()
+
     def __len__(self) -> int:
         """Number of frames."""
-        return 1
+        return self.recording.count
 
     def name(self, index: int) -> str:
         """What to call a frame in messages and results: the file's name."""
@@ -81,6 +91,38 @@ class FrameSource(ABC):
     def _stored(self, index: int) -> StoredFrame: ...
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Movie(FrameSource):
+    """A file of several frames, whose header is read when the number of its frames is asked for.
+
+    Of a frame only its own samples are read, whatever the size of the file; a header that is `remembered` is read once.
+    """
+
+    @property
+    def recording(self) -> Recording:
+        """How the frames were recorded, from the header alone.
+
+        Raises
+        ------
+        FrameError
+            The file is missing, or its header is damaged.
+        """
+        with _on_disk(self.path):
+            return self._recording()
+
+    @property
+    def fingerprint(self) -> str:
+        """Of size and samples of the content: a movie is too large to be read whole for it."""
+        return file_fingerprint(self.path)
+
+    def name(self, index: int) -> str:
+        """What to call a frame in messages and results: the file's name and the frame's index."""
+        return f"{self.path.name} frame {index}"
+
+    @abstractmethod
+    def _recording(self) -> Recording: ...
+
+
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
     """Something to read is there, and what the disk refuses becomes a FrameError."""
@@ -96,6 +138,21 @@ def _on_disk(path: Path) -> Iterator[None]:
         raise FrameError(f"{path} cannot be read: {error.strerror or error}") from None
 
 
+def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
+    """What `parse` finds in a file, found once for a file that does not change; an OSError where there is none."""
+
+    @lru_cache(maxsize=1024)
+    def found(path: Path, size: int, modified: int) -> _T:
+        return parse(path)
+
+    @wraps(parse)
+    def look(path: Path) -> _T:
+        status = path.stat()
+        return found(path, status.st_size, status.st_mtime_ns)
+
+    return look
+
+
 def file_hash(path: Path | str) -> str:
     """SHA-256 of a file, in hexadecimal digits; computed once for a file that does not change.
 
@@ -104,14 +161,39 @@ def file_hash(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
+    return _digest(path, _sha256)
+
+
+def file_fingerprint(path: Path | str) -> str:
+    """SHA-256 of a file's size and of 64 pieces of 4 KiB spread evenly over it: of all of it up to 256 KiB.
+
+    Raises
+    ------
+    FrameError
+        The file cannot be read.
+    """
+    return _digest(path, _sampled)
+
+
+def _digest(path: Path | str, function: Callable[[Path], str]) -> str:
     try:
-        status = Path(path).stat()
-        return _sha256(Path(path), status.st_size, status.st_mtime_ns)
+        return function(Path(path))
     except OSError as error:
         raise FrameError(f"{path} cannot be read: {error.strerror or error}") from None
 
 
-@lru_cache(maxsize=1024)
-def _sha256(path: Path, size: int, modified: int) -> str:
+@remembered
+def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@remembered
+def _sampled(path: Path) -> str:
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        digest = hashlib.sha256(str(size).encode())
+        for number in range(_SAMPLES):
+            file.seek(max(size - _PIECE, 0) * number // (_SAMPLES - 1))
+            digest.update(file.read(_PIECE))
+    return digest.hexdigest()
