@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -10,13 +11,13 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from rgbmidic import command
 from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
-from rgbmidic.results import EXPORT_FORMATS, Result, export_result
+from rgbmidic.results import EXPORT_FORMATS, Result, export_result, finish_result
 from rgbmidic.settings import FrameSettings
 
 __all__ = ["app", "main"]
@@ -62,27 +63,74 @@ def run(
     test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
     out: Out,
     overwrite: Overwrite = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in DIR.")] = False,
+    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 1000:2000; then `rgbmidic finish`.")] = "",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
     from rgbmidic.pipeline import measure
-    from rgbmidic.settings import read_test
+    from rgbmidic.settings import read_range, read_test
 
     started = time.perf_counter()
     settings = read_test(test)
+    chosen = read_range(frames, "--frames") if frames else None
+    if overwrite and (resume or frames):
+        raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
     _tell_first_run()
+    with _progress("measuring") as progress, _telling_how_to_go_on(test, out, frames):
+        result = measure(
+            settings,
+            out,
+            overwrite=overwrite,
+            resume=resume,
+            frames=chosen,
+            workers=workers or None,
+            scheduler=scheduler,
+            progress=progress,
+        )
+    if chosen is None:
+        _conclude(result, started, draw=draw)
+    else:
+        print(f"frames {frames} are measured; when all frames are: rgbmidic finish {out}")
+
+
+@app.command()
+def finish(
+    result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that runs with --frames have filled.")],
+    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
+) -> None:
+    """End a result that was measured in parts: check that no frame is missing, and draw it."""
+    started = time.perf_counter()
+    finish_result(result)
+    _conclude(Result.open(result), started, draw=draw)
+
+
+def _conclude(result: Result, started: float, *, draw: bool) -> None:
+    """Draw a finished result and tell what became of its frames; a failure where none of them is measured."""
     from rgbmidic.report import remove_figures, write_figures
 
-    with _progress("measuring") as progress:
-        result = measure(settings, out, overwrite=overwrite, progress=progress)
-    remove_figures(out / "figures")
+    remove_figures(result.path / "figures")
     if draw:
-        write_figures(result, out / "figures")
+        write_figures(result, result.path / "figures")
     _print_summary(result, time.perf_counter() - started)
     failed = [index for index in result.deformed if result.status[index] == _FAILED]
     if len(failed) == len(result.deformed):
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
         raise typer.Exit(command.fail(f"no deformed frame is measured; {first}", command.FAILURE))
+
+
+@contextmanager
+def _telling_how_to_go_on(test: Path, out: Path, frames: str) -> Iterator[None]:
+    """An interruption, by Ctrl-C or by whoever runs the machine, says how to go on."""
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    except KeyboardInterrupt:
+        part = f"--frames {frames}" if frames else "--resume"
+        _messages.print(f"go on with: rgbmidic run {test} --out {out} {part}", soft_wrap=True, markup=False)
+        raise
 
 
 @app.command()
@@ -326,11 +374,18 @@ def _tell_first_run() -> None:
 def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one."""
     # only for people who watch: an error stays one line, a log file stays short
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
     last = TextColumn("{task.fields[line]}", markup=False)
     with Progress(*columns, last, console=_messages, transient=True, disable=not _messages.is_terminal) as bar:
         task = bar.add_task(what, total=None, line="")
         yield lambda done, total, line: bar.update(task, completed=done, total=total, line=line)
+
+
+class _Rate(ProgressColumn):
+    """Frames per second."""
+
+    def render(self, task: Task) -> str:
+        return f"{task.speed:.3g}/s" if task.speed else ""
 
 
 def _print_summary(result: Result, seconds: float) -> None:

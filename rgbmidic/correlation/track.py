@@ -13,7 +13,7 @@ from rgbmidic.correlation.solution import NO_MATCH, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import coarse_start, refine_start
 from rgbmidic.settings import SolverSettings
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["LARGEST_TURN", "Start", "track"]
 
@@ -33,14 +33,20 @@ class Start:
     displacement: FloatArray | None
     unmeasured: float = 0.0
 
-    def after(self, solution: Solution) -> Start:
-        """The start of the frame after `solution`: gaps get the displacement of the nearest measured node."""
-        measured = solution.measured
-        if not measured.any():
-            return self
-        nearest = cKDTree(solution.nodes[measured]).query(solution.nodes)[1]
-        filled = np.where(measured[:, None], solution.displacement, solution.displacement[measured][nearest])
-        return Start(displacement=filled, unmeasured=solution.unmeasured_share)
+    @classmethod
+    def after(cls, nodes: FloatArray, displacement: FloatArray, measured: BoolArray) -> Start:
+        """The start of the frame after one in which some nodes are measured: the others move as the nearest of them.
+
+        Parameters
+        ----------
+        nodes, displacement : ndarray, shape (N, 2)
+            Positions and displacements in px.
+        measured : ndarray, shape (N,)
+            Which of them are measured: one at least.
+        """
+        nearest = cKDTree(nodes[measured]).query(nodes)[1]
+        filled = np.where(measured[:, None], displacement, displacement[measured][nearest])
+        return cls(displacement=filled, unmeasured=float((~measured).mean()))
 
 
 LARGEST_TURN = 8.0

@@ -22,7 +22,7 @@ from rgbmidic.pipeline.separation import correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["measure_frame"]
+__all__ = ["failed_frame", "measure_frame"]
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ _DARK = 0.3
 """Share of its light in the reference under which a light is told to be failing."""
 
 
-def measure_frame(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
+def measure_frame(plan: Plan, index: int, start: Start) -> FrameRecord:
     """Measure one frame of a test.
 
     A frame that cannot be read or measured gives a record with the reason, an error that is not one of rgbmidic's own
@@ -43,15 +43,9 @@ def measure_frame(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, St
     plan
         What all frames share.
     index
-        Number of the frame.
+        Which frame of the series.
     start
-        From where its displacement is looked for; the reference itself starts from rest.
-
-    Returns
-    -------
-    FrameRecord
-    Start
-        From where the next frame starts; `start` where this one failed.
+        From where its displacement is looked for; a frame of the reference starts from rest.
     """
     try:
         return _measure(plan, index, start)
@@ -61,11 +55,21 @@ def measure_frame(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, St
     except Exception as error:  # whatever it is, the other frames can be measured
         reason = f"unexpected error: {type(error).__name__}: {error}"
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
-    nodes, lights, number = len(plan.reference.mesh.nodes), len(plan.images.names), plan.series.numbers[index]
-    return FrameRecord.failed(reason, nodes=nodes, lights=lights, number=number), start
+    return failed_frame(plan, index, reason)
 
 
-def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
+def failed_frame(plan: Plan, index: int, reason: str) -> FrameRecord:
+    """The record of a frame that could not be measured at all."""
+    return FrameRecord.failed(
+        reason,
+        nodes=len(plan.reference.mesh.nodes),
+        lights=len(plan.images.names),
+        number=plan.series.numbers[index],
+        time_ns=plan.series.time_ns(index),
+    )
+
+
+def _measure(plan: Plan, index: int, start: Start) -> FrameRecord:
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
     state = plan.series.read(index)
     images = plan.separation(state)
@@ -73,7 +77,7 @@ def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     weights = plan.weights.deformed(images, index)
     deformed = Deformed.prepare(correlated(images, settings.illumination), weights, prefilter=settings.solver.prefilter)
-    if settings.frames.reference == (index,):
+    if index in settings.frames.reference:
         start = Start(displacement=np.zeros_like(reference.mesh.nodes))
     statistics = settings.weights.method == "statistics"
     solution = track(reference, deformed, start, settings.solver, statistics=statistics)
@@ -84,15 +88,15 @@ def _measure(plan: Plan, index: int, start: Start) -> tuple[FrameRecord, Start]:
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
     _tell_dark(name, images.names, brightness)
-    record = FrameRecord.from_solution(
+    return FrameRecord.from_solution(
         kept,
         number=plan.series.numbers[index],
+        time_ns=plan.series.time_ns(index),
         brightness=brightness,
         weights_thumbnail=_thumbnail(weights),
         reflection_thumbnail=None if images.reflection_index is None else _thumbnail(images.reflection_index),
         inputs=plan.series.inputs(index),
     )
-    return record, start.after(solution)
 
 
 def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> None:

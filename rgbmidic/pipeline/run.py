@@ -5,21 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from rgbmidic.correlation import NodeStatus, Start, Status
-from rgbmidic.pipeline.frame import measure_frame
+from rgbmidic._kernels import are_compiled
+from rgbmidic.errors import FrameError
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.pipeline.schedule import Schedule
+from rgbmidic.pipeline.workers import available_cores, open_workers
+from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.settings import TestSettings
 
 __all__ = ["measure"]
+
+FRAMES_A_WORKER = 8
+"""Fewer frames are not worth a process, which takes some 5 s to start."""
 
 Progress = Callable[[int, int, str], None]
 
 
 def measure(
-    settings: TestSettings, out: Path | str, *, overwrite: bool = False, progress: Progress | None = None
+    settings: TestSettings,
+    out: Path | str,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    frames: range | None = None,
+    workers: int | None = 1,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
 ) -> Result:
     """Measure a test: displacement of every frame against the reference.
+
+    The result is the same, bit for bit, for any number of workers, and whether or not it was interrupted and resumed or
+    measured part by part.
 
     Parameters
     ----------
@@ -29,6 +45,17 @@ def measure(
         Result folder; nothing is written to it before settings, calibration, region and reference are found good.
     overwrite
         Replace a result that is already there.
+    resume
+        Go on with a result that is already there: its settings, calibration and frames must be the same.
+    frames
+        Only these of the frames that the settings choose, counted as there, into a folder that other processes may fill
+        at the same time; when all are measured, `rgbmidic.results.finish_result` ends the result. None: all.
+    workers
+        Number of processes of this machine; with 1 the frames are measured in this one; None: one for each core, but
+        none for fewer than `FRAMES_A_WORKER` frames. A script that asks for more than 1 must be guarded by
+        ``if __name__ == "__main__"``.
+    scheduler
+        Address of the scheduler of a Dask cluster, instead of processes of this machine.
     progress
         Called after every frame with the number of frames done, their total and a line about the last one.
 
@@ -40,34 +67,63 @@ def measure(
     Raises
     ------
     RgbmidicError
-        The settings, the calibration, the region or the reference frames are not usable.
+        The settings, the calibration, the region or the reference frames are not usable, the result cannot be written,
+        or what is in `out` is another test's.
     """
     plan = Plan.from_settings(settings)
-    names = [plan.series.name(index) for index in range(len(plan.series))]
-    with ResultStore.create(
-        out,
+    places = _places(plan.series.chosen, frames)
+    if workers is None:
+        workers = max(min(available_cores(), len(places) // FRAMES_A_WORKER), 1)
+    with _store(plan, Path(out), places if frames else None, overwrite=overwrite, resume=resume) as store:
+        schedule = Schedule(plan, store, places)
+        if workers > 1 and not are_compiled():  # the other processes then find all compiled
+            with open_workers(plan, 1) as here:
+                schedule.run(here, progress, most=1)
+        if not schedule.done:
+            with open_workers(plan, min(workers, len(places)), scheduler) as others:
+                schedule.run(others, progress)
+        if frames is None:
+            store.finish()
+    return Result.open(out, partial=frames is not None)
+
+
+def _places(chosen: range, frames: range | None) -> range:
+    """Places in the result of the frames that are to be measured.
+
+    Raises
+    ------
+    FrameError
+        There is none of them.
+    """
+    places = [place for place, index in enumerate(chosen) if frames is None or index in frames]
+    if frames is not None and (not places or frames.stop > chosen[-1] + 1):
+        raise FrameError(
+            f"--frames names {frames.start} to {frames.stop - 1}; the frames to be measured are {chosen[0]} to {chosen[-1]}"
+        )
+    return range(places[0], places[-1] + 1)
+
+
+def _store(plan: Plan, out: Path, part: range | None, *, overwrite: bool, resume: bool) -> ResultStore:
+    series = plan.series
+    recording = series.recording
+    origin = Origin(
         nodes=plan.reference.mesh.nodes,
         elements=plan.reference.mesh.elements,
-        names=names,
+        names=[series.name(index) for index in series.chosen],
         lights=plan.images.names,
-        settings=settings,
+        settings=plan.settings,
+        inputs={" + ".join(plan.settings.frames.path): series.fingerprint()},
+        references=[place for place, index in enumerate(series.chosen) if index in plan.settings.frames.reference],
         reference=plan.images.values,
-        notes=plan.weights.notes,
-        overwrite=overwrite,
-    ) as store:
-        start = Start(displacement=None)
-        for index, name in enumerate(names):
-            record, start = measure_frame(plan, index, start)
-            store.write_frame(index, record)
-            if progress is not None:
-                progress(index + 1, len(names), _line(name, record))
-        store.finish()
-    return Result.open(out)
-
-
-def _line(name: str, record: FrameRecord) -> str:
-    status = Status(record.status)
-    if status is Status.CONVERGED:
-        measured = float((record.node_status == NodeStatus.MEASURED).mean())
-        return f"{name}: converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
-    return f"{name}: {status.name.lower().replace('_', ' ')}: {record.reason}"
+        notes={
+            **plan.weights.notes,
+            "frame_rate": recording.frame_rate,
+            "exposure_ns": recording.exposure_ns,
+            "lost_frames": series.lost,
+        },
+    )
+    if part is not None:
+        return ResultStore.join(out, origin, frames=part)
+    if resume:
+        return ResultStore.resume(out, origin)
+    return ResultStore.create(out, origin, overwrite=overwrite)

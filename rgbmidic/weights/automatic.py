@@ -44,7 +44,8 @@ def automatic_weights(
     Parameters as in `rgbmidic.weights.prepare_weights`.
     """
     blur, found, why = settings.weights.blur, None, "there is no deformed frame"
-    index = next((i for i in range(frames) if i not in settings.frames.reference), None)
+    measured = range(settings.frames.first, frames, settings.frames.step)
+    index = next((i for i in measured if i not in settings.frames.reference), None)
     if index is not None:
         why = f"no disturbed zone in frame {index}"
         size, prefilter = settings.element_size, settings.solver.prefilter

@@ -1,0 +1,266 @@
+"""A virtual fast test as one colour movie, measured end to end: error, stated uncertainty, memory, kill and resume.
+
+    python benchmarks/fast_event.py make FOLDER [--frames 500] [--size 1024]
+    python benchmarks/fast_event.py score FOLDER RESULT
+    python benchmarks/fast_event.py kill FOLDER [--times 20] [--workers 2]
+
+`make` writes a raw Bayer ``event.cine`` with its calibration, test.toml and the parameters of the motion, which is known
+in closed form. A speckled plate is struck: it swings by up to 30 px from frame to frame while a wave runs through it; a
+round fragment in it turns on its own; three reflections, each erratic in its own way, sweep over it; some frames are
+lost, as the time stamps tell. `score` prints the error of every tenth frame beside its stated uncertainty. `kill`
+measures it once, and once more killed at random moments and resumed: both must have the same bits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from rgbmidic.frames import cfa_channels  # noqa: E402 tests are no package
+from rgbmidic.illumination.calibration import Calibration, Crosstalk  # noqa: E402
+from rgbmidic.results import Result  # noqa: E402
+from rgbmidic.typing import FloatArray, FloatImage  # noqa: E402
+
+CROSSTALK = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
+CFA, BLACK, WHITE, GAIN, READ_NOISE = "GBRG", 64, 4095, 4.0, 3.0
+RATE = 100_000
+"""Frames per second."""
+_FINE = 2
+"""Pixels of the texture to one of a frame: what interpolating it adds is below the camera's noise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """Displacement of the plate and its fragment in px, at every point of the reference and every frame."""
+
+    size: int
+    struck: int = 20
+    swing: float = 120.0
+    period: float = 25.2
+    decay: float = 180.0
+    wave: float = 1.5
+    wave_length: float = 160.0
+    wave_speed: float = 9.0
+    turn_deg: float = 0.1
+
+    @property
+    def centre(self) -> FloatArray:
+        """Of the fragment, px."""
+        return np.array([0.62, 0.42]) * self.size
+
+    @property
+    def radius(self) -> float:
+        """Of the fragment, px."""
+        return 0.11 * self.size
+
+    def angle(self, frame: int) -> float:
+        """How far the fragment has turned, rad."""
+        return float(np.radians(self.turn_deg * max(frame - self.struck, 0)))
+
+    def plate(self, points: FloatArray, frame: int) -> FloatArray:
+        """Displacement (..., 2) of points (..., 2) of the plate."""
+        after = max(frame - self.struck, 0)
+        swing = self.swing * np.exp(-after / self.decay) * np.sin(2 * np.pi * after / self.period)
+        behind = (self.wave_speed * after - points[..., 0]) / self.wave_length
+        wave = np.where((behind > 0) & (behind < 1), self.wave * np.sin(np.pi * behind) ** 2, 0.0)
+        return np.stack([swing + wave, np.full(wave.shape, 0.3 * swing)], axis=-1)
+
+    def fragment(self, points: FloatArray, frame: int) -> FloatArray:
+        """Displacement (..., 2) of points (..., 2) of the fragment: the plate's at its centre, and its turn."""
+        c, s = np.cos(self.angle(frame)), np.sin(self.angle(frame))
+        turned = (points - self.centre) @ np.array([[c, s], [-s, c]])
+        return turned + self.centre - points + self.plate(self.centre, frame)
+
+    def displacement(self, points: FloatArray, frame: int) -> FloatArray:
+        """Displacement (..., 2) of material points (..., 2)."""
+        return np.where(self.inside(points)[..., None], self.fragment(points, frame), self.plate(points, frame))
+
+    def inside(self, points: FloatArray) -> FloatArray:
+        """Whether points lie in the fragment."""
+        return np.asarray(np.hypot(*np.moveaxis(points - self.centre, -1, 0)) < self.radius)
+
+    def origin(self, points: FloatArray, frame: int) -> FloatArray:
+        """Material points (..., 2) that are seen at points (..., 2) of a frame."""
+        c, s = np.cos(self.angle(frame)), np.sin(self.angle(frame))
+        seen = points - self.centre - self.plate(self.centre, frame)
+        turned_back = seen @ np.array([[c, -s], [s, c]]) + self.centre
+        plate = points
+        for _ in range(20):  # the wave's slope is .03: each step gains a factor of 30
+            plate = points - self.plate(plate, frame)
+        return np.where(self.inside(turned_back)[..., None], turned_back, plate)
+
+
+def make(folder: Path, frames: int, size: int, lost: int) -> None:
+    """Write movie, calibration, settings and truth."""
+    from cine_files import write_cine
+
+    folder.mkdir(parents=True)
+    motion = Motion(size=size)
+    numbers = np.setdiff1d(np.arange(frames + lost), _lost_numbers(frames + lost, lost))
+    (folder / "motion.json").write_text(json.dumps({**asdict(motion), "numbers": numbers.tolist()}))
+    Calibration(crosstalk=Crosstalk(matrix=CROSSTALK, lights=("red", "green", "blue"))).write(
+        folder / "calibration.json"
+    )
+    margin = round(0.17 * size)
+    (folder / "test.toml").write_text(
+        f'[frames]\npath = "event.cine"\nreference = "0:10"\n\n[region]\n'
+        f"rectangle = [{margin}, {margin // 2}, {size - 1 - margin}, {size - 1 - margin // 2}]\n\n"
+        f'[calibration]\nfile = "calibration.json"\n'
+    )
+    renderer = _Renderer(motion)
+    write_cine(
+        folder / "event.cine",
+        (renderer.frame(int(number)) for number in numbers),
+        cfa=CFA,
+        black_level=BLACK,
+        white_level=WHITE,
+        bit_depth=12,
+        frame_rate=RATE,
+        exposure_ns=2000,
+        times_ns=(numbers - 10) * (10**9 // RATE),
+        first_image=-10,
+    )
+
+
+def _lost_numbers(count: int, lost: int) -> FloatArray:
+    """Frames that are lost, in runs of one to three, none of them among the first 30."""
+    begins = np.random.default_rng(5).choice(np.arange(30, count - 4, 5), size=lost, replace=False)
+    return np.sort(begins)
+
+
+class _Renderer:
+    """Frames of the test, from a texture and three sparkles that lie on the specimen."""
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+        rng = np.random.default_rng(11)
+        self.fine = _FINE * (motion.size + 400)
+        spots = gaussian_filter(rng.normal(size=(self.fine, self.fine)).astype(np.float32), 1.25 * _FINE, mode="wrap")
+        paint = 0.45 + 0.3 * np.tanh(2 * spots / spots.std())
+        self.paint = spline_filter(paint, mode="grid-wrap", output=np.float32)
+        self.sparkle = [
+            gaussian_filter(rng.normal(size=paint.shape).astype(np.float32), 0.5 * _FINE, mode="wrap")
+            for _ in range(3)
+        ]
+        self.sparkle = [1 + 0.35 * one / one.std() for one in self.sparkle]
+        rows, columns = np.mgrid[: motion.size, : motion.size].astype(np.float64)
+        self.points = np.stack([columns, rows], axis=-1)
+        self.site = np.tile(cfa_channels(CFA), (motion.size // 2, motion.size // 2))
+
+    def frame(self, number: int) -> FloatImage:
+        """The raw mosaic of one frame, uint16, 12 bit."""
+        places = (self.motion.origin(self.points, number) + 200) * _FINE
+        # OpenCV rounds places to 1/32 px: enough for sparkle, not for the truth
+        paint = map_coordinates(self.paint, np.moveaxis(places, -1, 0)[::-1], mode="grid-wrap", prefilter=False)
+        lights = np.stack([0.6 * paint * self._reflected(light, number, places) for light in range(3)])
+        channels = np.tensordot(CROSSTALK, lights, axes=1)
+        signal = np.take_along_axis(channels, self.site[None], axis=0)[0] * (WHITE - BLACK) * 0.75
+        rng = np.random.default_rng(1000 + number)
+        noisy = signal + rng.normal(size=signal.shape) * np.sqrt(np.maximum(signal, 0) / GAIN + READ_NOISE**2)
+        values: FloatImage = np.clip(np.round(noisy + BLACK), 0, WHITE).astype(np.uint16)
+        return values
+
+    def _reflected(self, light: int, number: int, places: FloatImage) -> FloatImage:
+        """How much brighter a light's reflection, which sweeps over the picture, makes what it meets."""
+        size = self.motion.size
+        angle = 2 * np.pi * (number / 170 + light / 3)
+        x, y = (0.5 + 0.3 * np.cos(angle)) * size, (0.5 + 0.3 * np.sin(angle)) * size
+        spot = np.exp(-((self.points[..., 0] - x) ** 2 + (self.points[..., 1] - y) ** 2) / (2 * (0.09 * size) ** 2))
+        return 1 + 1.2 * spot * np.maximum(self._seen(self.sparkle[light], places), 0)
+
+    def _seen(self, texture: FloatImage, places: FloatImage) -> FloatImage:
+        x, y = ((places[..., axis] % self.fine).astype(np.float32) for axis in (0, 1))
+        return np.asarray(cv2.remap(texture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP))
+
+
+def score(folder: Path, path: Path) -> None:
+    """Error of the frames beside what they state, apart for the plate and the fragment."""
+    told = json.loads((folder / "motion.json").read_text())
+    numbers = told.pop("numbers")
+    motion, result = Motion(**told), Result.open(path, partial=True)
+    nodes = result.nodes
+    away = np.abs(np.hypot(*(nodes - motion.centre).T) - motion.radius) > 30
+    print("frame  motion  iterations  plate: measured rms error/stated   fragment: measured rms error/stated")
+    totals = []
+    for index in range(len(result)):
+        record, number = result.frame(index), numbers[index]
+        assert record.number == number - numbers[0] or record.iterations == 0
+        truth = motion.displacement(nodes, number) - motion.displacement(nodes, numbers[0])
+        error = np.stack([record.u, record.v], axis=1) - truth
+        stated = np.stack([record.u_std, record.v_std], axis=1)
+        parts = [_figures(error[part], stated[part]) for part in (away & ~motion.inside(nodes), motion.inside(nodes) & away)]
+        totals.append([*parts[0], *parts[1]])
+        if index % 10 == 0:
+            jump = np.linalg.norm(truth - motion.displacement(nodes, number - 1), axis=1).max()
+            told_parts = "   ".join(f"{share:7.1%} {rms:.4f} {ratio:.2f}" for share, rms, ratio in parts)
+            print(f"{number:5d}  {jump:6.1f}  {record.iterations:4d}  {told_parts}")
+    print("median over the frames:", np.round(np.nanmedian(totals, axis=0), 4).tolist())
+    print("worst:", np.round(np.nanmin(totals, axis=0), 4).tolist(), np.round(np.nanmax(totals, axis=0), 4).tolist())
+
+
+def _figures(error: FloatArray, stated: FloatArray) -> tuple[float, float, float]:
+    """Share that is measured, rms error, rms of error over stated."""
+    known = np.isfinite(error[:, 0])
+    if not known.any():
+        return 0.0, np.nan, np.nan
+    return float(known.mean()), *(float(np.sqrt((part[known] ** 2).mean())) for part in (error, error / stated))
+
+
+def kill(folder: Path, times: int, workers: int) -> None:
+    """Measure the test at one go, and killed at random moments and resumed; compare all quantities of all frames."""
+    command = [sys.executable, "-m", "rgbmidic.cli", "run", str(folder / "test.toml"), "--no-figures"]
+    command += ["--workers", str(workers), "--out"]
+    began = time.perf_counter()
+    if not (folder / "whole").exists():
+        subprocess.run([*command, str(folder / "whole")], check=True)
+    whole = time.perf_counter() - began
+    moments = random.Random(3)
+    for number in range(times):
+        run = subprocess.Popen([*command, str(folder / "killed"), *(["--resume"] if number else [])])
+        time.sleep(moments.uniform(0.3, 1.7) * max(whole, 60) / times + 8)
+        run.send_signal(signal.SIGKILL)
+        run.wait()
+        done = 0
+        if (folder / "killed" / "provenance.json").exists():
+            done = int((Result.open(folder / "killed", partial=True).number >= 0).sum())
+        print(f"killed {number + 1} times: {done} frames are kept", flush=True)
+    subprocess.run([*command, str(folder / "killed"), "--resume"], check=True)
+    one, other = (Result.open(folder / name) for name in ("whole", "killed"))
+    for index in range(len(one)):
+        for name, value in one.frame(index).values.items():
+            np.testing.assert_array_equal(value, other.frame(index).values[name], err_msg=f"{name} of frame {index}")
+    print(f"the same bits in all {len(one)} frames")
+
+
+def main() -> None:
+    """Run the command line above."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["make", "score", "kill"])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("result", type=Path, nargs="?")
+    for name, default in (("frames", 500), ("size", 1024), ("lost", 30), ("times", 20), ("workers", 2)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    given = parser.parse_args()
+    if given.what == "make":
+        make(given.folder, given.frames, given.size, given.lost)
+    elif given.what == "score":
+        score(given.folder, given.result or given.folder / "whole")
+    else:
+        kill(given.folder, given.times, given.workers)
+
+
+if __name__ == "__main__":
+    main()

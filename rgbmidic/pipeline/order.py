@@ -1,0 +1,50 @@
+"""In which order frames can be measured: each starts from an earlier one, whatever the number of workers.
+
+The frames are the leaves of a tree of base `STRIDE`: a frame starts from the one before it, every 16th from the 16th
+before, every 256th from the 256th before, and so on, so that chunks of consecutive frames can be measured side by side
+once their key frame is, and any range of frames needs only some key frames of those before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+__all__ = ["STRIDE", "children", "lineage", "parent"]
+
+STRIDE = 16
+"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
+
+
+def parent(position: int) -> int | None:
+    """The frame that a frame starts from; None for the first."""
+    return position - _step(position) if position else None
+
+
+def is_key(position: int) -> bool:
+    """Whether a frame starts from one that is not just before it."""
+    return position > 0 and _step(position) > 1
+
+
+def children(position: int, count: int) -> Iterator[int]:
+    """The frames among `count` that start from a frame."""
+    step = 1
+    while position + step < count:
+        if parent(position + step) == position:
+            yield position + step
+        step *= STRIDE
+
+
+def lineage(position: int) -> Iterator[int]:
+    """A frame, its parent, the parent of that, and so on to the first."""
+    following: int | None = position
+    while following is not None:
+        yield following
+        following = parent(following)
+
+
+def _step(position: int) -> int:
+    """The largest power of `STRIDE` that divides the position of a frame after the first."""
+    step = 1
+    while position % (step * STRIDE) == 0:
+        step *= STRIDE
+    return step

@@ -1,0 +1,184 @@
+"""Which frame is measured next, from where it starts, and what becomes of a frame whose worker dies."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from heapq import heappop, heappush
+
+import numpy as np
+
+from rgbmidic.correlation import NodeStatus, Start, Status
+from rgbmidic.pipeline.frame import failed_frame
+from rgbmidic.pipeline.order import children, is_key, lineage, parent
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.workers import Measured, Workers
+from rgbmidic.results import FrameRecord, ResultStore
+
+__all__ = ["Schedule"]
+
+logger = logging.getLogger("rgbmidic.pipeline.frame")
+
+_LOSS = 0.01
+"""Share of the nodes that a key frame may lose against the one it starts from before it is measured again from the
+frame just before it."""
+_TRIES = 3
+"""Times that a frame is given to a worker before it is told to be what kills them."""
+
+Progress = Callable[[int, int, str], None]
+
+
+class Schedule:
+    """The frames of a test that are still to be measured.
+
+    A frame starts from its parent in the tree of `rgbmidic.pipeline.order`, as the store keeps it. A key frame that is
+    not measured well from there is measured once more from the frame just before it, and the better of both is kept.
+
+    Attributes
+    ----------
+    done
+        Whether all are measured.
+    """
+
+    def __init__(self, plan: Plan, store: ResultStore, places: range) -> None:
+        self._plan, self._store, self._places = plan, store, places
+        self._finished = store.finished()
+        self._measured = self._finished & (store.read_all("status") != Status.FAILED)
+        self._wanted = np.zeros_like(self._finished)
+        self._ready: list[int] = []
+        self._waiting: dict[int, list[int]] = {}
+        self._first_tries: dict[int, FrameRecord] = {}
+        self._deaths: dict[int, int] = {}
+        self._running: dict[Future[Measured], tuple[int, Start]] = {}
+        for position in places:
+            self._want(position)
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to be measured."""
+        return not (self._ready or self._running)
+
+    def run(self, workers: Workers, progress: Progress | None = None, *, most: int | None = None) -> None:
+        """Have frames measured, and keep each in the store as it finishes.
+
+        Parameters
+        ----------
+        workers
+            Who measures.
+        progress
+            Called after every frame with the number of frames done, their total and a line about the last one.
+        most
+            Stop after so many; None: when all are measured.
+
+        Raises
+        ------
+        ResultError
+            The store cannot be written.
+        """
+        count = 0
+        while not self.done and count != most:
+            while self._ready and len(self._running) < (workers.slots if most is None else 1):
+                self._submit(workers)
+            ended = wait(self._running, return_when=FIRST_COMPLETED).done
+            if any(isinstance(future.exception(), BrokenExecutor) for future in ended):
+                ended = wait(self._running).done  # with one of its processes all work of an executor ends
+                workers.restart()
+            for future in ended:
+                position, start = self._running.pop(future)
+                if (record := self._outcome(future, position)) is not None:
+                    self._take(position, start, record, progress)
+                    count += 1
+
+    def _submit(self, workers: Workers) -> None:
+        position = heappop(self._ready)
+        before = position - 1 if position in self._first_tries else parent(position)
+        start = Start(displacement=None) if before is None else self._start_after(before)
+        self._running[workers.submit(self._plan.series.chosen[position], start)] = position, start
+
+    def _start_after(self, position: int) -> Start:
+        """Where a frame starts that follows one: from the last that is measured up to there.
+
+        Where a frame fails, all before it are finished: a key frame that fails waits for the one just before it.
+        """
+        measured = np.flatnonzero(self._measured[: position + 1])
+        if not measured.size:
+            return Start(displacement=None)
+        kept = self._store.read(int(measured[-1]), ["u", "v", "node_status"])
+        displacement = np.stack([kept["u"], kept["v"]], axis=1)
+        return Start.after(self._plan.reference.mesh.nodes, displacement, kept["node_status"] == NodeStatus.MEASURED)
+
+    def _outcome(self, future: Future[Measured], position: int) -> FrameRecord | None:
+        """What a worker found; None where it died and the frame is to be measured again."""
+        error = future.exception()
+        if error is None:
+            for level, text in future.result().messages:
+                logger.log(level, "%s", text)
+            return future.result().record
+        deaths = self._deaths[position] = self._deaths.get(position, 0) + 1
+        name = self._plan.series.name(self._plan.series.chosen[position])
+        logger.warning("a worker died while %s was measured (%s)", name, error or type(error).__name__)
+        if deaths < _TRIES:
+            heappush(self._ready, position)
+            return None
+        return failed_frame(self._plan, self._plan.series.chosen[position], f"its worker process died {deaths} times")
+
+    def _take(self, position: int, start: Start, record: FrameRecord, progress: Progress | None) -> None:
+        """Keep a record, or have the frame measured again, and release what waits for it."""
+        first = self._first_tries.pop(position, None)
+        if first is None and is_key(position) and _loses(record, start):
+            self._first_tries[position] = record
+            self._want(position - 1)
+            self._after(position - 1, [position])
+            return
+        if first is not None and _rank(first) <= _rank(record):
+            record = first
+        self._store.write_frame(position, record)
+        self._finished[position], self._measured[position] = True, record.status != Status.FAILED
+        for child in children(position, len(self._finished)):
+            if self._wanted[child]:
+                heappush(self._ready, child)
+        for waiting in self._waiting.pop(position, ()):
+            heappush(self._ready, waiting)
+        if progress is not None:
+            places = self._places
+            done = int(self._finished[places.start : places.stop].sum())
+            progress(done, len(places), _line(self._plan.series.name(self._plan.series.chosen[position]), record))
+
+    def _after(self, position: int, frames: Iterable[int]) -> None:
+        """Have frames measured once another one is finished."""
+        if not self._finished[position]:
+            self._waiting.setdefault(position, []).extend(frames)
+            return
+        for frame in frames:
+            heappush(self._ready, frame)
+
+    def _want(self, position: int) -> None:
+        """Have a frame measured, and all that it depends on."""
+        new = None
+        for place in lineage(position):
+            if self._finished[place]:
+                break
+            if self._wanted[place]:
+                return
+            self._wanted[place], new = True, place
+        if new is not None:
+            heappush(self._ready, new)
+
+
+def _rank(record: FrameRecord) -> tuple[int, float]:
+    """The smaller, the better a frame is measured."""
+    return int(record.status), float((record.node_status != NodeStatus.MEASURED).mean())
+
+
+def _loses(record: FrameRecord, start: Start) -> bool:
+    status, unmeasured = _rank(record)
+    return status != Status.CONVERGED or unmeasured > start.unmeasured + _LOSS
+
+
+def _line(name: str, record: FrameRecord) -> str:
+    status = Status(record.status)
+    if status is Status.CONVERGED:
+        measured = float((record.node_status == NodeStatus.MEASURED).mean())
+        return f"{name}: converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
+    return f"{name}: {status.name.lower().replace('_', ' ')}: {record.reason}"

@@ -1,0 +1,230 @@
+"""Who measures frames: this process, several processes of this machine, or a Dask cluster."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Self
+
+from rgbmidic.correlation import Start
+from rgbmidic.errors import ConfigurationError
+from rgbmidic.pipeline.frame import measure_frame
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.results import FrameRecord
+
+__all__ = ["Measured", "Workers", "available_cores", "open_workers"]
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "RGBMIDIC_THREADS")
+"""What libraries read, when they start, for the number of their threads."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """What a worker gives back of a frame: its record, and what there was to say (level and text)."""
+
+    record: FrameRecord
+    messages: tuple[tuple[int, str], ...]
+
+
+class Workers(ABC):
+    """Measure frames, as many at a time as there are `slots`."""
+
+    slots: int
+
+    @abstractmethod
+    def submit(self, index: int, start: Start) -> Future[Measured]:
+        """Have one frame measured."""
+
+    def restart(self) -> None:
+        """Begin anew after a worker has died."""
+
+    def close(self) -> None:
+        """Stop, without waiting for what is not finished."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Here(Workers):
+    """This process, one frame after the other, each on all its threads."""
+
+    slots = 1
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+
+    def submit(self, index: int, start: Start) -> Future[Measured]:
+        """Measure the frame at once."""
+        done: Future[Measured] = Future()
+        done.set_result(Measured(record=measure_frame(self._plan, index, start), messages=()))
+        return done
+
+
+class Processes(Workers):
+    """Processes of this machine, which share its cores."""
+
+    def __init__(self, plan: Plan, count: int) -> None:
+        self.slots = count
+        self._plan = pickle.dumps(plan, protocol=pickle.HIGHEST_PROTOCOL)
+        self._executor: Executor = self._begin()
+
+    def _begin(self) -> ProcessPoolExecutor:
+        threads = max(available_cores() // self.slots, 1)
+        with _environment(dict.fromkeys(_THREADS, str(threads))):
+            spawn = multiprocessing.get_context("spawn")  # threads do not survive a fork
+            pool = ProcessPoolExecutor(self.slots, spawn, initializer=_prepare, initargs=(self._plan, threads))
+            # the processes must start while the environment says how many threads they have
+            started = [pool.submit(os.getpid) for _ in range(self.slots)]
+            try:
+                for one in started:
+                    one.result()
+            except BrokenExecutor as error:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise ConfigurationError(f"worker processes cannot be started: {error}") from None
+        return pool
+
+    def submit(self, index: int, start: Start) -> Future[Measured]:
+        """Have one frame measured by the next free process."""
+        try:
+            return self._executor.submit(_measure_given, index, start)
+        except BrokenExecutor as error:
+            broken: Future[Measured] = Future()
+            broken.set_exception(error)
+            return broken
+
+    def restart(self) -> None:
+        """Begin with new processes."""
+        self.close()
+        self._executor = self._begin()
+
+    def close(self) -> None:
+        """Stop, without waiting for what is not finished."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+
+class Cluster(Workers):
+    """The workers of a Dask cluster; what a lost one was doing is done again by another."""
+
+    def __init__(self, plan: Plan, address: str) -> None:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise ConfigurationError(
+                "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
+            ) from None
+        try:
+            self._client: Any = Client(address, timeout=30, set_as_default=False)
+            self._client.wait_for_workers(1, timeout=120)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ConfigurationError(f"no Dask scheduler with workers answers at {address}: {error}") from None
+        self._plan = self._client.scatter(plan, broadcast=True, hash=False)
+        self._executor = self._client.get_executor(pure=False)
+
+    @property
+    def slots(self) -> int:  # type: ignore[override]
+        """Threads of all workers there are now."""
+        return max(sum(self._client.nthreads().values()), 1)
+
+    def submit(self, index: int, start: Start) -> Future[Measured]:
+        """Have one frame measured by some worker."""
+        future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, 1)
+        return future
+
+    def close(self) -> None:
+        """Leave the cluster to others, without waiting for what is not finished."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+        self._client.close()
+
+
+def open_workers(plan: Plan, count: int, scheduler: str | None) -> Workers:
+    """A Dask cluster where its scheduler is named, else `count` processes; a single one is this process."""
+    if scheduler is not None:
+        return Cluster(plan, scheduler)
+    return Processes(plan, count) if count > 1 else Here(plan)
+
+
+def available_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class _Messages(logging.Handler):
+    """Keeps what one thread logs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.thread, self.kept = threading.get_ident(), list[tuple[int, str]]()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self.thread:
+            self.kept.append((record.levelno, self.format(record)))
+
+
+def _measure_elsewhere(plan: Plan, index: int, start: Start, threads: int) -> Measured:
+    """Measure a frame in another process, whose log nobody reads."""
+    _use_threads(threads)
+    logger, handler = logging.getLogger("rgbmidic"), _Messages()
+    logger.addHandler(handler)
+    try:
+        return Measured(record=measure_frame(plan, index, start), messages=tuple(handler.kept))
+    finally:
+        logger.removeHandler(handler)
+
+
+_given: tuple[Plan, int] | None = None
+"""In a worker process: the test that it measures frames of, and on how many threads."""
+
+
+def _prepare(plan: bytes, threads: int) -> None:
+    """Begin a worker process."""
+    global _given
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one decides
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _given = pickle.loads(plan), threads
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _measure_given(index: int, start: Start) -> Measured:
+    assert _given is not None
+    plan, threads = _given
+    return _measure_elsewhere(plan, index, start, threads)
+
+
+def _use_threads(threads: int) -> None:
+    import cv2
+    import numba
+
+    cv2.setNumThreads(threads)
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Environment variables while something starts."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value

@@ -1,0 +1,40 @@
+"""The order of frames: a tree in which every frame has one place, near to which little has to be measured before it."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rgbmidic.pipeline.order import STRIDE, children, is_key, lineage, parent
+
+
+def test_a_frame_starts_from_the_one_before_it_and_a_key_frame_from_the_key_frame_before() -> None:
+    assert [parent(position) for position in (0, 1, 15, 16, 17, 32, 256, 272, 4096)] == [
+        None, 0, 14, 0, 16, 16, 0, 256, 0,
+    ]  # fmt: skip
+    assert [position for position in range(40) if is_key(position)] == [16, 32]
+
+
+@given(st.integers(1, 10**6))
+def test_a_parent_lies_before_and_knows_its_child(position: int) -> None:
+    before = parent(position)
+    assert before is not None
+    assert 0 <= before < position
+    assert position in children(before, position + 1)
+
+
+@pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 300, 5000])
+def test_the_tree_reaches_every_frame_once(count: int) -> None:
+    reached, ready = [], [0]
+    while ready:
+        reached.append(position := ready.pop())
+        ready.extend(children(position, count))
+    assert sorted(reached) == list(range(count))
+
+
+@given(st.integers(0, 10**6))
+def test_the_line_of_a_frame_is_short(position: int) -> None:
+    line = list(lineage(position))
+    assert (line[0], line[-1]) == (position, 0)
+    assert len(line) <= 1 + (STRIDE - 1) * 5
