@@ -8,7 +8,7 @@ from pathlib import Path
 from rgbmidic.correlation import NodeStatus, Start, Status
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.settings import TestSettings
 
 __all__ = ["measure"]
@@ -44,17 +44,17 @@ def measure(
     """
     plan = Plan.from_settings(settings)
     names = [plan.series.name(index) for index in range(len(plan.series))]
-    with ResultStore.create(
-        out,
+    origin = Origin(
         nodes=plan.reference.mesh.nodes,
         elements=plan.reference.mesh.elements,
         names=names,
         lights=plan.images.names,
         settings=settings,
+        references=settings.frames.reference,
         reference=plan.images.values,
         notes=plan.weights.notes,
-        overwrite=overwrite,
-    ) as store:
+    )
+    with ResultStore.create(out, origin, overwrite=overwrite) as store:
         start = Start(displacement=None)
         for index, name in enumerate(names):
             record, start = measure_frame(plan, index, start)
