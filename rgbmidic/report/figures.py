@@ -59,8 +59,10 @@ View = tuple[tuple[float, float], tuple[float, float]]
 
 
 def shown_frames(result: Result) -> tuple[int, ...]:
-    """The deformed frames; all where there is none."""
-    return result.deformed or tuple(range(len(result)))
+    """The deformed frames that are measured; all that are where there is none, all of the test where none is."""
+    finished = result.finished
+    deformed = tuple(index for index in result.deformed if finished[index])
+    return deformed or tuple(np.flatnonzero(finished).tolist()) or tuple(range(len(result)))
 
 
 def map_figure(result: Result, frame: int, kind: str) -> Figure:

@@ -2,18 +2,22 @@
 
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.quantities import QUANTITIES, Quantity
+from rgbmidic.results.provenance import Origin
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
 from rgbmidic.results.record import FrameRecord
 from rgbmidic.results.result import Result
-from rgbmidic.results.store import ResultStore
+from rgbmidic.results.store import ResultStore, finish_result
 
 __all__ = [
     "EXPORT_FORMATS",
     "QUANTITIES",
     "REFLECTING",
+    "UNKNOWN_TIME",
     "FrameRecord",
+    "Origin",
     "Quantity",
     "Result",
     "ResultStore",
     "export_result",
+    "finish_result",
 ]

@@ -7,14 +7,13 @@ import io
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results.files import write_complete, writing
-from rgbmidic.results.quantities import QUANTITIES
+from rgbmidic.results.quantities import QUANTITIES, Quantity
 from rgbmidic.results.result import Result
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
@@ -63,15 +62,22 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
 
 def _write_npz(result: Result, file: BinaryIO) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, array in _arrays(result):
+        for name in ("nodes", "elements", "names", "lights"):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+                np.lib.format.write_array(member, np.asarray(getattr(result, name)), allow_pickle=False)
+        for quantity in QUANTITIES.values():
+            if quantity.stackable:
+                with archive.open(f"{quantity.name}.npy", "w", force_zip64=True) as member:
+                    _write_frames(result, quantity, member)
 
 
-def _arrays(result: Result) -> Iterator[tuple[str, npt.ArrayLike]]:
-    """Name and content of each array, one after the other: only one is in memory."""
-    yield from {name: getattr(result, name) for name in ("nodes", "elements", "names", "lights")}.items()
-    yield from ((name, result.stack(name)) for name, quantity in QUANTITIES.items() if quantity.stackable)
+def _write_frames(result: Result, quantity: Quantity, file: IO[bytes]) -> None:
+    """One array of all frames, of which one frame at a time is in memory."""
+    one = quantity.unmeasured(result.table.layout.sizes)
+    head = {"descr": one.dtype.str, "fortran_order": False, "shape": (len(result), *one.shape)}
+    np.lib.format.write_array_header_1_0(file, head)
+    for value in result.each(quantity.name):
+        file.write(np.asarray(value, dtype=one.dtype).tobytes())
 
 
 def _write_csv(result: Result, file: BinaryIO) -> None:

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import socket
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from rgbmidic.errors import ResultError
 from rgbmidic.typing import AnyArray
 
-__all__ = ["read_arrays", "read_json", "write_arrays", "write_complete", "write_json", "writing"]
+__all__ = ["read_arrays", "read_json", "write_arrays", "write_complete", "write_json", "write_new_json", "writing"]
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -58,10 +59,18 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
     return array
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
+def write_json(path: Path, document: Any) -> None:
     """Write a JSON file."""
-    text = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
-    write_complete(path, lambda file: file.write(text.encode()))
+    write_complete(path, lambda file: file.write(_text(document)))
+
+
+def write_new_json(path: Path, document: Any) -> bool:
+    """Write a JSON file where there is none; of all who try at once one succeeds, the others are told False."""
+    return write_complete(path, lambda file: file.write(_text(document)), _name_new)
+
+
+def _text(document: Any) -> bytes:
+    return json.dumps(document, indent=2).encode() + b"\n"
 
 
 def read_json(path: Path) -> Any:
@@ -82,15 +91,33 @@ def read_json(path: Path) -> Any:
         raise ResultError(f"{path} is damaged: {error}") from None
 
 
-def write_complete(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file under another name and rename it when all of it is on the disk; else nothing is left of it."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
+def _rename(temporary: Path, path: Path) -> bool:
+    temporary.replace(path)
+    return True
+
+
+def _name_new(temporary: Path, path: Path) -> bool:
+    """Rename where there is none yet."""
+    try:
+        path.hardlink_to(temporary)
+    except FileExistsError:
+        return False
+    except OSError:  # a disk without links, where nobody else starts in the same millisecond
+        return not path.exists() and _rename(temporary, path)
+    return True
+
+
+def write_complete(
+    path: Path, write: Callable[[BinaryIO], object], rename: Callable[[Path, Path], bool] = _rename
+) -> bool:
+    """Write a file under another name and `rename` it when all of it is on the disk; else nothing is left of it."""
+    temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{os.getpid()}.part")
     try:
         with writing(path), temporary.open("wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-            temporary.replace(path)
+            return rename(temporary, path)
     finally:
         with contextlib.suppress(OSError):  # a read-only disk refuses even to remove what is not there
             temporary.unlink()

@@ -13,7 +13,7 @@ from rgbmidic.errors import InputError
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
 
-__all__ = ["QUANTITIES", "SHARED", "Quantity"]
+__all__ = ["QUANTITIES", "SHARED", "UNKNOWN_TIME", "Quantity"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Quantity:
     meaning
         What docs/conventions.md says of it.
     dtype
-        Type of the array.
+        Type of the array, in memory and on disk: what is known to no more than some digits has single precision.
     blank
         What a frame holds that could not be measured at all.
     codes
@@ -47,8 +47,8 @@ class Quantity:
     source: str
     meaning: str
     _: KW_ONLY
-    dtype: type[np.generic] = np.float64
-    blank: float | str = float("nan")
+    dtype: type[np.generic] = np.float32
+    blank: float | int | str = float("nan")
     codes: tuple[str, ...] = ()
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
@@ -79,10 +79,15 @@ class Quantity:
         return value[:, int(column)] if column else value
 
 
+UNKNOWN_TIME = np.iinfo(np.int64).min
+"""`time_ns` of a frame whose time nobody knows."""
+
 _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
+_EXACT: dict[str, Any] = {"dtype": np.float64}
 _AROUND = "the area-weighted mean of the elements around a node; NaN also beside a node that is not measured"
+_TIME = "time of the frame from the trigger; the smallest 64-bit integer where it is not known"
 _MISFIT = "weighted rms residual around a node over its median: 1 is ordinary, 3 is suspicious"
 _RESIDUAL = (
     "weighted rms of `f - g(x + u)`, in the unit of the images that are correlated: none if these are divided by their "
@@ -102,14 +107,15 @@ _TABLE = (
     Quantity(
         "number", (), "", "", "number of the frame: a frame that is missing leaves a gap", dtype=np.int64, blank=-1
     ),
+    Quantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
     Quantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
     Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
     Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
     Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
     Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
     Quantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
-    Quantity("u", _NODE, "px", "displacement.0", "displacement in x against the reference"),
-    Quantity("v", _NODE, "px", "displacement.1", "displacement in y against the reference"),
+    Quantity("u", _NODE, "px", "displacement.0", "displacement in x against the reference", **_EXACT),
+    Quantity("v", _NODE, "px", "displacement.1", "displacement in y against the reference", **_EXACT),
     Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
     Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
     Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
@@ -136,7 +142,7 @@ QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABL
 _CORNERS = "node indices; `(p1 - p0) x (p2 - p0) > 0` in (x, y)"
 _REFERENCE = "reference image of each light, stretched to 8 bit, for pictures"
 SHARED: dict[str, Quantity] = {
-    "nodes": Quantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image"),
+    "nodes": Quantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
     "elements": Quantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
     "reference": Quantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
 }

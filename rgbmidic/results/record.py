@@ -65,7 +65,7 @@ class FrameRecord:
         inputs
             Path and SHA-256 of the files that the frame was read from.
         given
-            The others: `number`, `brightness`, `weights_thumbnail`, `reflection_thumbnail`; None where not known.
+            The others, such as `number`, `time_ns`, `brightness` and `weights_thumbnail`; None where not known.
         """
         nodes, lights = np.shape(solution.light_share)
         solved = {name: entry.of(solution) for name, entry in QUANTITIES.items() if entry.source}

@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
+from rgbmidic.results.provenance import read_provenance
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.results.record import FrameRecord
-from rgbmidic.results.store import ResultStore, read_mesh, read_provenance
-from rgbmidic.typing import AnyArray, FloatArray
+from rgbmidic.results.shards import FrameTable
+from rgbmidic.results.store import check_complete, load_frames, read_mesh, read_names, read_reference
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 __all__ = ["Result"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Result:
-    """The reading side of a result folder.
+    """The reading side of a result folder, as far as it has come when it is opened.
 
     Every quantity of `rgbmidic.results.QUANTITIES` whose shape is the same in all frames is an attribute with the
-    frames as first axis, such as ``result.u`` of shape (T, N): read when it is first asked for, then kept. `each` gives
-    any quantity one frame after the other and keeps nothing, `frame` everything of one frame.
+    frames as first axis, such as ``result.u`` of shape (T, N): read when it is first asked for, then kept, so that it
+    takes its T x N numbers of memory. `each` gives any quantity one frame after the other and keeps nothing, `frame`
+    everything of one frame. A frame that is not measured yet is blank, with that as its reason.
 
     Attributes
     ----------
-    store
+    path
         The folder.
+    table
+        Where each frame lies.
     nodes : ndarray, shape (N, 2), float64
         Positions (x, y) in px on the reference image.
     elements : ndarray, shape (E, 3), int32
@@ -44,7 +49,8 @@ class Result:
         Settings, versions and dates, as in ``provenance.json``.
     """
 
-    store: ResultStore
+    path: Path
+    table: FrameTable
     nodes: FloatArray
     elements: npt.NDArray[np.int32]
     names: tuple[str, ...]
@@ -52,7 +58,7 @@ class Result:
     provenance: Mapping[str, Any]
 
     @classmethod
-    def open(cls, path: Path | str, *, partial: bool = False) -> Result:
+    def open(cls, path: Path | str, *, partial: bool = False) -> Self:
         """Open a result folder.
 
         Parameters
@@ -60,39 +66,48 @@ class Result:
         path
             The folder.
         partial
-            Take the frames before the first missing one of an interrupted run as the whole result.
+            Whether frames may be missing, because a run goes on or was interrupted.
 
         Raises
         ------
         ResultError
-            The folder is not a result, is damaged, is incomplete (unless `partial`), or has no frame at all.
+            The folder is not a result, is damaged, or is incomplete (unless `partial`).
         """
         path = Path(path)
-        provenance, mesh = read_provenance(path), read_mesh(path)
-        names, lights = tuple(provenance["frames"]), tuple(provenance["lights"])
-        sizes = {"node": len(mesh["nodes"]), "light": len(lights)}
-        store = ResultStore(path=path, frame_count=len(names), sizes=sizes)
-        written = store.written()
-        if written < len(names) and not (partial and written):
-            raise ResultError(
-                f"{path} is incomplete: frame {written} ({names[written]}) of {len(names)} is missing; was the run "
-                "interrupted?"
-            )
-        return cls(store=store, **mesh, names=names[:written], lights=lights, provenance=provenance)
+        provenance = read_provenance(path)
+        names, lights = read_names(path, provenance), tuple(provenance["lights"])
+        mesh = read_mesh(path, provenance)
+        table = load_frames(path, {"node": len(mesh["nodes"]), "light": len(lights)}, len(names))
+        if not partial:
+            check_complete(path, names, table.finished)
+        return cls(path=path, table=table, **mesh, names=names, lights=lights, provenance=provenance)
+
+    def refresh(self) -> Self:
+        """The result as it is now, with the frames that were added since.
+
+        Raises
+        ------
+        ResultError
+            It is damaged, or another result took its place.
+        """
+        provenance = read_provenance(self.path)
+        if {**provenance, "finished": ""} != {**self.provenance, "finished": ""}:
+            raise ResultError(f"{self.path} now holds another result; open it again")
+        return replace(self, table=load_frames(self.path, self.table.layout.sizes, len(self)), provenance=provenance)
 
     def __len__(self) -> int:
         """Number of frames T."""
         return len(self.names)
 
     @property
-    def path(self) -> Path:
-        """The folder."""
-        return self.store.path
+    def finished(self) -> BoolArray:
+        """Which frames are measured, failed ones included, shape (T,)."""
+        return self.table.finished
 
-    @property
+    @cached_property
     def deformed(self) -> tuple[int, ...]:
         """Indices of the frames that are no reference."""
-        references = self.setting("frames", "reference", [0])
+        references = set(self.provenance["references"])
         return tuple(index for index in range(len(self)) if index not in references)
 
     def setting(self, section: str, key: str, default: Any = None) -> Any:
@@ -105,20 +120,20 @@ class Result:
         Raises
         ------
         ResultError
-            The frame is missing or damaged, or does not fit the mesh.
+            The frame is damaged, or does not fit the mesh.
         """
         if not 0 <= index < len(self):
             raise InputError(f"there is no frame {index} in a result of {len(self)} frames (0 to {len(self) - 1})")
-        return self.store.read_frame(index)
+        return self.table.read(index)
 
     def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
         """One quantity, frame after frame (None: all): an array, or a plain number or text."""
         chosen = range(len(self)) if frames is None else frames
-        return (self.store.read(index, [name])[name] for index in chosen)
+        return (values[name] for values in self.table.each([name], chosen))
 
     def stack(self, name: str) -> AnyArray:
-        """One quantity of all frames, the frames as first axis."""
-        one = QUANTITIES[name].unmeasured(self.store.sizes)
+        """One quantity of all frames, the frames as first axis; takes the memory of all of them."""
+        one = QUANTITIES[name].unmeasured(self.table.layout.sizes)
         stacked = np.empty((len(self), *one.shape), dtype=one.dtype)
         for index, value in enumerate(self.each(name)):
             stacked[index] = value
@@ -157,12 +172,12 @@ class Result:
     def mean_share(self) -> FloatArray:
         """Mean of `light_share` over the measured nodes, shape (T, k); NaN where none is measured."""
         shares = np.full((len(self), len(self.lights)), np.nan)
-        for row, share, status in zip(shares, self.each("light_share"), self.each("node_status"), strict=True):
-            if (measured := status == 0).any():
-                row[:] = share[measured].mean(axis=0)
+        for row, values in zip(shares, self.table.each(["light_share", "node_status"], range(len(self))), strict=True):
+            if (measured := values["node_status"] == 0).any():
+                row[:] = values["light_share"][measured].mean(axis=0, dtype=np.float64)
         return shares
 
     @cached_property
     def reference(self) -> npt.NDArray[np.uint8] | None:
         """Reference image of each light as a picture, shape (k, H, W); None where none was kept."""
-        return self.store.read_reference()
+        return read_reference(self.path, self.table.layout.sizes)

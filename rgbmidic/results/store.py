@@ -1,52 +1,50 @@
-"""The result of a test on disk: one folder that grows frame by frame and can be read at any time.
+"""The writing side of a result: one folder that grows frame by frame and can be read at any time.
 
-``provenance.json`` (settings, inputs with their hashes, versions, dates), ``mesh.npz``, ``reference.npz`` (the
-reference images as pictures) and one npz per frame under ``solution/``. Every file appears under its name only when it
-is complete, so several processes may write frames and an interrupted run loses none that was finished. No other module
-knows these files.
+``provenance.json`` (settings, fingerprints, versions, dates), ``frames.json`` (names), ``mesh.npz``, ``reference.npz``
+(the reference images as pictures) and the frames under ``solution/``. The provenance appears first and at once, whoever
+starts first; all else follows from what it has fingerprints of, so that whoever comes later can complete it.
 """
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.frames import file_hash
-from rgbmidic.results.files import read_arrays, read_json, write_arrays, write_json, writing
-from rgbmidic.results.lock import release_lock, take_lock
-from rgbmidic.results.quantities import QUANTITIES, SHARED
+from rgbmidic.results.files import read_arrays, read_json, write_arrays, write_json, write_new_json, writing
+from rgbmidic.results.layout import RecordLayout
+from rgbmidic.results.lock import ALL_FRAMES, Claim
+from rgbmidic.results.provenance import PROVENANCE, Origin, check_same, digest, now, read_provenance
+from rgbmidic.results.quantities import SHARED
 from rgbmidic.results.record import FrameRecord
-from rgbmidic.settings import TestSettings
-from rgbmidic.typing import AnyArray, FloatImage
+from rgbmidic.results.shards import FrameTable, ShardWriter, shard_files
+from rgbmidic.typing import AnyArray, BoolArray, FloatImage
 
-__all__ = ["SCHEMA_VERSION", "ResultStore"]
+__all__ = [
+    "ResultStore",
+    "check_complete",
+    "finish_result",
+    "load_frames",
+    "read_mesh",
+    "read_names",
+    "read_reference",
+]
 
-SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 3
-"""Goes up with every change of the quantities: a result of another version is refused, not guessed at."""
-
-_PROVENANCE, _MESH, _REFERENCE, _FRAMES = "provenance.json", "mesh.npz", "reference.npz", "solution"
-_LOCK = "in_use.json"
-_FRAME_FILE = re.compile(r"frame_[0-9]{6,}\.npz(\.[0-9]+\.part)?")
-_PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
+_NAMES, _MESH, _REFERENCE, _FRAMES = "frames.json", "mesh.npz", "reference.npz", "solution"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultStore:
-    """A result folder; small, so that it can be sent to other processes.
+    """A result folder, some frames of which are written here.
 
-    ``with ResultStore.create(...) as store`` keeps other runs out of the folder until the end, however it comes.
+    ``with ResultStore.create(...) as store`` keeps others who would write these frames out until the end, however it
+    comes. A copy sent to another process writes there too.
 
     Attributes
     ----------
@@ -56,42 +54,27 @@ class ResultStore:
         Number of frames of the test.
     sizes
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
+    frames
+        Those that may be written here.
     """
 
     path: Path
     frame_count: int
     sizes: Mapping[str, int]
+    frames: range
+    _claim: Claim
+    _writer: ShardWriter
 
     @classmethod
-    def create(
-        cls,
-        path: Path | str,
-        *,
-        nodes: npt.ArrayLike,
-        elements: npt.ArrayLike,
-        names: Sequence[str],
-        lights: Sequence[str],
-        settings: TestSettings | None = None,
-        reference: npt.ArrayLike | None = None,
-        notes: Mapping[str, Any] | None = None,
-        overwrite: bool = False,
-    ) -> ResultStore:
-        """Start a result.
+    def create(cls, path: Path | str, origin: Origin, *, overwrite: bool = False) -> Self:
+        """Start a result, all frames of which may be written.
 
         Parameters
         ----------
         path
             Folder; made where it does not exist. Files in it that are not a result's are never touched.
-        nodes, elements
-            The mesh: (N, 2) positions in px and (E, 3) node indices.
-        names, lights
-            Name of each frame and of each light.
-        settings
-            Kept in the provenance, with the hash of the calibration file that they name.
-        reference : array, shape (k, H, W), optional
-            Reference image of each light, NaN where unknown; kept in 8 bit, for figures.
-        notes
-            Further plain values to keep in the provenance.
+        origin
+            What all frames share.
         overwrite
             Whether a result that is already in the folder may be replaced.
 
@@ -101,24 +84,59 @@ class ResultStore:
             The folder is in use by another run, holds a result (and `overwrite` is False) or foreign files under a
             result's names, or cannot be written.
         """
-        path = Path(path)
-        mesh = {"nodes": SHARED["nodes"].convert(nodes, {}), "elements": SHARED["elements"].convert(elements, {})}
-        provenance = _provenance(settings, names, lights, notes or {})
-        sizes = {"node": len(mesh["nodes"]), "light": len(lights)}
+        store = cls._claimed(Path(path), origin, ALL_FRAMES)
+        with _releasing(store):
+            _make_room(store.path, overwrite=overwrite)
+            _start(store.path, origin)
+        return store
+
+    @classmethod
+    def resume(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
+        """Go on with a result: `finished` tells what is there already.
+
+        Parameters
+        ----------
+        path
+            The folder.
+        origin
+            As it was created.
+        frames
+            Those to be written here, consecutive; None: all.
+
+        Raises
+        ------
+        ResultError
+            There is no result, it is of another origin (the message names the difference), or some of the frames are
+            being written by another run.
+        """
+        read_provenance(Path(path))
+        return cls.join(path, origin, frames=frames)
+
+    @classmethod
+    def join(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
+        """Start a result where there is none, else go on with it: for several runs of parts, in any order or at once.
+
+        Parameters and errors as `resume`; foreign files as `create`.
+        """
+        store = cls._claimed(Path(path), origin, range(len(origin.names)) if frames is None else frames)
+        with _releasing(store):
+            _start(store.path, origin)
+        return store
+
+    @classmethod
+    def _claimed(cls, path: Path, origin: Origin, frames: range) -> Self:
+        """The store with its claim, before anything is in the folder."""
+        count, sizes = len(origin.names), {"node": len(origin.mesh["nodes"]), "light": len(origin.lights)}
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-        take_lock(path / _LOCK)
-        store = cls(path=path, frame_count=len(names), sizes=sizes)
-        try:
-            _make_room(path, overwrite=overwrite)
-            write_json(path / _PROVENANCE, provenance)
-            write_arrays(path / _MESH, mesh)
-            if reference is not None:
-                write_arrays(path / _REFERENCE, {"reference": _pictures(np.asarray(reference, dtype=np.float32))})
-        except BaseException:
-            store.release()
-            raise
-        return store
+        return cls(
+            path=path,
+            frame_count=count,
+            sizes=sizes,
+            frames=range(max(frames.start, 0), min(frames.stop, count)),
+            _claim=Claim.take(path, frames),
+            _writer=ShardWriter(path / _FRAMES, RecordLayout.of(sizes)),
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -127,72 +145,115 @@ class ResultStore:
         self.release()
 
     def release(self) -> None:
-        """Let other runs write into the folder."""
-        release_lock(self.path / _LOCK)
+        """Close what was written and let other runs write these frames."""
+        try:
+            self._writer.close()
+        finally:
+            self._claim.release()
 
     def write_frame(self, index: int, record: FrameRecord) -> None:
-        """Keep the result of frame `index`; may be called in any order, from any process.
+        """Keep the result of frame `index`; in any order, and again, where the last one counts.
 
         Raises
         ------
         InputError
-            There is no such frame, or the record has another number of nodes or lights.
+            There is no such frame here, or the record has another number of nodes or lights.
         ResultError
-            The file cannot be written.
+            The disk is full or refuses; the frames before are kept.
         """
-        if not 0 <= index < self.frame_count:
-            raise InputError(f"there is no frame {index} in a result of {self.frame_count} frames")
+        if index not in self.frames:
+            told = f"frames {self.frames.start} to {self.frames.stop - 1} of {self.frame_count} are written here"
+            raise InputError(f"there is no frame {index}: {told}")
         if record.sizes != self.sizes:
             raise InputError(f"frame {index} has the sizes {record.sizes}, the result {self.sizes}")
-        write_arrays(self._frame_file(index), record.values)
+        self._writer.append(index, record)
+
+    def finished(self) -> BoolArray:
+        """Which frames of the test are in the folder, whoever wrote them, shape (T,)."""
+        return load_frames(self.path, self.sizes, self.frame_count).finished
 
     def finish(self) -> None:
-        """Put the date into the provenance and release the folder; call once, when every frame is written."""
-        write_json(self.path / _PROVENANCE, {**read_provenance(self.path), "finished": _now()})
+        """`release` and `finish_result`: when every frame is written."""
         self.release()
-
-    def written(self) -> int:
-        """Number of frames before the first missing one."""
-        present = {file.name for file in (self.path / _FRAMES).glob("*")}
-        missing = (i for i in range(self.frame_count) if self._frame_file(i).name not in present)
-        return next(missing, self.frame_count)
-
-    def read(self, index: int, names: Iterable[str]) -> dict[str, Any]:
-        """The named quantities of frame `index`; the others are not read.
-
-        Raises
-        ------
-        ResultError
-            The frame is missing or damaged, or belongs to another mesh or other lights.
-        """
-        return _read(self._frame_file(index), names, self.sizes)
-
-    def read_frame(self, index: int) -> FrameRecord:
-        """All that is kept of frame `index`; errors as `read`."""
-        return FrameRecord(values=self.read(index, QUANTITIES), sizes=self.sizes)
-
-    def read_reference(self) -> npt.NDArray[np.uint8] | None:
-        """Reference image of each light as a picture, shape (k, H, W); None where none was kept."""
-        if not (self.path / _REFERENCE).is_file():
-            return None
-        pictures: npt.NDArray[np.uint8] = _read(self.path / _REFERENCE, ["reference"], self.sizes)["reference"]
-        return pictures
-
-    def _frame_file(self, index: int) -> Path:
-        return self.path / _FRAMES / f"frame_{index:06d}.npz"
+        finish_result(self.path)
 
 
-def read_mesh(path: Path) -> dict[str, AnyArray]:
-    """``nodes`` (N, 2) and ``elements`` (E, 3) of the result in a folder."""
-    return _read(path / _MESH, ["nodes", "elements"], {})
+@contextmanager
+def _releasing(store: ResultStore) -> Iterator[None]:
+    """Release a store if the block fails."""
+    try:
+        yield
+    except BaseException:
+        store.release()
+        raise
 
 
-def _read(path: Path, names: Iterable[str], sizes: Mapping[str, int]) -> dict[str, Any]:
+def finish_result(path: Path | str) -> None:
+    """Put the date of its end into the provenance of a result.
+
+    Raises
+    ------
+    ResultError
+        The folder is no result, a frame is missing, or it cannot be written.
+    """
+    path = Path(path)
+    provenance = read_provenance(path)
+    names = read_names(path, provenance)
+    sizes = {"node": len(read_mesh(path, provenance)["nodes"]), "light": len(provenance["lights"])}
+    check_complete(path, names, load_frames(path, sizes, len(names)).finished)
+    write_json(path / PROVENANCE, {**provenance, "finished": now()})
+
+
+def check_complete(path: Path, names: tuple[str, ...], finished: BoolArray) -> None:
+    """Raise a `ResultError` that says how many frames are missing, and the first of them."""
+    if not finished.all():
+        first, missing = int(finished.argmin()), int((~finished).sum())
+        more = f" and {missing - 1} more" if missing > 1 else ""
+        raise ResultError(
+            f"{path} is incomplete: frame {first} ({names[first]}) of {len(names)} is missing{more}; was the run "
+            "interrupted, or does it go on?"
+        )
+
+
+def load_frames(path: Path, sizes: Mapping[str, int], count: int) -> FrameTable:
+    """What is in the folder of a result of `count` frames now."""
+    return FrameTable.load(path / _FRAMES, RecordLayout.of(sizes), count)
+
+
+def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    """The frames' names; a `ResultError` where they are not those of the provenance."""
+    try:
+        names = read_json(path / _NAMES)
+    except FileNotFoundError:
+        raise ResultError(f"{path / _NAMES} is missing: the result is incomplete") from None
+    texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not texts or {"count": len(names), "sha256": digest(names)} != provenance["frames"]:
+        raise ResultError(f"{path / _NAMES} is damaged: it does not hold the names of the frames")
+    return tuple(names)
+
+
+def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
+    """``nodes`` (N, 2) and ``elements`` (E, 3); a `ResultError` where they are not those of the provenance."""
+    mesh = _read(path / _MESH, ["nodes", "elements"], {})
+    if digest(mesh) != provenance["mesh"]:
+        raise ResultError(f"{path / _MESH} is damaged or of another result")
+    return mesh
+
+
+def read_reference(path: Path, sizes: Mapping[str, int]) -> npt.NDArray[np.uint8] | None:
+    """Reference image of each light as a picture, shape (k, H, W); None where none was kept."""
+    if not (path / _REFERENCE).is_file():
+        return None
+    pictures: npt.NDArray[np.uint8] = _read(path / _REFERENCE, ["reference"], sizes)["reference"]
+    return pictures
+
+
+def _read(path: Path, names: Iterable[str], sizes: Mapping[str, int]) -> dict[str, AnyArray]:
     arrays = read_arrays(path, names)
     try:
-        return {name: (QUANTITIES | SHARED)[name].convert(array, sizes) for name, array in arrays.items()}
+        return {name: SHARED[name].convert(array, sizes) for name, array in arrays.items()}
     except (TypeError, ValueError) as error:
-        raise ResultError(f"{path} is damaged or does not belong to this mesh and these lights: {error}") from None
+        raise ResultError(f"{path} is damaged: {error}") from None
 
 
 def _pictures(images: FloatImage) -> npt.NDArray[np.uint8]:
@@ -205,65 +266,34 @@ def _pictures(images: FloatImage) -> npt.NDArray[np.uint8]:
 
 
 def _make_room(path: Path, *, overwrite: bool) -> None:
-    """Make the folder, or empty it of an old result; nothing else in it is touched."""
-    frames = path / _FRAMES
-    if (path / _PROVENANCE).exists():
-        read_provenance(path)  # refuses foreign files of this name
-        if not overwrite:
-            raise ResultError(
-                f"{path} already holds a result; choose another folder, or overwrite it (overwrite=True, --overwrite)"
-            )
-    elif foreign := [name for name in (_MESH, _REFERENCE, _FRAMES) if (path / name).exists()]:
-        raise ResultError(f"{path} holds a {foreign[0]} that is not of a result; give another folder")
+    """Empty the folder of an old result, its provenance last; nothing else in it is touched."""
+    if not (path / PROVENANCE).exists():
+        return
+    read_provenance(path)  # refuses foreign files of this name
+    if not overwrite:
+        raise ResultError(
+            f"{path} already holds a result; choose another folder, overwrite it (overwrite=True, --overwrite), or go "
+            "on with it (--resume)"
+        )
     with writing(path):
-        frames.mkdir(parents=True, exist_ok=True)
-        (path / _REFERENCE).unlink(missing_ok=True)
-        for file in frames.glob("*"):
-            if _FRAME_FILE.fullmatch(file.name):
-                file.unlink()
+        for file in (*shard_files(path / _FRAMES), *(path / name for name in (_REFERENCE, _MESH, _NAMES, PROVENANCE))):
+            file.unlink(missing_ok=True)
 
 
-def _provenance(
-    settings: TestSettings | None, names: Sequence[str], lights: Sequence[str], notes: Mapping[str, Any]
-) -> dict[str, Any]:
-    document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION, "created": _now()}
-    document["versions"] = {"rgbmidic": __version__, "python": platform.python_version(), **_package_versions()}
-    document["platform"] = platform.platform()
-    if settings is not None:
-        document |= {"settings": settings.to_mapping(), "base": str(settings.base)}
-        if (file := settings.calibration_file) is not None:
-            document["calibration"] = {"file": str(file), "sha256": file_hash(file)}
-    return {**document, **notes, "lights": list(lights), "frames": list(names)}
-
-
-def _package_versions() -> dict[str, str]:
-    return {one.name: one.version for one in importlib.metadata.distributions() if one.name in _PACKAGES}
-
-
-def read_provenance(path: Path) -> dict[str, Any]:
-    """The provenance of the result in a folder: names of frames and lights, settings, versions, dates.
-
-    Raises
-    ------
-    ResultError
-        The folder is no result, of another schema version, or damaged.
-    """
-    file = path / _PROVENANCE
-    try:
-        document = read_json(file)
-    except FileNotFoundError:
-        raise ResultError(f"{path} is not a result folder: it has no {_PROVENANCE}") from None
-    if not isinstance(document, dict) or document.get("schema") != SCHEMA_NAME:
-        raise ResultError(f'{file} does not belong to a result: its "schema" is not "{SCHEMA_NAME}"')
-    if (version := document.get("schema_version")) != SCHEMA_VERSION:
-        raise ResultError(f"{path} has schema version {version!r}; this version of rgbmidic reads {SCHEMA_VERSION}")
-    names = [document.get("frames"), document.get("lights")]
-    sections = document.get("settings", {})
-    named = all(isinstance(entry, list) and all(isinstance(name, str) for name in entry) for entry in names)
-    if not (named and isinstance(sections, dict) and all(isinstance(keys, dict) for keys in sections.values())):
-        raise ResultError(f"{file} is damaged: the names of frames and lights, or the settings, are not as written")
-    return document
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+def _start(path: Path, origin: Origin) -> None:
+    """Let the folder hold what all frames share; refuse one of another origin."""
+    foreign = [name for name in (_MESH, _REFERENCE, _NAMES, _FRAMES) if (path / name).exists()]
+    provenance = origin.provenance()
+    if not (path / PROVENANCE).exists():  # looked at after the others: it is the first to appear
+        if foreign:
+            raise ResultError(f"{path} holds a {foreign[0]} that is not of a result; give another folder")
+        write_new_json(path / PROVENANCE, provenance)
+    check_same(path, read_provenance(path), provenance)
+    with writing(path):
+        (path / _FRAMES).mkdir(exist_ok=True)
+    if not (path / _NAMES).exists():
+        write_json(path / _NAMES, list(origin.names))
+    if not (path / _MESH).exists():
+        write_arrays(path / _MESH, origin.mesh)
+    if origin.reference is not None and not (path / _REFERENCE).exists():
+        write_arrays(path / _REFERENCE, {"reference": _pictures(np.asarray(origin.reference, dtype=np.float32))})

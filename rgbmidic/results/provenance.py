@@ -1,0 +1,190 @@
+"""Where a result comes from: what all its frames share, kept so that a later run can tell whether it is the same."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._version import __version__
+from rgbmidic.errors import ResultError
+from rgbmidic.frames import file_hash
+from rgbmidic.results.files import read_json
+from rgbmidic.results.quantities import SHARED
+from rgbmidic.settings import TestSettings
+from rgbmidic.typing import AnyArray
+
+__all__ = ["PROVENANCE", "SCHEMA_VERSION", "Origin", "check_same", "digest", "now", "read_provenance"]
+
+SCHEMA_NAME = "rgbmidic-result"
+SCHEMA_VERSION = 4
+"""Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
+
+PROVENANCE = "provenance.json"
+_PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
+_TOLD = 3
+"""Differences that an error names."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Origin:
+    """What all frames of a result share.
+
+    Attributes
+    ----------
+    nodes, elements
+        The mesh: (N, 2) positions in px and (E, 3) node indices.
+    names, lights
+        Name of each frame and of each light.
+    settings
+        Kept in the provenance, with the hash of the calibration file that they name.
+    inputs
+        A text for each input by its name, such as a file's fingerprint: when it differs, so does the input.
+    references
+        Positions of the reference frames among the result's frames; may be empty.
+    reference : array, shape (k, H, W), optional
+        Reference image of each light, NaN where unknown; kept in 8 bit, for figures.
+    notes
+        Further plain values to keep in the provenance, such as ``frame_rate`` and ``exposure_ns``.
+    """
+
+    nodes: npt.ArrayLike
+    elements: npt.ArrayLike
+    names: Sequence[str]
+    lights: Sequence[str]
+    settings: TestSettings | None = None
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    references: Sequence[int] = (0,)
+    reference: npt.ArrayLike | None = None
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def mesh(self) -> dict[str, AnyArray]:
+        """`nodes` and `elements` in the types of the table."""
+        return {name: SHARED[name].convert(getattr(self, name), {}) for name in ("nodes", "elements")}
+
+    def provenance(self) -> dict[str, Any]:
+        """What ``provenance.json`` says at the start, in plain values."""
+        document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION, "created": now()}
+        document["versions"] = {"rgbmidic": __version__, "python": platform.python_version(), **_package_versions()}
+        document["platform"] = platform.platform()
+        if self.settings is not None:
+            document |= {"settings": self.settings.to_mapping(), "base": str(self.settings.base)}
+            if (file := self.settings.calibration_file) is not None:
+                document["calibration"] = {"file": str(file), "sha256": file_hash(file)}
+        document |= {**self.notes, "lights": list(self.lights), "references": list(self.references)}
+        document["frames"] = {"count": len(self.names), "sha256": digest(list(self.names))}
+        document |= {"mesh": digest(self.mesh), "inputs": dict(self.inputs)}
+        plain: dict[str, Any] = json.loads(json.dumps(document))
+        return plain
+
+
+def _package_versions() -> dict[str, str]:
+    return {one.name: one.version for one in importlib.metadata.distributions() if one.name in _PACKAGES}
+
+
+def digest(content: Mapping[str, AnyArray] | list[str]) -> str:
+    """SHA-256 of arrays or of texts, in hexadecimal digits."""
+    if isinstance(content, list):
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+    sums = hashlib.sha256()
+    for name, array in content.items():
+        sums.update(f"{name} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
+    return sums.hexdigest()
+
+
+def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse to go on with a result whose provenance `was` when frames to come would have the provenance `now`.
+
+    Raises
+    ------
+    ResultError
+        Settings, calibration, inputs, frames, mesh, lights, references, or a version differ; the message says which.
+    """
+    before, after = dict(_compared(was)), dict(_compared(now))
+    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    if names:
+        told = "; ".join(
+            f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:_TOLD]
+        )
+        more = f"; and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
+        raise ResultError(f"{path} is of another test and is not gone on with: {told}{more}; give another folder")
+
+
+def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """What decides on the bits of a result, by names for people."""
+    for section, keys in document.get("settings", {}).items():
+        yield from ((f"{section}.{key}", value) for key, value in keys.items())
+    yield "the calibration", document.get("calibration", {}).get("sha256")
+    yield from ((f"the input {name}", text) for name, text in document["inputs"].items())
+    yield "the mesh", document["mesh"]
+    yield "the number of frames", document["frames"]["count"]
+    yield "the list of frames", document["frames"]["sha256"]
+    yield from ((name, document[name]) for name in ("lights", "references"))
+    yield from ((f"the version of {name}", text) for name, text in document["versions"].items() if name != "python")
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value is None else json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:56]} ..."
+
+
+def read_provenance(path: Path) -> dict[str, Any]:
+    """The provenance of the result in a folder: lights, settings, fingerprints, versions, dates.
+
+    Raises
+    ------
+    ResultError
+        The folder is no result, of another schema version, or damaged.
+    """
+    file = path / PROVENANCE
+    try:
+        document = read_json(file)
+    except FileNotFoundError:
+        raise ResultError(f"{path} is not a result folder: it has no {PROVENANCE}") from None
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA_NAME:
+        raise ResultError(f'{file} does not belong to a result: its "schema" is not "{SCHEMA_NAME}"')
+    if (version := document.get("schema_version")) != SCHEMA_VERSION:
+        raise ResultError(f"{path} has schema version {version!r}; this version of rgbmidic reads {SCHEMA_VERSION}")
+    if not _as_written(document):
+        raise ResultError(f"{file} is damaged: what it says of settings, frames, lights or inputs is not as written")
+    return document
+
+
+def _as_written(document: dict[str, Any]) -> bool:
+    """Whether the parts that are read have the types with which they were written."""
+    kinds = {
+        "inputs": dict,
+        "versions": dict,
+        "frames": dict,
+        "mesh": str,
+        "created": str,
+        "lights": list,
+        "references": list,
+    }
+    if any(not isinstance(document.get(name), kind) for name, kind in kinds.items()):
+        return False
+    sections = document.get("settings", {})
+    return (
+        all(isinstance(name, str) for name in document["lights"])
+        and all(isinstance(place, int) for place in document["references"])
+        and isinstance(document["frames"].get("count"), int)
+        and isinstance(document["frames"].get("sha256"), str)
+        and isinstance(document.get("calibration", {}), dict)
+        and isinstance(sections, dict)
+        and all(isinstance(keys, dict) for keys in sections.values())
+    )
+
+
+def now() -> str:
+    """Date and time of this moment."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
