@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from heapq import heappop, heappush
+from typing import Any
 
 import numpy as np
 
@@ -32,21 +33,16 @@ Progress = Callable[[int, int, str], None]
 class Schedule:
     """The frames of a test that are still to be measured.
 
-    A frame starts from its parent in the tree of `rgbmidic.pipeline.order`, as the store keeps it. A key frame that is
-    not measured well from there is measured once more from the frame just before it, and the better of both is kept.
-
-    Attributes
-    ----------
-    done
-        Whether all are measured.
+    A frame starts from its parent in the tree of `rgbmidic.pipeline.order`, or, where that one failed, from where it
+    started. A key frame that is not measured well from there is measured once more from the frame just before it, and
+    the better of both is kept.
     """
 
     def __init__(self, plan: Plan, store: ResultStore, places: range) -> None:
         self._plan, self._store, self._places = plan, store, places
         self._finished = store.finished()
-        self._measured = self._finished & (store.read_all("status") != Status.FAILED)
         self._wanted = np.zeros_like(self._finished)
-        self._ready: list[int] = []
+        self._ready: list[tuple[int, Start]] = []
         self._waiting: dict[int, list[int]] = {}
         self._first_tries: dict[int, FrameRecord] = {}
         self._deaths: dict[int, int] = {}
@@ -79,36 +75,23 @@ class Schedule:
         count = 0
         while not self.done and count != most:
             while self._ready and len(self._running) < (workers.slots if most is None else 1):
-                self._submit(workers)
+                position, start = heappop(self._ready)
+                self._running[workers.submit(self._index(position), start)] = position, start
             ended = wait(self._running, return_when=FIRST_COMPLETED).done
             if any(isinstance(future.exception(), BrokenExecutor) for future in ended):
                 ended = wait(self._running).done  # with one of its processes all work of an executor ends
                 workers.restart()
             for future in ended:
                 position, start = self._running.pop(future)
-                if (record := self._outcome(future, position)) is not None:
+                if (record := self._outcome(future, position, start)) is not None:
                     self._take(position, start, record, progress)
                     count += 1
 
-    def _submit(self, workers: Workers) -> None:
-        position = heappop(self._ready)
-        before = position - 1 if position in self._first_tries else parent(position)
-        start = Start(displacement=None) if before is None else self._start_after(before)
-        self._running[workers.submit(self._plan.series.chosen[position], start)] = position, start
+    def _index(self, position: int) -> int:
+        """Place in the series of a frame of the result."""
+        return self._plan.series.chosen[position]
 
-    def _start_after(self, position: int) -> Start:
-        """Where a frame starts that follows one: from the last that is measured up to there.
-
-        Where a frame fails, all before it are finished: a key frame that fails waits for the one just before it.
-        """
-        measured = np.flatnonzero(self._measured[: position + 1])
-        if not measured.size:
-            return Start(displacement=None)
-        kept = self._store.read(int(measured[-1]), ["u", "v", "node_status"])
-        displacement = np.stack([kept["u"], kept["v"]], axis=1)
-        return Start.after(self._plan.reference.mesh.nodes, displacement, kept["node_status"] == NodeStatus.MEASURED)
-
-    def _outcome(self, future: Future[Measured], position: int) -> FrameRecord | None:
+    def _outcome(self, future: Future[Measured], position: int, start: Start) -> FrameRecord | None:
         """What a worker found; None where it died and the frame is to be measured again."""
         error = future.exception()
         if error is None:
@@ -116,54 +99,72 @@ class Schedule:
                 logger.log(level, "%s", text)
             return future.result().record
         deaths = self._deaths[position] = self._deaths.get(position, 0) + 1
-        name = self._plan.series.name(self._plan.series.chosen[position])
+        name = self._plan.series.name(self._index(position))
         logger.warning("a worker died while %s was measured (%s)", name, error or type(error).__name__)
         if deaths < _TRIES:
-            heappush(self._ready, position)
+            heappush(self._ready, (position, start))
             return None
-        return failed_frame(self._plan, self._plan.series.chosen[position], f"its worker process died {deaths} times")
+        return failed_frame(self._plan, self._index(position), f"its worker process died {deaths} times")
 
     def _take(self, position: int, start: Start, record: FrameRecord, progress: Progress | None) -> None:
         """Keep a record, or have the frame measured again, and release what waits for it."""
         first = self._first_tries.pop(position, None)
         if first is None and is_key(position) and _loses(record, start):
             self._first_tries[position] = record
-            self._want(position - 1)
-            self._after(position - 1, [position])
+            self._measure_after(position - 1, position)
             return
         if first is not None and _rank(first) <= _rank(record):
             record = first
         self._store.write_frame(position, record)
-        self._finished[position], self._measured[position] = True, record.status != Status.FAILED
-        for child in children(position, len(self._finished)):
-            if self._wanted[child]:
-                heappush(self._ready, child)
-        for waiting in self._waiting.pop(position, ()):
-            heappush(self._ready, waiting)
+        self._finished[position] = True
+        following = self._following(record.values) or start
+        released = [child for child in children(position, len(self._finished)) if self._wanted[child]]
+        for after in (*released, *self._waiting.pop(position, ())):
+            heappush(self._ready, (after, following))
         if progress is not None:
             places = self._places
             done = int(self._finished[places.start : places.stop].sum())
-            progress(done, len(places), _line(self._plan.series.name(self._plan.series.chosen[position]), record))
+            progress(done, len(places), _line(self._plan.series.name(self._index(position)), record))
 
-    def _after(self, position: int, frames: Iterable[int]) -> None:
-        """Have frames measured once another one is finished."""
-        if not self._finished[position]:
-            self._waiting.setdefault(position, []).extend(frames)
-            return
-        for frame in frames:
-            heappush(self._ready, frame)
+    def _measure_after(self, before: int, position: int) -> None:
+        """Have a frame measured from one that may have to be measured first."""
+        if self._finished[before]:
+            heappush(self._ready, (position, self._start_after(before)))
+        else:
+            self._waiting.setdefault(before, []).append(position)
+            self._want(before)
 
     def _want(self, position: int) -> None:
         """Have a frame measured, and all that it depends on."""
-        new = None
+        first = None
         for place in lineage(position):
             if self._finished[place]:
                 break
             if self._wanted[place]:
                 return
-            self._wanted[place], new = True, place
-        if new is not None:
-            heappush(self._ready, new)
+            self._wanted[place], first = True, place
+        if first is not None:
+            before = parent(first)
+            heappush(self._ready, (first, Start(displacement=None) if before is None else self._start_after(before)))
+
+    def _start_after(self, position: int) -> Start:
+        """Where a frame starts that follows a finished one: from the last that is measured up to there.
+
+        Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
+        """
+        table = self._store.table()
+        for kept in table.each(["u", "v", "node_status"], range(position, -1, -1)):
+            if start := self._following(kept):
+                return start
+        return Start(displacement=None)
+
+    def _following(self, kept: Mapping[str, Any]) -> Start | None:
+        """Where a frame starts that follows one of which this is kept; None where nothing of that is measured."""
+        measured = kept["node_status"] == NodeStatus.MEASURED
+        if not measured.any():
+            return None
+        displacement = np.stack([kept["u"], kept["v"]], axis=1)
+        return Start.after(self._plan.reference.mesh.nodes, displacement, measured)
 
 
 def _rank(record: FrameRecord) -> tuple[int, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import multiprocessing
 import os
@@ -44,10 +45,10 @@ class Workers(ABC):
     def submit(self, index: int, start: Start) -> Future[Measured]:
         """Have one frame measured."""
 
-    def restart(self) -> None:
+    def restart(self) -> None:  # noqa: B027 most have nothing to do
         """Begin anew after a worker has died."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027
         """Stop, without waiting for what is not finished."""
 
     def __enter__(self) -> Self:
@@ -119,13 +120,13 @@ class Cluster(Workers):
 
     def __init__(self, plan: Plan, address: str) -> None:
         try:
-            from distributed import Client
+            distributed: Any = importlib.import_module("distributed")
         except ImportError:
             raise ConfigurationError(
                 "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
             ) from None
         try:
-            self._client: Any = Client(address, timeout=30, set_as_default=False)
+            self._client = distributed.Client(address, timeout=30, set_as_default=False)
             self._client.wait_for_workers(1, timeout=120)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConfigurationError(f"no Dask scheduler with workers answers at {address}: {error}") from None
@@ -135,7 +136,7 @@ class Cluster(Workers):
     @property
     def slots(self) -> int:  # type: ignore[override]
         """Threads of all workers there are now."""
-        return max(sum(self._client.nthreads().values()), 1)
+        return max(sum(map(int, self._client.nthreads().values())), 1)
 
     def submit(self, index: int, start: Start) -> Future[Measured]:
         """Have one frame measured by some worker."""
@@ -148,7 +149,7 @@ class Cluster(Workers):
         self._client.close()
 
 
-def open_workers(plan: Plan, count: int, scheduler: str | None) -> Workers:
+def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Workers:
     """A Dask cluster where its scheduler is named, else `count` processes; a single one is this process."""
     if scheduler is not None:
         return Cluster(plan, scheduler)
@@ -210,10 +211,8 @@ def _measure_given(index: int, start: Start) -> Measured:
 
 def _use_threads(threads: int) -> None:
     import cv2
-    import numba
 
     cv2.setNumThreads(threads)
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
 
 
 @contextmanager

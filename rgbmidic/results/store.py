@@ -54,14 +54,11 @@ class ResultStore:
         Number of frames of the test.
     sizes
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
-    frames
-        Those that may be written here.
     """
 
     path: Path
     frame_count: int
     sizes: Mapping[str, int]
-    frames: range
     _claim: Claim
     _writer: ShardWriter
 
@@ -133,7 +130,6 @@ class ResultStore:
             path=path,
             frame_count=count,
             sizes=sizes,
-            frames=range(max(frames.start, 0), min(frames.stop, count)),
             _claim=Claim.take(path, frames),
             _writer=ShardWriter(path / _FRAMES, RecordLayout.of(sizes)),
         )
@@ -154,23 +150,28 @@ class ResultStore:
     def write_frame(self, index: int, record: FrameRecord) -> None:
         """Keep the result of frame `index`; in any order, and again, where the last one counts.
 
+        Frames that others claim may be written too, where this run needs them: all runs give them the same values.
+
         Raises
         ------
         InputError
-            There is no such frame here, or the record has another number of nodes or lights.
+            There is no such frame, or the record has another number of nodes or lights.
         ResultError
             The disk is full or refuses; the frames before are kept.
         """
-        if index not in self.frames:
-            told = f"frames {self.frames.start} to {self.frames.stop - 1} of {self.frame_count} are written here"
-            raise InputError(f"there is no frame {index}: {told}")
+        if not 0 <= index < self.frame_count:
+            raise InputError(f"there is no frame {index} in a result of {self.frame_count} frames")
         if record.sizes != self.sizes:
             raise InputError(f"frame {index} has the sizes {record.sizes}, the result {self.sizes}")
         self._writer.append(index, record)
 
     def finished(self) -> BoolArray:
         """Which frames of the test are in the folder, whoever wrote them, shape (T,)."""
-        return load_frames(self.path, self.sizes, self.frame_count).finished
+        return self.table().finished
+
+    def table(self) -> FrameTable:
+        """What is in the folder now, whoever wrote it; reads it."""
+        return load_frames(self.path, self.sizes, self.frame_count)
 
     def finish(self) -> None:
         """`release` and `finish_result`: when every frame is written."""
