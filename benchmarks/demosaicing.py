@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from rgbmidic._kernels.threads import threads
 from rgbmidic.correlation import correlate
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.images import IlluminationImages
@@ -272,8 +273,6 @@ def table(study: str, paint: str, seeds: list[int], speckle: float, contenders: 
 
 def speed(sizes: tuple[int, ...] = (1024, 2048), repeats: int = 5) -> None:
     """Print the time per pixel from a linearised frame to the lights (least of several runs)."""
-    import numba
-
     patch = plate_scene(size=512, seed=3)
     frame = record(render(patch), patch.camera, patch.lights, seed=0)
     small = linearise(frame, patch.camera.noise)
@@ -285,7 +284,7 @@ def speed(sizes: tuple[int, ...] = (1024, 2048), repeats: int = 5) -> None:
         "reflection-aware, texture learnt": lambda mosaic: separate(mosaic, crosstalk),
         "Malvar": lambda mosaic: separate(mosaic, crosstalk, "malvar"),
     }
-    print(f"\nns per pixel, {numba.get_num_threads()} threads\n")
+    print(f"\nns per pixel, {threads()} threads\n")
     print("| size | " + " | ".join(ways) + " |\n" + "|---" * (len(ways) + 1) + "|")
     for size in sizes:
         copies = (size // 512, size // 512)

@@ -206,7 +206,7 @@ def installed(name: str) -> str | None:
 def in_own_process(what: str, folder: Path, threads: int, repeats: int) -> dict[str, Any]:
     """Run one contender in a fresh process; a failure is a result too."""
     path = os.pathsep.join(str(Path(entry).resolve()) for entry in sys.path)
-    threading = {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)}
+    threading = {"RGBMIDIC_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)}
     environment = {**os.environ, **threading, "PYTHONPATH": path}
     command = [sys.executable, str(Path(__file__).resolve()), "--child", what, str(folder), str(threads), str(repeats)]
     # in the temporary folder: some contenders leave files where they run

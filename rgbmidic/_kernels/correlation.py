@@ -8,9 +8,10 @@ element's origin pixel: float32 then resolves 1e-5 px on images of any size.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from rgbmidic._kernels.interpolation import _FAST, PAD
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = [
     "curvature_deviation",
@@ -28,7 +29,7 @@ _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath=_FAST)
 def _spline(coefficients, row, column, tx, ty):
     """Cubic B-spline value at pixel (row, column) plus the fraction (tx, ty); `coefficients` carry the padding."""
     t2 = tx * tx
@@ -77,7 +78,7 @@ def _spline(coefficients, row, column, tx, ty):
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def _place(px, py, base_x, base_y, height, width):
     """Pixel (column, row) and fraction of a local position, and whether it lies outside the image."""
     cx = np.floor(px)
@@ -91,7 +92,7 @@ def _place(px, py, base_x, base_y, height, width):
     return column, row, tx, ty, beyond_x or beyond_y
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def _element_motion(displacement, elements, barycentric, origin, e):
     """Affine displacement of element e about its origin pixel: whole-pixel part, constant rest and slopes."""
     ux = uy = uxx = uxy = uyx = uyy = 0.0
@@ -119,9 +120,10 @@ def _element_motion(displacement, elements, barycentric, origin, e):
     )
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
+@over_ranges("elements")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def element_right_side(
-    coefficients, reference, gradient_x, gradient_y, weight, local_x, local_y, offsets, origin, elements, barycentric,
+    start, stop, coefficients, reference, gradient_x, gradient_y, weight, local_x, local_y, offsets, origin, elements, barycentric,
     displacement, out, sums,
 ):  # fmt: skip
     """Right-hand side of one light, element by element.
@@ -134,7 +136,7 @@ def element_right_side(
     """
     height = coefficients.shape[0] - 2 * PAD
     width = coefficients.shape[1] - 2 * PAD
-    for e in prange(elements.shape[0]):
+    for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         low_x = np.float32(-base_x)
         low_y = np.float32(-base_y)
@@ -187,13 +189,14 @@ def element_right_side(
         sums[e, 2] = lost
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def element_hessian(gradient_x, gradient_y, weight, local_x, local_y, offsets, barycentric, out):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_y, offsets, barycentric, out):
     """Hessian (correlation matrix) of one light: ``out`` (E, 3, 3, 3) receives ``sum w D phi_a phi_b``.
 
     The last axis of `out` holds D = (gx gx, gx gy, gy gy).
     """
-    for e in prange(offsets.size - 1):
+    for e in range(start, stop):
         b00 = np.float32(barycentric[e, 0, 0])
         b01 = np.float32(barycentric[e, 0, 1])
         b02 = np.float32(barycentric[e, 0, 2])
@@ -237,24 +240,25 @@ def element_hessian(gradient_x, gradient_y, weight, local_x, local_y, offsets, b
             y02 += yy * p02
             y12 += yy * p12
             y22 += yy * p22
-        h = out[e]
-        h[0, 0, 0], h[0, 0, 1], h[0, 0, 2] = x00, m00, y00
-        h[1, 1, 0], h[1, 1, 1], h[1, 1, 2] = x11, m11, y11
-        h[2, 2, 0], h[2, 2, 1], h[2, 2, 2] = x22, m22, y22
-        h[0, 1, 0], h[0, 1, 1], h[0, 1, 2] = x01, m01, y01
-        h[0, 2, 0], h[0, 2, 1], h[0, 2, 2] = x02, m02, y02
-        h[1, 2, 0], h[1, 2, 1], h[1, 2, 2] = x12, m12, y12
-        h[1, 0] = h[0, 1]
-        h[2, 0] = h[0, 2]
-        h[2, 1] = h[1, 2]
+        out[e, 0, 0, 0], out[e, 0, 0, 1], out[e, 0, 0, 2] = x00, m00, y00
+        out[e, 1, 1, 0], out[e, 1, 1, 1], out[e, 1, 1, 2] = x11, m11, y11
+        out[e, 2, 2, 0], out[e, 2, 2, 1], out[e, 2, 2, 2] = x22, m22, y22
+        out[e, 0, 1, 0], out[e, 0, 1, 1], out[e, 0, 1, 2] = x01, m01, y01
+        out[e, 0, 2, 0], out[e, 0, 2, 1], out[e, 0, 2, 2] = x02, m02, y02
+        out[e, 1, 2, 0], out[e, 1, 2, 1], out[e, 1, 2, 2] = x12, m12, y12
+        for a in range(1, 3):
+            for b in range(a):
+                for c in range(3):
+                    out[e, a, b, c] = out[e, b, a, c]
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def warp(coefficients, local_x, local_y, offsets, origin, elements, barycentric, displacement, out):
+@over_ranges("elements")
+@njit(cache=True, nogil=True, error_model="numpy")
+def warp(start, stop, coefficients, local_x, local_y, offsets, origin, elements, barycentric, displacement, out):
     """Deformed image brought back to the reference: ``out`` (P,) float32 receives g(x + u), NaN outside the image."""
     height = coefficients.shape[0] - 2 * PAD
     width = coefficients.shape[1] - 2 * PAD
-    for e in prange(elements.shape[0]):
+    for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         for i in range(offsets[e], offsets[e + 1]):
             px = ux + fxx * local_x[i] + fxy * local_y[i]
@@ -266,11 +270,12 @@ def warp(coefficients, local_x, local_y, offsets, origin, elements, barycentric,
                 out[i] = _spline(coefficients, row, column, tx, ty)
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def element_moments(reference, warped, weight, offsets, out):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def element_moments(start, stop, reference, warped, weight, offsets, out):
     """Weighted moments of reference and warped deformed image: ``out`` (E, 6) receives the sums of
     w, w f, w g, w f f, w f g, w g g over the pixels with weight and a finite g."""
-    for e in prange(offsets.size - 1):
+    for e in range(start, stop):
         total = f1 = g1 = f2 = fg = g2 = 0.0
         for i in range(offsets[e], offsets[e + 1]):
             g = warped[i]
@@ -287,15 +292,16 @@ def element_moments(reference, warped, weight, offsets, out):
         out[e, 0], out[e, 1], out[e, 2], out[e, 3], out[e, 4], out[e, 5] = total, f1, g1, f2, fg, g2
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def pull_back(deformed_weight, reference_weight, local_x, local_y, offsets, origin, elements, barycentric,
+@over_ranges("elements")
+@njit(cache=True, nogil=True, error_model="numpy")
+def pull_back(start, stop, deformed_weight, reference_weight, local_x, local_y, offsets, origin, elements, barycentric,
               displacement, out):  # fmt: skip
     """Weight of each owned pixel: the reference's times the deformed image's at the displaced position (bilinear).
 
     `deformed_weight` (H, W) float32, `reference_weight` (P,) float32; positions outside the image give 0.
     """
     height, width = deformed_weight.shape
-    for e in prange(elements.shape[0]):
+    for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         for i in range(offsets[e], offsets[e + 1]):
             px = ux + fxx * local_x[i] + fxy * local_y[i]
@@ -315,10 +321,11 @@ def pull_back(deformed_weight, reference_weight, local_x, local_y, offsets, orig
             out[i] = reference_weight[i] * value if min(a, b, c, d) > _ZERO else _ZERO
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def element_vector(first, second, local_x, local_y, offsets, barycentric, out):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def element_vector(start, stop, first, second, local_x, local_y, offsets, barycentric, out):
     """Projection of two pixel fields on the shape functions: ``out`` (E, 3, 2) receives their sums times phi."""
-    for e in prange(offsets.size - 1):
+    for e in range(start, stop):
         b00 = np.float32(barycentric[e, 0, 0])
         b01 = np.float32(barycentric[e, 0, 1])
         b02 = np.float32(barycentric[e, 0, 2])
@@ -340,10 +347,11 @@ def element_vector(first, second, local_x, local_y, offsets, barycentric, out):
         out[e, 2, 0], out[e, 2, 1] = p2 - p0 - p1, q2 - q0 - q1
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def interpolate_nodal(values, elements, local_x, local_y, offsets, barycentric, out):
+@over_ranges("elements")
+@njit(cache=True, nogil=True, error_model="numpy")
+def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, barycentric, out):
     """Nodal field (N, 2) at the owned pixels: ``out`` (2, P) float32."""
-    for e in prange(elements.shape[0]):
+    for e in range(start, stop):
         for c in range(2):
             constant = slope_x = slope_y = 0.0
             for a in range(3):
@@ -355,25 +363,29 @@ def interpolate_nodal(values, elements, local_x, local_y, offsets, barycentric, 
                 out[c, i] = constant + slope_x * local_x[i] + slope_y * local_y[i]
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def curvature_deviation(nodes, elements, curvature, local_x, local_y, offsets, barycentric, out):
+@over_ranges("elements")
+@njit(cache=True, nogil=True, error_model="numpy")
+def curvature_deviation(start, stop, nodes, elements, curvature, local_x, local_y, offsets, barycentric, out):
     """Deviation of a curved field from its linear interpolant, ``out`` (2, P) float32.
 
     `curvature` (E, 2, 3) float64 holds the second derivatives (xx, xy, yy) of both components, constant per element:
     ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H (x_a - x_b)``.
     """
-    for e in prange(elements.shape[0]):
+    for e in range(start, stop):
         for c in range(2):
-            half = np.zeros(3)
-            for edge in range(3):
-                a = elements[e, edge]
-                b = elements[e, (edge + 1) % 3]
-                dx = nodes[a, 0] - nodes[b, 0]
-                dy = nodes[a, 1] - nodes[b, 1]
-                h = curvature[e, c]
-                half[edge] = -0.5 * (h[0] * dx * dx + 2.0 * h[1] * dx * dy + h[2] * dy * dy)
+            half_01 = _half_sag(nodes, elements[e, 0], elements[e, 1], curvature, e, c)
+            half_12 = _half_sag(nodes, elements[e, 1], elements[e, 2], curvature, e, c)
+            half_20 = _half_sag(nodes, elements[e, 2], elements[e, 0], curvature, e, c)
             for i in range(offsets[e], offsets[e + 1]):
                 l0 = barycentric[e, 0, 0] + barycentric[e, 0, 1] * local_x[i] + barycentric[e, 0, 2] * local_y[i]
                 l1 = barycentric[e, 1, 0] + barycentric[e, 1, 1] * local_x[i] + barycentric[e, 1, 2] * local_y[i]
                 l2 = 1.0 - l0 - l1
-                out[c, i] = half[0] * l0 * l1 + half[1] * l1 * l2 + half[2] * l2 * l0
+                out[c, i] = half_01 * l0 * l1 + half_12 * l1 * l2 + half_20 * l2 * l0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _half_sag(nodes, a, b, curvature, e, c):
+    """Half the second difference of component c along the edge from node a to node b of element e."""
+    dx = nodes[a, 0] - nodes[b, 0]
+    dy = nodes[a, 1] - nodes[b, 1]
+    return -0.5 * (curvature[e, c, 0] * dx * dx + 2.0 * curvature[e, c, 1] * dx * dy + curvature[e, c, 2] * dy * dy)

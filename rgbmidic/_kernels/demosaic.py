@@ -6,7 +6,9 @@ of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["PAD", "malvar", "pad_mosaic"]
 
@@ -14,18 +16,19 @@ PAD = 2
 """Pixels added on every side by `pad_mosaic`."""
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mirror(index, size):
     period = 2 * (size - 1)
     index = abs(index) % period
     return min(index, period - index)
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def pad_mosaic(values, invalid, out):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy")
+def pad_mosaic(start, stop, values, invalid, out):
     """Copy (H, W) `values` into (H + 4, W + 4) `out`, mirrored at the borders, NaN where `invalid`; H, W >= 2."""
     rows, columns = values.shape
-    for i in prange(out.shape[0]):
+    for i in range(start, stop):
         source = _mirror(i - PAD, rows)
         for j in range(columns):
             out[i, j + PAD] = np.nan if invalid[source, j] else values[source, j]
@@ -36,11 +39,12 @@ def pad_mosaic(values, invalid, out):
             out[i, columns + PAD + side] = np.nan if invalid[source, right] else values[source, right]
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def malvar(padded, red_row, red_column, out):
+@over_ranges("out", axis=1)
+@njit(cache=True, nogil=True, error_model="numpy")
+def malvar(start, stop, padded, red_row, red_column, out):
     """Bilinear average corrected by the Laplacian of the sampled channel (Malvar 2004); fills (3, H, W) `out`."""
     rows, columns = out.shape[1:]
-    for i in prange(rows):
+    for i in range(start, stop):
         above2, above, here, below, below2 = padded[i], padded[i + 1], padded[i + 2], padded[i + 3], padded[i + 4]
         in_red_row = i % 2 == red_row
         own = 0 if in_red_row else 2

@@ -1,36 +1,41 @@
 """Compiled loops between the owned pixels and coarse grids of square blocks."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["block_index", "block_sums", "grid_at_pixels", "score_sums"]
 
 _SLAB = 16384
-"""Pixels per task."""
+"""Ranges of pixels start at multiples of it."""
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def block_index(rows, columns, top, left, block, width, out):
+@over_ranges("out", grain=_SLAB)
+@njit(cache=True, nogil=True, error_model="numpy")
+def block_index(start, stop, rows, columns, top, left, block, width, out):
     """Number of the block (of a grid `width` blocks wide) in which each pixel lies: ``out`` (P,) int32."""
-    for i in prange(rows.size):
+    for i in range(start, stop):
         out[i] = (rows[i] - top) // block * width + (columns[i] - left) // block
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def block_sums(values, index, out):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy")
+def block_sums(start, stop, values, index, out):
     """Sums of fields (n, P) over blocks: ``out`` (n, B), zero before."""
-    for n in prange(values.shape[0]):
+    for n in range(start, stop):
         for i in range(index.size):
             out[n, index[i]] += values[n, i]
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def score_sums(residual, weight, gradient_x, gradient_y, index, out):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy")
+def score_sums(start, stop, residual, weight, gradient_x, gradient_y, index, out):
     """Per light, sums over blocks of ``w r gx``, ``w r gy``, ``w (gx gx + gy gy)`` and of the pixels with weight.
 
     The fields are (k, P) float32; `out` (k, 4, B) float64, zero before.
     """
-    for j in prange(residual.shape[0]):
+    for j in range(start, stop):
         for i in range(index.size):
             w = weight[j, i]
             if w > 0:
@@ -43,19 +48,19 @@ def score_sums(residual, weight, gradient_x, gradient_y, index, out):
                 out[j, 3, b] += 1.0
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def grid_at_pixels(grid, rows, columns, top, left, block, out):
+@over_ranges("out", grain=_SLAB)
+@njit(cache=True, nogil=True, error_model="numpy")
+def grid_at_pixels(start, stop, grid, rows, columns, top, left, block, out):
     """A grid of blocks interpolated linearly between their centres, level beyond the outer ones: ``out`` (P,)."""
     height, width = grid.shape
     scale = np.float32(1.0 / block)
     shift = np.float32(0.5 * scale - 0.5)
-    for start in prange((rows.size + _SLAB - 1) // _SLAB):
-        for i in range(start * _SLAB, min((start + 1) * _SLAB, rows.size)):
-            y = min(max((rows[i] - top) * scale + shift, np.float32(0)), np.float32(height - 1))
-            x = min(max((columns[i] - left) * scale + shift, np.float32(0)), np.float32(width - 1))
-            a, b = int(y), int(x)
-            c, d = min(a + 1, height - 1), min(b + 1, width - 1)
-            ty, tx = y - a, x - b
-            above = grid[a, b] + (grid[a, d] - grid[a, b]) * tx
-            below = grid[c, b] + (grid[c, d] - grid[c, b]) * tx
-            out[i] = above + (below - above) * ty
+    for i in range(start, stop):
+        y = min(max((rows[i] - top) * scale + shift, np.float32(0)), np.float32(height - 1))
+        x = min(max((columns[i] - left) * scale + shift, np.float32(0)), np.float32(width - 1))
+        a, b = int(y), int(x)
+        c, d = min(a + 1, height - 1), min(b + 1, width - 1)
+        ty, tx = y - a, x - b
+        above = grid[a, b] + (grid[a, d] - grid[a, b]) * tx
+        below = grid[c, b] + (grid[c, d] - grid[c, b]) * tx
+        out[i] = above + (below - above) * ty

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["PAD", "bspline_coefficients", "sample_with_gradient"]
 
@@ -16,20 +18,77 @@ _HORIZON = 14  # |z|**14 is below float32 resolution
 _FAST = {"reassoc", "contract", "arcp", "nsz"}  # keeps the meaning of NaN and inf
 
 
-@njit(cache=True, nogil=True)
-def _filter_line(line, n):
-    """Turn the n samples of `line` into B-spline coefficients in place (mirror boundary)."""
+_BLOCK = 64
+"""Columns filtered together: a cache line of each row."""
+
+
+def bspline_coefficients(image, out):
+    """Cubic B-spline coefficients of `image` (H, W) float32 into `out` (H + 2 PAD, W + 2 PAD) float32, mirrored."""
+    height, width = image.shape
+    inner = out[PAD : PAD + height, PAD : PAD + width]
+    inner[:] = image
+    _filter_columns(inner)
+    _filter_rows(out[PAD : PAD + height])
+    for p in range(1, PAD + 1):
+        out[PAD - p] = out[PAD + min(p, height - 1)]
+        out[PAD + height - 1 + p] = out[PAD + max(height - 1 - p, 0)]
+
+
+@over_ranges("values", axis=1, grain=_BLOCK)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _filter_columns(start, stop, values):
+    """Turn the columns of `values` into B-spline coefficients in place (mirror boundary), the inner loops along memory."""
+    n = values.shape[0]
     if n == 1:
         return
     z = _POLE
-    last = 2 * n - 2
-    start = line[0]
+    factor = z / (z * z - np.float32(1.0))
+    first = np.empty(_BLOCK, dtype=np.float32)
+    for left in range(start, stop, _BLOCK):
+        m = min(_BLOCK, stop - left)
+        for c in range(m):
+            first[c] = values[0, left + c]
+        power = z
+        for i in range(1, _HORIZON):
+            row = _mirrored(i, n)
+            for c in range(m):
+                first[c] += power * values[row, left + c]
+            power *= z
+        for c in range(m):
+            values[0, left + c] = first[c] * _GAIN
+        for i in range(1, n):
+            for c in range(left, left + m):
+                values[i, c] = values[i, c] * _GAIN + z * values[i - 1, c]
+        for c in range(left, left + m):
+            values[n - 1, c] = factor * (values[n - 1, c] + z * values[n - 2, c])
+        for i in range(n - 2, -1, -1):
+            for c in range(left, left + m):
+                values[i, c] = z * (values[i + 1, c] - values[i, c])
+
+
+@over_ranges("rows")
+@njit(cache=True, nogil=True, error_model="numpy")
+def _filter_rows(start, stop, rows):
+    """The same along each of `rows` (H, W + 2 PAD), whose ends then mirror what lies inside."""
+    n = rows.shape[1] - 2 * PAD
+    for r in range(start, stop):
+        line = rows[r, PAD:]
+        if n > 1:
+            _filter_line(line, n)
+        for p in range(1, PAD + 1):
+            rows[r, PAD - p] = line[min(p, n - 1)]
+            line[n - 1 + p] = line[max(n - 1 - p, 0)]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _filter_line(line, n):
+    z = _POLE
+    first = line[0]
     power = z
     for i in range(1, _HORIZON):
-        j = i % last
-        start += power * line[j if j < n else last - j]
+        first += power * line[_mirrored(i, n)]
         power *= z
-    line[0] = start * _GAIN
+    line[0] = first * _GAIN
     for i in range(1, n):
         line[i] = line[i] * _GAIN + z * line[i - 1]
     line[n - 1] = z / (z * z - np.float32(1.0)) * (line[n - 1] + z * line[n - 2])
@@ -37,99 +96,57 @@ def _filter_line(line, n):
         line[i] = z * (line[i + 1] - line[i])
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _filter_columns(block, n):
-    """The same filter down the n rows of `block` (n, m): the inner loop runs along memory."""
-    if n == 1:
-        return
-    z = _POLE
-    m = block.shape[1]
-    last = 2 * n - 2
-    start = block[0].copy()
-    power = z
-    for i in range(1, _HORIZON):
-        j = i % last
-        j = j if j < n else last - j
-        for c in range(m):
-            start[c] += power * block[j, c]
-        power *= z
-    for c in range(m):
-        block[0, c] = start[c] * _GAIN
-    for i in range(1, n):
-        for c in range(m):
-            block[i, c] = block[i, c] * _GAIN + z * block[i - 1, c]
-    factor = z / (z * z - np.float32(1.0))
-    for c in range(m):
-        block[n - 1, c] = factor * (block[n - 1, c] + z * block[n - 2, c])
-    for i in range(n - 2, -1, -1):
-        for c in range(m):
-            block[i, c] = z * (block[i + 1, c] - block[i, c])
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mirrored(i, n):
+    """Sample of n > 1 that stands for the i-th, mirrored about the last and the first."""
+    j = i % (2 * n - 2)
+    return j if j < n else 2 * n - 2 - j
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def bspline_coefficients(image, out):
-    """Cubic B-spline coefficients of `image` (H, W) float32 into `out` (H + 2 PAD, W + 2 PAD) float32, mirrored."""
-    height, width = image.shape
-    block = 64
-    for b in prange((width + block - 1) // block):
-        c0 = b * block
-        c1 = min(c0 + block, width)
-        part = image[:, c0:c1].copy()
-        _filter_columns(part, height)
-        out[PAD : PAD + height, PAD + c0 : PAD + c1] = part
-    for row in prange(height):
-        _filter_line(out[PAD + row, PAD:], width)
-        for p in range(1, PAD + 1):
-            out[PAD + row, PAD - p] = out[PAD + row, PAD + min(p, width - 1)]
-            out[PAD + row, PAD + width - 1 + p] = out[PAD + row, PAD + max(width - 1 - p, 0)]
-    for p in range(1, PAD + 1):
-        out[PAD - p] = out[PAD + min(p, height - 1)]
-        out[PAD + height - 1 + p] = out[PAD + max(height - 1 - p, 0)]
-
-
-@njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def sample_with_gradient(coefficients, x, y, value, gradient_x, gradient_y):
+@over_ranges("x", grain=4096)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gradient_y):
     """Value and spatial gradient of the spline at the points (x, y), 1-D float64; points outside are clamped.
 
     `value`, `gradient_x`, `gradient_y` are 1-D float32 outputs, grey levels and grey levels per px.
     """
     height = coefficients.shape[0] - 2 * PAD
     width = coefficients.shape[1] - 2 * PAD
-    for i in prange(x.size):
+    for i in range(start, stop):
         px = min(max(x[i], 0.0), width - 1.0)
         py = min(max(y[i], 0.0), height - 1.0)
-        column = min(int(px), width - 1)
-        row = min(int(py), height - 1)
-        tx = px - column
-        ty = py - row
-        wx = (
-            (1 - tx) ** 3 / 6,
-            (4 - 6 * tx * tx + 3 * tx**3) / 6,
-            (1 + 3 * tx + 3 * tx * tx - 3 * tx**3) / 6,
-            tx**3 / 6,
-        )
-        wy = (
-            (1 - ty) ** 3 / 6,
-            (4 - 6 * ty * ty + 3 * ty**3) / 6,
-            (1 + 3 * ty + 3 * ty * ty - 3 * ty**3) / 6,
-            ty**3 / 6,
-        )
-        dx = (-((1 - tx) ** 2) / 2, (3 * tx * tx - 4 * tx) / 2, (1 + 2 * tx - 3 * tx * tx) / 2, tx * tx / 2)
-        dy = (-((1 - ty) ** 2) / 2, (3 * ty * ty - 4 * ty) / 2, (1 + 2 * ty - 3 * ty * ty) / 2, ty * ty / 2)
-        v = 0.0
-        gx = 0.0
-        gy = 0.0
+        column = int(px)
+        row = int(py)
+        x0, x1, x2, x3, dx0, dx1, dx2, dx3 = _weights(px - column)
+        y0, y1, y2, y3, dy0, dy1, dy2, dy3 = _weights(py - row)
+        v = gx = gy = 0.0
         for a in range(4):
-            along = 0.0
-            slope = 0.0
-            for b in range(4):
-                # PAD - 1 = 1: the first of the four taps lies one pixel before the point's own
-                c = coefficients[row + a + 1, column + b + 1]
-                along += wx[b] * c
-                slope += dx[b] * c
-            v += wy[a] * along
-            gx += wy[a] * slope
-            gy += dy[a] * along
+            # PAD - 1 = 1: the first of the four taps lies one pixel before the point's own
+            c0, c1 = coefficients[row + a + 1, column + 1], coefficients[row + a + 1, column + 2]
+            c2, c3 = coefficients[row + a + 1, column + 3], coefficients[row + a + 1, column + 4]
+            weight = y0 if a == 0 else y1 if a == 1 else y2 if a == 2 else y3
+            slope = dy0 if a == 0 else dy1 if a == 1 else dy2 if a == 2 else dy3
+            along = x0 * c0 + x1 * c1 + x2 * c2 + x3 * c3
+            v += weight * along
+            gx += weight * (dx0 * c0 + dx1 * c1 + dx2 * c2 + dx3 * c3)
+            gy += slope * along
         value[i] = v
         gradient_x[i] = gx
         gradient_y[i] = gy
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _weights(t):
+    """The four cubic B-spline weights at the fraction t behind the second sample, and their slopes."""
+    t2, rest = t * t, 1.0 - t
+    t3 = t2 * t
+    return (
+        rest * rest * rest / 6,
+        (4 - 6 * t2 + 3 * t3) / 6,
+        (1 + 3 * t + 3 * t2 - 3 * t3) / 6,
+        t3 / 6,
+        -rest * rest / 2,
+        (3 * t2 - 4 * t) / 2,
+        (1 + 2 * t - 3 * t2) / 2,
+        t2 / 2,
+    )

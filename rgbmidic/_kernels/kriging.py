@@ -1,9 +1,10 @@
 """Compiled loops of the reconstruction by local linear prediction: fixed filters per tile, chosen from a table."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from rgbmidic._kernels.texture import expand_row
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["TILE", "fill_unknown", "predict"]
 
@@ -11,15 +12,16 @@ TILE = 16
 """Side in px of the squares within which the filters are the same."""
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _channel(i, j, red_row, red_column):
     if i % 2 == red_row:
         return 0 if j % 2 == red_column else 1
     return 1 if j % 2 == red_column else 2
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def fill_unknown(padded, share, red_row, red_column, pad, out, unknown):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_unknown(start, stop, padded, share, red_row, red_column, pad, out, unknown):
     """Replace samples that are NaN by what the known ones around tell of the common texture.
 
     `padded` as written by `scaled_contrast`; `share` (3, h, w) is the share of the common texture in each tile. `out`,
@@ -27,7 +29,7 @@ def fill_unknown(padded, share, red_row, red_column, pad, out, unknown):
     and `unknown` (like `padded`) is set.
     """
     height, width = padded.shape
-    for i in prange(height):
+    for i in range(start, stop):
         for j in range(width):
             if np.isfinite(padded[i, j]):
                 continue
@@ -63,7 +65,7 @@ def _add_one(line, c, total):
         total[j] += c[j] * line[j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _spread(taps, index, parity, output, lines):
     """Filters of a row of tiles, tap by tap, written out along the pixels: `lines` (size², 16 w)."""
     for tile in range(index.size):
@@ -74,8 +76,9 @@ def _spread(taps, index, parity, output, lines):
                 target[j] = source[j]
 
 
-@njit(cache=True, parallel=True, nogil=True, fastmath={"contract"})
-def predict(padded, index, taps, size, scale, scale_block, mean, mean_block, out):
+@over_ranges("index")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, mean_block, out):
     """Channels from the scaled contrast: ``out = mean + scale * sum of taps x samples around``.
 
     Parameters
@@ -93,7 +96,7 @@ def predict(padded, index, taps, size, scale, scale_block, mean, mean_block, out
     """
     outputs, rows, columns = out.shape
     width = index.shape[1] * TILE
-    for ti in prange(index.shape[0]):
+    for ti in range(start, stop):
         lines = np.empty((size * size, width), dtype=np.float32)
         total, level, gain = np.empty(width, np.float32), np.empty(columns, np.float32), np.empty(columns, np.float32)
         scratch_scale, scratch_mean = np.empty(scale.shape[2], np.float32), np.empty(mean.shape[2], np.float32)
@@ -101,7 +104,8 @@ def predict(padded, index, taps, size, scale, scale_block, mean, mean_block, out
             for parity in range(2):
                 _spread(taps, index[ti], parity, n, lines)
                 for i in range(ti * TILE + parity, min((ti + 1) * TILE, rows), 2):
-                    total[:] = 0.0
+                    for j in range(width):
+                        total[j] = 0.0
                     for a in range(size):
                         b = 0
                         while b + 5 <= size:

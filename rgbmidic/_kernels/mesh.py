@@ -8,7 +8,7 @@ from numba import njit
 __all__ = ["claim_pixels", "list_pixels"]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def claim_pixels(nodes, elements, owner, counts):
     """Give every pixel of the region to the first element that contains its centre.
 
@@ -40,7 +40,7 @@ def claim_pixels(nodes, elements, owner, counts):
         counts[e] = count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def list_pixels(owner, position, rows, columns):
     """Write the pixels of each element, row by row; `position` (E,) int64 holds each first slot and is consumed."""
     for row in range(owner.shape[0]):

@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["interpolate_nodal"]
 
 _EDGE = -1e-9
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def interpolate_nodal(out, x, y, nodes, elements, values, box, first, members):
+@over_ranges("out", grain=4096)
+@njit(cache=True, nogil=True, error_model="numpy")
+def interpolate_nodal(start, stop, out, x, y, nodes, elements, values, box, first, members):
     """Write the linear interpolation (2,) of `values` (N, 2) at every point, NaN outside the mesh.
 
     Parameters
@@ -27,7 +30,7 @@ def interpolate_nodal(out, x, y, nodes, elements, values, box, first, members):
         ``members[first[b]:first[b + 1]]`` are the elements whose bounding box meets bin b.
     """
     columns, rows = int(box[3]), int(box[4])
-    for p in prange(x.size):
+    for p in range(start, stop):
         out[p, 0] = out[p, 1] = np.nan
         i, j = math.floor((x[p] - box[0]) / box[2]), math.floor((y[p] - box[1]) / box[2])
         if not (0 <= i < columns and 0 <= j < rows):

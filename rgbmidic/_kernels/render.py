@@ -20,13 +20,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["CYLINDER", "PLATE", "SPHERE", "filter_columns", "sample_paint", "trace_rows"]
 
 PLATE, CYLINDER, SPHERE = 0, 1, 2
 TILE = 8
 MAX_CANDIDATES = 1024
+_POINTS = 256
+"""Points whose droplets `sample_paint` gathers together."""
 _SQRT6 = math.sqrt(6.0)
 
 # Rows of the work array: spatial point, material point, normal, direction to the camera, micro-normal, paint, pixel.
@@ -378,18 +382,19 @@ def _trace_tile(out, x0, y0, lens, frame, body, affine, material, lights, paint,
                     out[j, r, q, c] = energy[r, q, c] if seen[r, q, c] > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def trace_rows(out, first_row, samples, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed):
+@over_ranges("out", axis=1)
+@njit(cache=True, nogil=True, error_model="numpy")
+def trace_rows(start, stop, out, first_row, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed):
     """Radiance of every light along sub-pixel rows, filtered along x to whole pixels.
 
     Parameters
     ----------
-    out : (k, n, W) float32
-        Written: light j on sub-pixel row ``first_row + i``; n is a multiple of `samples`.
+    out : (k, n, samples, W) float32
+        Written: light j on the sub-pixel rows of n rows of pixels.
     first_row : int
         First sub-pixel row; row r lies at y = (r + 1/2)/samples - 1/2 px.
-    samples, pad : int
-        Sub-pixel samples per pixel and direction; pixels rendered beyond the frame on each side.
+    pad : int
+        Pixels rendered beyond the frame on each side.
     taps : (samples (2 pad + 1),) float64
         Pixel aperture and lens blur along x.
     material : (n, samples (W + 2 pad), 2) float64, or empty
@@ -397,8 +402,8 @@ def trace_rows(out, first_row, samples, taps, pad, lens, frame, body, affine, ma
     lights : (k, 4)
         Position in the body's frame and power.
     """
-    across = out.shape[2] + 2 * pad
-    for block in prange(out.shape[1] // samples):
+    samples, across = out.shape[2], out.shape[3] + 2 * pad
+    for block in range(start, stop):
         line = np.empty((lights.shape[0], samples, samples, across), dtype=np.float32)
         row = block * samples
         y0 = (first_row + row + 0.5) / samples - 0.5
@@ -410,7 +415,7 @@ def trace_rows(out, first_row, samples, taps, pad, lens, frame, body, affine, ma
             _trace_tile(tile, x0, y0, lens, frame, body, affine, points, lights, paint, counts, seed)
         for j in range(lights.shape[0]):
             for r in range(samples):
-                _decimate(out[j, row + r], line[j, r], taps)
+                _decimate(out[j, block, r], line[j, r], taps)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -426,29 +431,34 @@ def _decimate(out, line, taps):
         out[c] = total[c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def filter_columns(out, rows, samples, taps):
+@over_ranges("out", axis=1)
+@njit(cache=True, nogil=True, error_model="numpy")
+def filter_columns(start, stop, out, rows, samples, taps):
     """Pixel aperture and lens blur along y: sub-pixel rows (k, n, W) to pixel rows `out` (k, h, W)."""
-    for r in prange(out.shape[1]):
+    total = np.empty(out.shape[2])
+    for r in range(start, stop):
         for j in range(out.shape[0]):
-            total = np.zeros(out.shape[2])
+            for c in range(out.shape[2]):
+                total[c] = 0.0
             for q in range(taps.size):
+                weight, line = taps[q], rows[j, r * samples + q]
                 for c in range(out.shape[2]):
-                    total[c] += taps[q] * rows[j, r * samples + q, c]
+                    total[c] += weight * line[c]
             for c in range(out.shape[2]):
                 out[j, r, c] = total[c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def sample_paint(out, points, body, paint, counts, seed):
+@over_ranges("out", grain=_POINTS)
+@njit(cache=True, nogil=True, error_model="numpy")
+def sample_paint(start, stop, out, points, body, paint, counts, seed):
     """Cover, height (mm) and slope vector of the paint at points on the body: `out` (N, 5)."""
-    for block in prange((points.shape[0] + 255) // 256):
-        start, stop = 256 * block, min(256 * block + 256, points.shape[0])
+    for first in range(start, stop, _POINTS):
+        number = min(_POINTS, stop - first)
         found = np.empty((MAX_CANDIDATES, 4))
-        work = np.zeros((_FIELDS, stop - start))
-        grid, cells = np.empty((7, stop - start), dtype=np.float32), np.empty((3, stop - start), dtype=np.int32)
-        for p in range(stop - start):
-            x, y, z = points[start + p, 0], points[start + p, 1], points[start + p, 2]
+        work = np.zeros((_FIELDS, number))
+        grid, cells = np.empty((7, number), dtype=np.float32), np.empty((3, number), dtype=np.int32)
+        for p in range(number):
+            x, y, z = points[first + p, 0], points[first + p, 1], points[first + p, 2]
             work[_MX, p], work[_MY, p], work[_MZ, p] = x, y, z
             work[_SEEN, p], work[_NZ, p] = 1.0, -1.0
             if body[0] != PLATE:
@@ -456,6 +466,6 @@ def sample_paint(out, points, body, paint, counts, seed):
                 work[_NY, p] = y / body[1] if body[0] == SPHERE else 0.0
         _spray(work, work.shape[1] // 2, found, body, paint, counts, seed)
         _relief(work, grid, cells, paint, np.uint32(seed ^ np.uint32(0x5BD1E995)))
-        for p in range(stop - start):
+        for p in range(number):
             for column in range(5):
-                out[start + p, column] = work[_COVER + column, p]
+                out[first + p, column] = work[_COVER + column, p]

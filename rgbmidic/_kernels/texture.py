@@ -6,7 +6,9 @@ interpolated linearly, beyond the outermost they are constant. ``red_row, red_co
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["block_sums", "cell_moments", "expand_row", "lag_products", "scaled_contrast", "subtract_mean"]
 
@@ -14,11 +16,12 @@ REACH = 3
 """Rows and columns beyond a cell that its binomial sums reach."""
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def block_sums(values, red_row, red_column, block, sums, counts):
+@over_ranges("sums", axis=1)
+@njit(cache=True, nogil=True, error_model="numpy")
+def block_sums(start, stop, values, red_row, red_column, block, sums, counts):
     """Sum and number of finite samples of each channel in each block: `sums`, `counts` (3, h, w) float64."""
     rows, columns = values.shape
-    for bi in prange(sums.shape[1]):
+    for bi in range(start, stop):
         for bj in range(sums.shape[2]):
             for channel in range(3):
                 sums[channel, bi, bj] = 0.0
@@ -32,7 +35,7 @@ def block_sums(values, red_row, red_column, block, sums, counts):
                         counts[channel, bi, bj] += 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def expand_row(grid, row, block, line, out):
     """Row of pixels `out` (W,) interpolated from a grid (h, w); `line` (w,) is scratch."""
     position = min(max((row + 0.5) / block - 0.5, 0.0), grid.shape[0] - 1.0)
@@ -55,7 +58,7 @@ def expand_row(grid, row, block, line, out):
         out[j] = line[last]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _expand_own(grid, i, block, red_row, red_column, line, other, out):
     """Row i of a grid (3, h, w) of blocks, at each pixel that of the pixel's own channel, into `out` (W,)."""
     own = 0 if i % 2 == red_row else 2
@@ -66,11 +69,12 @@ def _expand_own(grid, i, block, red_row, red_column, line, other, out):
         out[j] = other[j]
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def subtract_mean(values, mean, red_row, red_column, block, out):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy")
+def subtract_mean(start, stop, values, mean, red_row, red_column, block, out):
     """``out = values - local mean of the pixel's channel``; `mean` (3, h, w) float32."""
     rows, columns = values.shape
-    for i in prange(rows):
+    for i in range(start, stop):
         line = np.empty(mean.shape[2], dtype=np.float32)
         other, green = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
         _expand_own(mean, i, block, red_row, red_column, line, other, green)
@@ -78,15 +82,16 @@ def subtract_mean(values, mean, red_row, red_column, block, out):
             out[i, j] = values[i, j] - green[j]
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def scaled_contrast(contrast, scale, red_row, red_column, block, pad, out):
+@over_ranges("out")
+@njit(cache=True, nogil=True, error_model="numpy")
+def scaled_contrast(start, stop, contrast, scale, red_row, red_column, block, pad, out):
     """``out = contrast * scale of the pixel's channel``, mirrored by `pad` pixels on every side.
 
     `scale` (3, h, w) float32; `out` has `pad` more rows above and below and columns on the left, and at least as many
     on the right, where what lies beyond is 0. H, W > pad.
     """
     rows, columns = contrast.shape
-    for p in prange(rows + 2 * pad):
+    for p in range(start, stop):
         i = abs(p - pad)
         i = min(i, 2 * (rows - 1) - i)
         line = np.empty(scale.shape[2], dtype=np.float32)
@@ -102,8 +107,9 @@ def scaled_contrast(contrast, scale, red_row, red_column, block, pad, out):
             target[j] = 0.0
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def cell_moments(contrast, red_row, red_column, block, sums, counts):
+@over_ranges("counts")
+@njit(cache=True, nogil=True, error_model="numpy")
+def cell_moments(start, stop, contrast, red_row, red_column, block, sums, counts):
     """Second moments of the four planes' low-passed contrast, summed over the cells of each block.
 
     At the middle of each 2x2 cell the binomial [1 5 10 10 5 1] along both axes takes from each of the planes red, green
@@ -114,9 +120,11 @@ def cell_moments(contrast, red_row, red_column, block, sums, counts):
     """
     rows, columns = contrast.shape
     half = block // 2
-    for bi in prange(sums.shape[1]):
-        sums[:, bi] = 0.0
-        counts[bi] = 0.0
+    for bi in range(start, stop):
+        for bj in range(sums.shape[2]):
+            counts[bi, bj] = 0.0
+            for moment in range(7):
+                sums[moment, bi, bj] = 0.0
         even = np.empty(columns, dtype=np.float32)
         odd = np.empty(columns, dtype=np.float32)
         for ci in range(bi * half, (bi + 1) * half):
@@ -155,7 +163,7 @@ def cell_moments(contrast, red_row, red_column, block, sums, counts):
                     counts[bi, bj] += 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def lag_products(contrast, red_row, red_column, lags, step, sums, counts):
     """Products of samples at each lag (row, column), apart for red-green, red-blue, green-blue and each colour alone.
 

@@ -1,13 +1,16 @@
 """Compiled loop that turns camera channels into lights with a matrix that varies slowly over the field."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["unmix_field"]
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def unmix_field(channels, valid, grid, step, needed, out, out_valid):
+@over_ranges("out", axis=1)
+@njit(cache=True, nogil=True, error_model="numpy")
+def unmix_field(start, stop, channels, valid, grid, step, needed, out, out_valid):
     """``out = matrix(x, y) @ channels`` with the matrix interpolated linearly between grid points `step` px apart.
 
     channels, valid: (C, H, W); grid: (GY, GX, k, C) at x, y = 0, step, 2 step ... beyond the last pixel; needed:
@@ -16,13 +19,13 @@ def unmix_field(channels, valid, grid, step, needed, out, out_valid):
     """
     colours, height, width = channels.shape
     lights = out.shape[0]
-    for y in prange(height):
+    for y in range(start, stop):
         gy = y // step
         down = np.float32(y - gy * step) / np.float32(step)
         for light in range(lights):
             values, ok = out[light, y], out_valid[light, y]
-            values[:] = 0.0
-            ok[:] = True
+            for x in range(width):
+                values[x], ok[x] = 0.0, True
             for colour in range(colours):
                 counts = needed[light, colour]
                 for gx in range((width + step - 1) // step):

@@ -102,17 +102,19 @@ def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> Fl
     out = np.empty((len(lights), height, width), dtype=np.float32)
     for top in range(0, height, BAND):
         bottom = min(top + BAND, height)
-        rows = np.empty((len(lights), n * (bottom - top + 2 * pad), width), dtype=np.float32)
+        rows = np.empty((len(lights), bottom - top + 2 * pad, n, width), dtype=np.float32)
         first = n * (top - pad)
         material = np.empty((0, 0, 2))
         if affine is None:
-            material = _subpixel_material(scene, state, lights[0], first, rows.shape[1], pad)
+            material = _subpixel_material(scene, state, lights[0], first, n * rows.shape[1], pad)
         body, identity = scene.body.parameters(), np.array([1.0, 0, 0, 1, 0, 0])
         trace_rows(
-            rows, first, n, taps, pad, lens, frame, body, identity if affine is None else affine, material, positions,
+            rows, first, taps, pad, lens, frame, body, identity if affine is None else affine, material, positions,
             *scene.surface.parameters(),
         )  # fmt: skip
-        filter_columns(out[:, top:bottom], rows, n, taps)
+        band = np.empty((len(lights), bottom - top, width), dtype=np.float32)
+        filter_columns(band, rows.reshape(len(lights), -1, width), n, taps)
+        out[:, top:bottom] = band
     return out
 
 

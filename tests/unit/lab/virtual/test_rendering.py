@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 from naive_render import paint_at, trace
 
+from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.errors import InputError
 from rgbmidic.lab.virtual import (
     AffineField,
@@ -140,13 +140,13 @@ def test_light_adds_up_and_is_linear_in_power():
 
 def test_the_number_of_threads_does_not_change_a_bit():
     scene = sphere_scene(size=40, samples=4)
-    available = numba.get_num_threads()
+    available = threads()
     two = render(scene, turned(3.0))
-    numba.set_num_threads(1)
+    set_threads(1)
     try:
         one = render(scene, turned(3.0))
     finally:
-        numba.set_num_threads(available)
+        set_threads(available)
     assert np.array_equal(one, two)
 
 

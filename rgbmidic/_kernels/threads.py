@@ -1,0 +1,101 @@
+"""The threads that share the items of a kernel: each does a range of elements, rows or pixels.
+
+A kernel holds no lock of the interpreter (``nogil=True``) and writes only what belongs to its items, so that the result
+is the same bits on any number of threads.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, wraps
+from typing import Any
+
+from rgbmidic.errors import InputError
+
+__all__ = ["over_ranges", "set_threads", "threads"]
+
+_VARIABLE = "RGBMIDIC_THREADS"
+_chosen: list[int] = []
+
+
+def threads() -> int:
+    """Number of threads that share a kernel: what `set_threads` was given, else the environment's RGBMIDIC_THREADS, else
+    the processors this process may use.
+
+    Raises
+    ------
+    InputError
+        RGBMIDIC_THREADS is not a whole number from 1.
+    """
+    return _chosen[-1] if _chosen else _default()
+
+
+def set_threads(number: int) -> None:
+    """Let `number` threads share the kernels of this process.
+
+    Raises
+    ------
+    InputError
+        `number` is under 1.
+    """
+    if number < 1:
+        raise InputError(f"the number of threads must be at least 1; given is {number}")
+    _chosen[:] = [number]
+
+
+def over_ranges(array: str, *, axis: int = 0, grain: int = 1) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Share the items of a compiled ``kernel(start, stop, *arguments)`` among the threads; it is called without the two.
+
+    Parameters
+    ----------
+    array, axis
+        Name of the argument that has one entry per item along `axis`.
+    grain : int
+        Ranges start at multiples of it: what is vectorised or gathered in blocks of so many items stays the same on
+        any number of threads.
+    """
+
+    def shared(kernel: Any) -> Callable[..., None]:
+        code = kernel.py_func.__code__
+        position = code.co_varnames[: code.co_argcount].index(array) - 2
+
+        @wraps(kernel)
+        def call(*arguments: Any) -> None:
+            _share(kernel, arguments, arguments[position].shape[axis], grain)
+
+        return call
+
+    return shared
+
+
+def _share(kernel: Callable[..., None], arguments: tuple[Any, ...], items: int, grain: int) -> None:
+    """Run `kernel` on ranges of about equal length: the first in this thread, the others in the pool."""
+    grains = -(-items // grain)
+    parts = min(threads(), grains)
+    if parts <= 1:
+        kernel(0, items, *arguments)
+        return
+    edges = [min(grains * part // parts * grain, items) for part in range(parts + 1)]
+    pool = _pool(os.getpid(), threads() - 1)
+    others = [pool.submit(kernel, *edge, *arguments) for edge in zip(edges[1:], edges[2:], strict=False)]
+    kernel(0, edges[1], *arguments)
+    for other in others:
+        other.result()
+
+
+@cache
+def _pool(process: int, workers: int) -> ThreadPoolExecutor:
+    """The pool of a process: a forked one inherits no threads and makes its own."""
+    return ThreadPoolExecutor(workers, thread_name_prefix="rgbmidic")
+
+
+@cache
+def _default() -> int:
+    given = os.environ.get(_VARIABLE)
+    if given is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if not given.isdecimal() or int(given) < 1:
+        raise InputError(f"{_VARIABLE} must be a whole number from 1; given is {given!r}")
+    return int(given)
