@@ -4,8 +4,8 @@
     python benchmarks/fast_event.py score FOLDER RESULT
     python benchmarks/fast_event.py kill FOLDER [--times 20] [--workers 2]
 
-`make` writes a raw Bayer ``event.cine`` with its calibration, test.toml and the parameters of the motion, which is known
-in closed form. A speckled plate is struck: it swings by up to 30 px from frame to frame while a wave runs through it; a
+`make` writes a raw Bayer ``event.cine`` with its calibration, test.toml and the parameters of the motion, which has a
+closed form. A speckled plate is struck: it swings by up to 30 px from frame to frame while a wave runs through it; a
 round fragment in it turns on its own; three reflections, each erratic in its own way, sweep over it; some frames are
 lost, as the time stamps tell. `score` prints the error of every tenth frame beside its stated uncertainty. `kill`
 measures it once, and once more killed at random moments and resumed: both must have the same bits.
@@ -29,10 +29,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from rgbmidic.frames import cfa_channels  # noqa: E402 tests are no package
-from rgbmidic.illumination.calibration import Calibration, Crosstalk  # noqa: E402
-from rgbmidic.results import Result  # noqa: E402
-from rgbmidic.typing import FloatArray, FloatImage  # noqa: E402
+from rgbmidic.frames import cfa_channels
+from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.results import Result
+from rgbmidic.typing import FloatArray, FloatImage
 
 CROSSTALK = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 CFA, BLACK, WHITE, GAIN, READ_NOISE = "GBRG", 64, 4095, 4.0, 3.0
@@ -152,8 +152,7 @@ class _Renderer:
         paint = 0.45 + 0.3 * np.tanh(2 * spots / spots.std())
         self.paint = spline_filter(paint, mode="grid-wrap", output=np.float32)
         self.sparkle = [
-            gaussian_filter(rng.normal(size=paint.shape).astype(np.float32), 0.5 * _FINE, mode="wrap")
-            for _ in range(3)
+            gaussian_filter(rng.normal(size=paint.shape).astype(np.float32), 0.5 * _FINE, mode="wrap") for _ in range(3)
         ]
         self.sparkle = [1 + 0.35 * one / one.std() for one in self.sparkle]
         rows, columns = np.mgrid[: motion.size, : motion.size].astype(np.float64)
@@ -201,7 +200,9 @@ def score(folder: Path, path: Path) -> None:
         truth = motion.displacement(nodes, number) - motion.displacement(nodes, numbers[0])
         error = np.stack([record.u, record.v], axis=1) - truth
         stated = np.stack([record.u_std, record.v_std], axis=1)
-        parts = [_figures(error[part], stated[part]) for part in (away & ~motion.inside(nodes), motion.inside(nodes) & away)]
+        parts = [
+            _figures(error[part], stated[part]) for part in (away & ~motion.inside(nodes), motion.inside(nodes) & away)
+        ]
         totals.append([*parts[0], *parts[1]])
         if index % 10 == 0:
             jump = np.linalg.norm(truth - motion.displacement(nodes, number - 1), axis=1).max()

@@ -64,7 +64,9 @@ def run(
     out: Out,
     overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in DIR.")] = False,
-    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 1000:2000; then `rgbmidic finish`.")] = "",
+    frames: Annotated[
+        str, typer.Option("--frames", help="Only these, such as 1000:2000; then `rgbmidic finish`.")
+    ] = "",
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,

@@ -384,7 +384,9 @@ def _trace_tile(out, x0, y0, lens, frame, body, affine, material, lights, paint,
 
 @over_ranges("out", axis=1)
 @njit(cache=True, nogil=True, error_model="numpy")
-def trace_rows(start, stop, out, first_row, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed):
+def trace_rows(
+    start, stop, out, first_row, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed
+):
     """Radiance of every light along sub-pixel rows, filtered along x to whole pixels.
 
     Parameters

@@ -98,7 +98,7 @@ def _places(chosen: range, frames: range | None) -> range:
     places = [place for place, index in enumerate(chosen) if frames is None or index in frames]
     if frames is not None and (not places or frames.stop > chosen[-1] + 1):
         raise FrameError(
-            f"--frames names {frames.start} to {frames.stop - 1}; the frames to be measured are {chosen[0]} to {chosen[-1]}"
+            f"--frames names {frames.start} to {frames.stop - 1}; the test has the frames {chosen[0]} to {chosen[-1]}"
         )
     return range(places[0], places[-1] + 1)
 

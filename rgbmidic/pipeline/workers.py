@@ -16,6 +16,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
+import cv2
+
+from rgbmidic._kernels.threads import set_threads
 from rgbmidic.correlation import Start
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.pipeline.frame import measure_frame
@@ -24,7 +27,7 @@ from rgbmidic.results import FrameRecord
 
 __all__ = ["Measured", "Workers", "available_cores", "open_workers"]
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "RGBMIDIC_THREADS")
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RGBMIDIC_THREADS")
 """What libraries read, when they start, for the number of their threads."""
 
 
@@ -210,9 +213,8 @@ def _measure_given(index: int, start: Start) -> Measured:
 
 
 def _use_threads(threads: int) -> None:
-    import cv2
-
     cv2.setNumThreads(threads)
+    set_threads(threads)
 
 
 @contextmanager

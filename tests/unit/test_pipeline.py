@@ -227,7 +227,7 @@ def test_a_folder_in_use_is_refused_and_free_after_an_interruption(bayer, tmp_pa
 
     with pytest.raises(KeyboardInterrupt):
         measure(bayer.settings(), folder, progress=second_run_then_stop)
-    assert len(Result.open(folder, partial=True)) == 1
+    assert Result.open(folder, partial=True).finished.tolist() == [True, False, False]
     assert len(measure(bayer.settings(), folder, overwrite=True)) == 3
 
 
@@ -354,12 +354,11 @@ def test_a_frame_measured_with_a_plan_from_another_process_gives_the_same_bits(b
     plan = Plan.from_settings(bayer.settings())
     again = pickle.loads(pickle.dumps(plan))
     start = Start(displacement=None)
-    (record, after), (twin, twin_after) = (measure_frame(one, 1, start) for one in (plan, again))
+    record, twin = (measure_frame(one, 1, start) for one in (plan, again))
     np.testing.assert_equal(record.values, twin.values)
-    np.testing.assert_array_equal(after.displacement, twin_after.displacement)
     # nothing but the start ties a frame to the one before it
-    _, rest = measure_frame(plan, 0, start)
-    np.testing.assert_equal(measure_frame(plan, 1, rest)[0].values, bayer_result.frame(1).values)
+    rest = Start(displacement=np.zeros_like(plan.reference.mesh.nodes))
+    np.testing.assert_equal(measure_frame(plan, 1, rest).values, bayer_result.frame(1).values)
 
 
 def test_the_reference_is_read_linearised_and_modelled_once(bayer, monkeypatch):

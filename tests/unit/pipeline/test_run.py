@@ -1,0 +1,176 @@
+"""The main job over many frames: any number of workers, interrupted, in parts, with workers that die: the same bits."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+from concurrent.futures import BrokenExecutor, Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from textures import Affine, Texture
+
+from rgbmidic.correlation import Start, Status
+from rgbmidic.errors import FrameError, ResultError
+from rgbmidic.frames import write_tiff
+from rgbmidic.frames.data import ChannelFrame
+from rgbmidic.pipeline import measure, run, schedule, workers
+from rgbmidic.pipeline.frame import measure_frame
+from rgbmidic.results import Result, finish_result
+from rgbmidic.settings import TestSettings
+
+COUNT, SHAPE = 36, (72, 80)
+
+
+@pytest.fixture(scope="module")
+def movie(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A plate that swings under a monochrome camera; frame 20 cannot be read, frames 31 and 32 show nothing."""
+    folder = tmp_path_factory.mktemp("movie")
+    texture, rng = Texture.random(3, contrast=35.0), np.random.default_rng(5)
+    for index in range(COUNT):
+        motion = Affine.strain_and_rotation(2e-4 * index, 0.0, (3 * np.sin(0.5 * index), 0.1 * index))
+        image = texture.image(SHAPE, motion)
+        values = np.clip(np.round(image + rng.normal(0, 1.5, SHAPE)), 0, 255)
+        if index in (31, 32):
+            values = np.full(SHAPE, 20) + rng.integers(0, 2, SHAPE)
+        frame = ChannelFrame(values=values.astype(np.uint8)[None], black_level=0.0, white_level=255.0)
+        write_tiff(folder / f"f{index:03d}.tif", frame)
+    (folder / "f020.tif").write_bytes((folder / "f020.tif").read_bytes()[:900])
+    return folder
+
+
+def settings(movie: Path, **frames: Any) -> TestSettings:
+    return TestSettings.from_mapping(
+        {
+            "frames": {"path": "*.tif", "kind": "monochrome", "white_level": 255, **frames},
+            "region": {"rectangle": [12, 12, 66, 58]},
+            "mesh": {"element_size": 18.0},
+        },
+        movie,
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(movie: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """Measured at one go by this process."""
+    return measure(settings(movie), tmp_path_factory.mktemp("whole") / "result")
+
+
+def same(one: Result, other: Result) -> None:
+    assert one.names == other.names
+    for index in range(len(one)):
+        np.testing.assert_equal(one.frame(index).values, other.frame(index).values, err_msg=f"frame {index}")
+
+
+def test_every_frame_is_measured_or_says_why_not(whole: Result) -> None:
+    failed = [20, 31, 32]
+    assert np.flatnonzero(whole.status == Status.FAILED).tolist() == failed
+    assert "f020.tif" in whole.frame(20).reason
+    good = np.setdiff1d(np.arange(COUNT), failed)
+    assert (whole.node_status[good] == 0).mean() > 0.99
+    assert np.abs(whole.u[good].mean(axis=1) - 3 * np.sin(0.5 * good)).max() < 0.1
+
+
+def test_two_workers_give_the_same_bits(movie: Path, whole: Result, tmp_path: Path, caplog: Any) -> None:
+    with caplog.at_level(logging.WARNING):
+        same(measure(settings(movie), tmp_path / "result", workers=2), whole)
+    assert "f020.tif" in caplog.text  # what the other processes say is heard
+
+
+def test_a_worker_that_is_killed_costs_no_frame(movie: Path, whole: Result, tmp_path: Path) -> None:
+    def kill_one(done: int, total: int, line: str) -> None:
+        if done == 12:
+            os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
+
+    same(measure(settings(movie), tmp_path / "result", workers=2, progress=kill_one), whole)
+
+
+def test_a_frame_that_kills_every_worker_fails_and_the_rest_goes_on(
+    movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Dying(workers.Here):
+        def submit(self, index: int, start: Start) -> Future[workers.Measured]:
+            if index != 5:
+                return super().submit(index, start)
+            dead: Future[workers.Measured] = Future()
+            dead.set_exception(BrokenExecutor("killed"))
+            return dead
+
+    monkeypatch.setattr(run, "open_workers", lambda plan, *_: Dying(plan))
+    result = measure(settings(movie, last=9), tmp_path / "result")
+    assert result.frame(5).reason == "its worker process died 3 times"
+    assert (result.status[[4, 6, 9]] == Status.CONVERGED).all()
+
+
+@pytest.mark.parametrize("stop", [1, 13, 35])
+def test_an_interrupted_run_goes_on_to_the_same_bits(movie: Path, whole: Result, tmp_path: Path, stop: int) -> None:
+    def interrupt(done: int, total: int, line: str) -> None:
+        if done == stop:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        measure(settings(movie), tmp_path / "result", progress=interrupt)
+    partial = Result.open(tmp_path / "result", partial=True)
+    assert partial.finished.sum() == stop
+    assert partial.frame(COUNT - 1).reason == "not measured yet"
+    same(measure(settings(movie), tmp_path / "result", resume=True), whole)
+
+
+def test_parts_in_any_order_make_the_whole(movie: Path, whole: Result, tmp_path: Path) -> None:
+    out = tmp_path / "result"
+    for part in (range(17, 36), range(17)):
+        with pytest.raises(ResultError, match=r"not a result|is missing"):
+            finish_result(out)
+        measure(settings(movie), out, frames=part)
+    finish_result(out)
+    same(Result.open(out), whole)
+
+
+def test_going_on_with_something_else_is_refused_by_name(movie: Path, whole: Result, tmp_path: Path) -> None:
+    with pytest.raises(ResultError, match=r"frames\.first.*was.*now"):
+        measure(settings(movie, first=1), whole.path, resume=True)
+    with pytest.raises(ResultError, match="not a result folder"):
+        measure(settings(movie), tmp_path / "nothing", resume=True)
+    with pytest.raises(FrameError, match="--frames names 30 to 39; the test has the frames 0 to 35"):
+        measure(settings(movie), tmp_path / "nothing", frames=range(30, 40))
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_chosen_frames_keep_their_numbers_and_the_reference_may_lie_outside(
+    movie: Path, whole: Result, tmp_path: Path
+) -> None:
+    result = measure(settings(movie, first=4, last=14, step=5, reference=[0]), tmp_path / "result")
+    assert result.names == ("f004.tif", "f009.tif", "f014.tif")
+    assert result.number.tolist() == [4, 9, 14]
+    assert result.deformed == (0, 1, 2)
+    np.testing.assert_allclose(result.u, whole.u[4:15:5], atol=0.03)  # they start from elsewhere: half of u_std
+
+
+def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
+    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts: list[tuple[int, float]] = []
+
+    def watched(plan: Any, index: int, start: Start) -> Any:
+        moved = np.inf if start.displacement is None else float(start.displacement[:, 1].mean())
+        starts.append((index, moved))
+        record = measure_frame(plan, index, start)
+        return schedule.failed_frame(plan, index, "lost") if index == 16 and len(starts) == 17 else record
+
+    monkeypatch.setattr("rgbmidic.pipeline.workers.measure_frame", watched)
+    result = measure(settings(movie, last=18), tmp_path / "result")
+    tries = [moved for index, moved in starts if index == 16]
+    assert tries == pytest.approx([0.0, 1.5], abs=0.1)
+    assert (result.status == Status.CONVERGED).all()
+
+
+def test_a_dask_cluster_gives_the_same_bits(movie: Path, whole: Result, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="dask and distributed are not installed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+    ) as cluster:
+        same(measure(settings(movie), tmp_path / "result", scheduler=cluster.scheduler_address), whole)
