@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
 
 from rgbmidic.correlation import NodeStatus, Start, Status
+from rgbmidic.errors import RgbmidicError
 from rgbmidic.pipeline.frame import failed_frame
 from rgbmidic.pipeline.order import children, is_key, lineage, parent
 from rgbmidic.pipeline.plan import Plan
@@ -78,7 +79,7 @@ class Schedule:
                 position, start = heappop(self._ready)
                 self._running[workers.submit(self._index(position), start)] = position, start
             ended = wait(self._running, return_when=FIRST_COMPLETED).done
-            if any(isinstance(future.exception(), BrokenExecutor) for future in ended):
+            if any(isinstance(_error(future), BrokenExecutor) for future in ended):
                 ended = wait(self._running).done  # with one of its processes all work of an executor ends
                 workers.restart()
             for future in ended:
@@ -93,7 +94,7 @@ class Schedule:
 
     def _outcome(self, future: Future[Measured], position: int, start: Start) -> FrameRecord | None:
         """What a worker found; None where it died and the frame is to be measured again."""
-        error = future.exception()
+        error = _error(future)
         if error is None:
             for level, text in future.result().messages:
                 logger.log(level, "%s", text)
@@ -165,6 +166,14 @@ class Schedule:
             return None
         displacement = np.stack([kept["u"], kept["v"]], axis=1)
         return Start.after(self._plan.reference.mesh.nodes, displacement, measured)
+
+
+def _error(future: Future[Measured]) -> BaseException | None:
+    try:
+        return future.exception()
+    except CancelledError:
+        told = "the cluster has lost all its workers; what was finished is kept: go on with --resume"
+        raise RgbmidicError(told) from None
 
 
 def _rank(record: FrameRecord) -> tuple[int, float]:

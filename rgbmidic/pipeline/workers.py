@@ -148,7 +148,7 @@ class Cluster(Workers):
 
     def close(self) -> None:
         """Leave the cluster to others, without waiting for what is not finished."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        self._executor.shutdown(wait=False)
         self._client.close()
 
 
