@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -31,6 +31,12 @@ _messages = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
+Kind = Annotated[str | None, typer.Option("--kind", help="bayer, rgb or monochrome.")]
+Cfa = Annotated[str | None, typer.Option("--cfa", help="Bayer pattern, such as RGGB.")]
+BlackLevel = Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample.")]
+WhiteLevel = Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level.")]
+Shape = Annotated[str, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")]
+Dtype = Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")]
 Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")]
 
 
@@ -246,16 +252,44 @@ def plan(
 
 
 @app.command()
+def frames(
+    path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")],
+    json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+    save: Annotated[
+        tuple[int, Path] | None, typer.Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
+    ] = None,
+    kind: Kind = None,
+    cfa: Cfa = None,
+    black_level: BlackLevel = None,
+    white_level: WhiteLevel = None,
+    shape: Shape = "",
+    dtype: Dtype = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """What a reader sees of raw frames: how many, of what size and levels, when they were taken, how many are lost."""
+    from rgbmidic.frames.describe import describe, save_frame
+
+    stated = _stated(kind, cfa, black_level, white_level, shape, dtype)
+    settings = FrameSettings(path=(path,), **{key: value for key, value in stated.items() if value is not None})
+    description = describe(settings)
+    if save is not None:
+        save_frame(settings, *save, overwrite=overwrite)
+    for warning in description.warnings:
+        _messages.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+    print(description.as_json() if json else description.as_text())
+
+
+@app.command()
 def inspect(
     frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; one per light in succession.")],
     test: Annotated[Path | None, typer.Option("--test", help="TEST.toml the frame is meant for.")] = None,
     calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
-    kind: Annotated[str | None, typer.Option("--kind", help="bayer, rgb or monochrome.")] = None,
-    cfa: Annotated[str | None, typer.Option("--cfa", help="Bayer pattern, such as RGGB.")] = None,
-    black_level: Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample.")] = None,
-    white_level: Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level.")] = None,
-    shape: Annotated[str, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")] = "",
-    dtype: Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")] = None,
+    kind: Kind = None,
+    cfa: Cfa = None,
+    black_level: BlackLevel = None,
+    white_level: WhiteLevel = None,
+    shape: Shape = "",
+    dtype: Dtype = None,
     region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or the frame.")] = "",
     element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's or 25.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
@@ -270,14 +304,7 @@ def inspect(
         check_folder(out, report.FILES, overwrite=overwrite)
     settings = None if test is None else read_test(test)
     _tell_first_run()
-    stated: dict[str, object] = {
-        "kind": kind,
-        "cfa": cfa,
-        "black_level": black_level,
-        "white_level": white_level,
-        "dtype": dtype,
-        "shape": command.read_shape(shape),
-    }
+    stated = _stated(kind, cfa, black_level, white_level, shape, dtype)
     with _progress("inspecting") as progress:
         inspection = inspect_files(
             frames,
@@ -301,6 +328,19 @@ def inspect(
         print(f"warning: {finding.text}")
     if out is not None:
         print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")
+
+
+def _stated(
+    kind: str | None,
+    cfa: str | None,
+    black_level: float | None,
+    white_level: float | None,
+    shape: str,
+    dtype: str | None,
+) -> dict[str, Any]:
+    """What the options state of frames, as `FrameSettings` names it."""
+    levels = {"black_level": black_level, "white_level": white_level}
+    return {"kind": kind, "cfa": cfa, **levels, "dtype": dtype, "shape": command.read_shape(shape)}
 
 
 def _print_table(

@@ -502,8 +502,9 @@ def _check_bounds(settings: Any, section: str) -> None:
     for entry in fields(settings):
         value = getattr(settings, entry.name)
         where = entry.metadata.get("key", f"{section}.{entry.name}")
-        if get_origin(hints[entry.name]) is Literal:
-            convert_value(value, hints[entry.name], where, Path())
+        hint = hints[entry.name]
+        if value is not None and any(get_origin(kind) is Literal for kind in (hint, *get_args(hint)[:1])):
+            convert_value(value, hint, where, Path())
         for number in _numbers(value):
             if not math.isfinite(number):
                 raise ConfigurationError(f"{where} must be finite, not {number}")

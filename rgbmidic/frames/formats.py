@@ -9,6 +9,7 @@ from typing import Literal, NoReturn, Protocol
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
+from rgbmidic.frames.cine import CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic, shift_cfa
 from rgbmidic.frames.headerless import HeaderlessFile, is_headerless
 from rgbmidic.frames.png import PngFile
@@ -17,7 +18,7 @@ from rgbmidic.frames.tiff import TiffFile
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
 
-__all__ = ["FORMATS", "FRAME_ENDINGS", "Camera", "FrameFormat", "advice", "open_source", "read_frame"]
+__all__ = ["FORMATS", "FRAME_ENDINGS", "Camera", "FrameFormat", "advice", "open_source", "read_frame", "reader_name"]
 
 SampleType = Literal["uint8", "uint16", ">u2"]
 
@@ -80,6 +81,12 @@ FORMATS = (
         source=TiffFile,
     ),
     FrameFormat(
+        name="Phantom .cine",
+        endings=(),  # a movie is named by itself: a folder stands for its files of one frame
+        recognises=lambda path, _: path.suffix.lower() in (".cine", ".cin", ".cci"),
+        source=CineFile,
+    ),
+    FrameFormat(
         name="camera raws (DNG, NEF, CR2, ARW, ...)",
         endings=CAMERA_RAW_ENDINGS,
         recognises=lambda path, _: has_camera_header(path),
@@ -93,7 +100,8 @@ FRAME_ENDINGS = tuple(ending for known in FORMATS for ending in known.endings)
 
 
 _ADVICE = {
-    (".cine", ".mraw", ".cih", ".cihx", ".seq"): "a camera's movie: export its frames as DNG or 16-bit TIFF, without "
+    (".cine", ".cin"): "a camera's movie: name the file itself",
+    (".mraw", ".cih", ".cihx", ".seq"): "a camera's movie: export its frames as DNG or 16-bit TIFF, without "
     "demosaicing",
     (".mp4", ".avi", ".mov", ".mkv", ".wmv"): "a movie whose frames are compressed or demosaiced: export them from the "
     "camera's own file as DNG or 16-bit TIFF, without demosaicing",
@@ -145,6 +153,11 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
             white_level=camera.white_level if stated.white_level is None else stated.white_level,
         )
     return source(path=path, stated=stated)
+
+
+def reader_name(source: FrameSource) -> str:
+    """Name of the format that a source is read as."""
+    return next((known.name for known in FORMATS if known.source is type(source)), "unknown")
 
 
 def _pattern(camera: Camera, stated: FrameSettings) -> str | None:

@@ -36,6 +36,8 @@ class Recording:
         they would be off by a quarter of a frame at a million frames a second.
     numbers : ndarray, shape (count,), int64, or None
         The camera's own numbers, with gaps where frames are lost.
+    remarks
+        What else in the header a user should know.
     """
 
     count: int = 1
@@ -45,6 +47,7 @@ class Recording:
     trigger: int | None = None
     times_ns: Integers | None = None
     numbers: Integers | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def numbered(self) -> Integers:

@@ -78,11 +78,14 @@ class FrameSource(ABC):
         IndexError
             There is no such frame.
         """
+        return raw_frame(self.told(index), self.stated, self.path)
+
+    def told(self, index: int) -> StoredFrame:
+        """The samples of frame `index` with what the file alone tells of them; raises as `read` does."""
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
         with _on_disk(self.path):
-            stored = self._stored(index)
-        return raw_frame(stored, self.stated, self.path)
+            return self._stored(index)
 
     @abstractmethod
     def _shape(self) -> tuple[int, int]: ...

@@ -215,11 +215,6 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
         Something stated is not allowed, or several frames that are not monochrome.
     """
     given = {key: value for key, value in stated.items() if value is not None}
-    allowed = ("bayer", "rgb", "monochrome")
-    if given.get("kind", "bayer") not in allowed:
-        raise ConfigurationError(f"kind must be one of {', '.join(allowed)}, not {given['kind']!r}")
-    if given.get("dtype", "uint8") not in ("uint8", "uint16", ">u2"):
-        raise ConfigurationError(f"dtype must be one of uint8, uint16, >u2, not {given['dtype']!r}")
     if len(given.get("shape", (1, 1))) != 2:
         raise ConfigurationError("shape is two numbers, rows and columns")
     if test is not None:

@@ -1,0 +1,168 @@
+"""What a reader sees of a file, a folder or a pattern of raw frames, and one of its frames as a plain TIFF."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from rgbmidic.errors import FrameError, InputError
+from rgbmidic.frames.formats import reader_name
+from rgbmidic.frames.series import FrameSeries, open_series
+from rgbmidic.frames.writers import write_tiff
+from rgbmidic.settings import FrameSettings
+from rgbmidic.typing import FloatArray
+
+__all__ = ["Description", "describe", "save_frame"]
+
+_SECOND = 1e9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Description:
+    """What a reader sees; None where neither the files nor the user tell it.
+
+    Attributes
+    ----------
+    reader
+        Format that the files, or the first of them, are read as.
+    count
+        Number of frames in all files.
+    shape
+        Rows and columns.
+    kind, cfa
+        What the frames are, and the Bayer pattern of their first pixels.
+    bit_depth
+        Bits of a sample.
+    black_level, white_level
+        Grey levels (DN); four black levels where they differ over the positions of the 2x2 cell.
+    frame_rate
+        Frames per second, as the camera was set.
+    exposure
+        Time in s that each frame collects light.
+    trigger
+        Index of the frame at the trigger; it may lie before the first or behind the last.
+    lost_frames
+        Number of frames missing between the first and the last.
+    first_time_ns, last_time_ns
+        When the first and the last frame were taken, in ns from the trigger.
+    warnings
+        What else the header tells that a user should know, and why the last frame cannot be read.
+    """
+
+    reader: str
+    count: int
+    shape: tuple[int, int]
+    kind: str | None
+    cfa: str | None
+    bit_depth: int | None
+    black_level: float | tuple[float, ...] | None
+    white_level: float | None
+    frame_rate: float | None
+    exposure: float | None
+    trigger: int | None
+    lost_frames: int | None
+    first_time_ns: int | None
+    last_time_ns: int | None
+    warnings: tuple[str, ...]
+
+    def as_json(self) -> str:
+        """As a JSON object, with null for what is not known."""
+        return json.dumps(asdict(self), indent=2)
+
+    def as_text(self) -> str:
+        """One line for each thing that is known."""
+        known = {name: value for name, value in asdict(self).items() if value is not None and name != "warnings"}
+        return "\n".join(f"{name:<15}{_text(value)}" for name, value in known.items())
+
+
+def describe(settings: FrameSettings) -> Description:
+    """Describe frames from their headers, the first and the last of them.
+
+    Parameters
+    ----------
+    settings
+        A file, a folder or a pattern, and what the files do not tell.
+
+    Raises
+    ------
+    FrameError
+        Nothing can be read, or what is stated contradicts the file.
+    """
+    series = _opened(settings)
+    source, recording = series.lights[0][0], series.recording
+    stored = source.told(0)
+    frame, *_ = series.read(0)
+    cfa = getattr(frame, "cfa", None)
+    numbered = recording.times_ns is not None or recording.numbers is not None or len(series.lights[0]) > 1
+    return Description(
+        reader=reader_name(source),
+        count=len(series),
+        shape=(frame.values.shape[-2], frame.values.shape[-1]),
+        kind="bayer" if cfa else settings.kind or stored.kind,
+        cfa=cfa,
+        bit_depth=recording.bit_depth,
+        black_level=settings.black_level if stored.black_level is None else _level(stored.black_level),
+        white_level=settings.white_level if stored.white_level is None else stored.white_level,
+        frame_rate=recording.frame_rate,
+        exposure=None if recording.exposure_ns is None else recording.exposure_ns / _SECOND,
+        trigger=recording.trigger,
+        lost_frames=series.lost if numbered else None,
+        first_time_ns=series.time_ns(0),
+        last_time_ns=series.time_ns(len(series) - 1),
+        warnings=(*recording.remarks, *_last_frame(series)),
+    )
+
+
+def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bool = False) -> None:
+    """Write the raw values of frame `index` as a 16-bit TIFF.
+
+    Raises
+    ------
+    FrameError
+        The frame cannot be read.
+    InputError
+        There is no such frame, or the file exists and is not to be replaced.
+    """
+    series = _opened(settings)
+    if not 0 <= index < len(series):
+        raise InputError(f"there is no frame {index}: {settings.path[0]} holds {len(series)} (0 to {len(series) - 1})")
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        raise InputError(f"a frame is saved as .tif, not as {path}")
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists already; --overwrite replaces it")
+    if not path.parent.is_dir():
+        raise InputError(f"there is no folder {path.parent} to save {path.name} in")
+    write_tiff(path, series.read(index)[0])
+
+
+def _opened(settings: FrameSettings) -> FrameSeries:
+    """The frames; those of a mosaic whose pattern nobody tells are read as they are, one grey level at every pixel."""
+    series = open_series(settings)
+    if settings.kind is None and settings.cfa is None:
+        stored = series.lights[0][0].told(0)
+        if stored.kind is None and stored.values.ndim == 2:
+            return open_series(replace(settings, kind="monochrome"))
+    return series
+
+
+def _text(value: object) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(map(_text, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _level(black: FloatArray) -> float | tuple[float, ...]:
+    levels = tuple(np.unique(black).tolist())
+    return levels[0] if len(levels) == 1 else tuple(black.ravel().tolist())
+
+
+def _last_frame(series: FrameSeries) -> tuple[str, ...]:
+    """Why the last frame cannot be read: a movie that is truncated, or still being written."""
+    try:
+        series.read(len(series) - 1)
+    except FrameError as error:
+        return (str(error),)
+    return ()
