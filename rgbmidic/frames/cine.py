@@ -19,7 +19,9 @@ from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import StoredFrame, damaged
 from rgbmidic.typing import AnyArray
 
-__all__ = ["CineFile"]
+__all__ = ["CINE_ENDINGS", "CineFile"]
+
+CINE_ENDINGS = (".cine", ".cin", ".cci")
 
 _STEPS = (
     "311111111111101111111111111111011111111111111101111111111111110111111111111111101111111111111110111111111111"

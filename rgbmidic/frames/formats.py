@@ -9,13 +9,18 @@ from typing import Literal, NoReturn, Protocol
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
-from rgbmidic.frames.cine import CineFile
+from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic, shift_cfa
+from rgbmidic.frames.hdf5 import HDF5_ENDINGS, Hdf5File, split_dataset
 from rgbmidic.frames.headerless import HeaderlessFile, is_headerless
+from rgbmidic.frames.mraw import MRAW_ENDINGS, MrawFile
+from rgbmidic.frames.npy import NpyFile
 from rgbmidic.frames.png import PngFile
+from rgbmidic.frames.seq import SeqFile
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.tiff import TiffFile
 from rgbmidic.frames.tiff_pages import is_dng
+from rgbmidic.frames.tiff_stack import TiffStack, is_tiff_stack
 from rgbmidic.settings import FrameKind, FrameSettings
 
 __all__ = ["FORMATS", "FRAME_ENDINGS", "Camera", "FrameFormat", "advice", "open_source", "read_frame", "reader_name"]
@@ -49,6 +54,8 @@ class FrameFormat:
         What messages call it.
     endings
         Endings (lower case) of its files in a folder.
+    movies
+        Endings of its files that are named by themselves: a folder does not stand for movies.
     recognises
         Whether a file, with what is stated of it, is read as this format; never an error, whatever the file is.
     source
@@ -59,6 +66,7 @@ class FrameFormat:
     endings: tuple[str, ...]
     recognises: Callable[[Path, FrameSettings], bool]
     source: type[FrameSource]
+    movies: tuple[str, ...] = ()
 
 
 FORMATS = (
@@ -75,6 +83,14 @@ FORMATS = (
         source=PngFile,
     ),
     FrameFormat(
+        name="TIFF stacks",
+        endings=(),
+        recognises=lambda path, _: (
+            path.suffix.lower() in (".tif", ".tiff") and not is_dng(path) and is_tiff_stack(path)
+        ),
+        source=TiffStack,
+    ),
+    FrameFormat(
         name="TIFF",
         endings=(".tif", ".tiff"),
         recognises=lambda path, _: path.suffix.lower() in (".tif", ".tiff") and not is_dng(path),
@@ -82,8 +98,8 @@ FORMATS = (
     ),
     FrameFormat(
         name="Phantom .cine",
-        endings=(),  # a movie is named by itself: a folder stands for its files of one frame
-        recognises=lambda path, _: path.suffix.lower() in (".cine", ".cin", ".cci"),
+        movies=CINE_ENDINGS,
+        recognises=lambda path, _: path.suffix.lower() in CINE_ENDINGS,
         source=CineFile,
     ),
     FrameFormat(
@@ -91,6 +107,34 @@ FORMATS = (
         endings=CAMERA_RAW_ENDINGS,
         recognises=lambda path, _: has_camera_header(path),
         source=CameraRaw,
+    ),
+    FrameFormat(
+        name="Photron .mraw with .cihx or .cih",
+        endings=(),
+        recognises=lambda path, _: path.suffix.lower() in MRAW_ENDINGS,
+        source=MrawFile,
+        movies=MRAW_ENDINGS,
+    ),
+    FrameFormat(
+        name="NorPix .seq",
+        endings=(),
+        recognises=lambda path, _: path.suffix.lower() == ".seq",
+        source=SeqFile,
+        movies=(".seq",),
+    ),
+    FrameFormat(
+        name="stacks in .npy files",
+        endings=(),
+        recognises=lambda path, _: path.suffix.lower() == ".npy",
+        source=NpyFile,
+        movies=(".npy",),
+    ),
+    FrameFormat(
+        name="stacks in HDF5 files",
+        endings=(),
+        recognises=lambda path, _: Path(split_dataset(path)[0]).suffix.lower() in HDF5_ENDINGS,
+        source=Hdf5File,
+        movies=HDF5_ENDINGS,
     ),
 )
 """The first that recognises a file reads it."""
@@ -100,21 +144,26 @@ FRAME_ENDINGS = tuple(ending for known in FORMATS for ending in known.endings)
 
 
 _ADVICE = {
-    (".cine", ".cin"): "a camera's movie: name the file itself",
-    (".mraw", ".cih", ".cihx", ".seq"): "a camera's movie: export its frames as DNG or 16-bit TIFF, without "
-    "demosaicing",
-    (".mp4", ".avi", ".mov", ".mkv", ".wmv"): "a movie whose frames are compressed or demosaiced: export them from the "
-    "camera's own file as DNG or 16-bit TIFF, without demosaicing",
+    (
+        ".mp4",
+        ".avi",
+        ".mov",
+        ".mkv",
+        ".wmv",
+    ): "a movie whose frames are compressed or demosaiced, so that its samples are "
+    "no longer the sensor's: give the camera's own file, or export from it DNG or 16-bit TIFF, without demosaicing",
+    tuple(ending for known in FORMATS for ending in known.movies): "a movie or a stack: a folder stands for frames in "
+    "files of their own; name the movie itself, or a pattern",
     (".jpg", ".jpeg", ".bmp", ".gif", ".heic", ".webp"): "a picture that is no raw frame: let the camera record DNG or "
     "16-bit TIFF, without demosaicing",
     (".raw", ".bin"): "a file without a camera's header: state its shape and dtype (frames.shape and frames.dtype, or "
     "--shape and --dtype)",
 }
-"""By endings, what files are that no format recognises, and what to do."""
+"""By endings, what files are that are no frames, and what to do."""
 
 
 def advice(path: Path) -> str:
-    """What a file is that no format recognises, and what to do; empty where that is not known."""
+    """What a file is that is no frame, and what to do; empty where that is not known."""
     return next((text for endings, text in _ADVICE.items() if path.suffix.lower() in endings), "")
 
 

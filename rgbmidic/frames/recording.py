@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Recording", "frame_numbers"]
+__all__ = ["Recording", "even_times", "frame_numbers"]
 
 _EVEN = 0.1
 """Share of a period by which stamps may miss whole periods: a clock of 1 MHz does at 100,000 frames a second."""
@@ -77,3 +78,15 @@ def frame_numbers(times_ns: Integers) -> Integers:
     if (periods < 1).any() or (np.abs(steps - periods * period) > _EVEN * period * np.sqrt(periods)).any():
         return np.arange(len(times_ns))
     return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
+
+
+def even_times(numbers: range, interval: Fraction) -> Integers:
+    """When frames with these numbers were taken, in ns from number 0, `interval` seconds apart: rounded whole numbers.
+
+    Raises
+    ------
+    OverflowError
+        More than 292 years lie between them.
+    """
+    above, below = 10**9 * interval.numerator, interval.denominator
+    return np.fromiter(((2 * number * above + below) // (2 * below) for number in numbers), np.int64, len(numbers))

@@ -16,6 +16,7 @@ from pathlib import Path
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.formats import FRAME_ENDINGS, Camera, advice, open_source
+from rgbmidic.frames.hdf5 import split_dataset
 from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.settings import FrameSettings
@@ -166,7 +167,8 @@ def open_series(
         `FrameSeries.read` to tell.
     """
     files = [list_frames(text, base) for text in settings.path]
-    lights = tuple(tuple(open_source(path, settings, camera) for path in paths) for paths in files)
+    # a movie and its header, both matched by a pattern, are one source
+    lights = tuple(tuple(dict.fromkeys(open_source(path, settings, camera) for path in paths)) for paths in files)
     _check_counts(settings, lights)
     numbers = _numbers(settings, lights) if in_order else ()
     if settings.lights > 1:
@@ -275,7 +277,8 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     Parameters
     ----------
     pattern
-        A file, a folder (its files with the ending of a frame), or a pattern with ``*``, ``?``, ``[...]`` or ``**``.
+        A file, a folder (its files with the ending of a frame), or a pattern with ``*``, ``?``, ``[...]`` or ``**``;
+        behind an HDF5 file or a pattern of them the dataset may be named, as in ``run.h5:/entry/data``.
     base
         Folder that a relative pattern starts from.
 
@@ -284,18 +287,19 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     FrameError
         Nothing matches.
     """
-    place = Path(base) / pattern
+    text, dataset = split_dataset(pattern)
+    place = Path(base) / text
     if place.is_dir():
         found = sorted(file for file in place.iterdir() if file.name[0] != ".")
         files = [file for file in found if file.suffix.lower() in FRAME_ENDINGS]
     else:
-        found = files = _matching(Path(pattern), Path(base))
+        found = files = _matching(Path(text), Path(base))
     files = [file for file in files if file.is_file() or not file.exists()]  # a link to nothing is told when it is read
     if not files:
         what = "a folder without frames" if place.is_dir() else "no file matches"
         other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")
         raise FrameError(f"no frames: {what}: {pattern} (looked for in {Path(base).resolve()}){other}")
-    return tuple(sorted(files, key=_natural_key))
+    return tuple(Path(f"{file}:{dataset}") if dataset else file for file in sorted(files, key=_natural_key))
 
 
 def _matching(pattern: Path, base: Path) -> list[Path]:

@@ -46,6 +46,8 @@ class StoredFrame:
         Black level (DN) of each position of the 2x2 cell.
     white_level
         Grey level (DN) of a saturated sample.
+    bits
+        Bits of a sample where they are fewer than those of its type.
     """
 
     values: AnyArray
@@ -53,6 +55,7 @@ class StoredFrame:
     cfa: str | None = None
     black_level: FloatArray | None = None
     white_level: float | None = None
+    bits: int | None = None
 
     @classmethod
     def plain(cls, values: AnyArray, path: Path, cfa: str | None = None) -> StoredFrame:
@@ -137,12 +140,12 @@ def _grey_saved_as_colour(stored: StoredFrame, kind: FrameKind | None) -> Stored
     first = stored.values[..., :1]
     if kind not in ("bayer", "monochrome") or stored.kind != "rgb" or not (stored.values == first).all():
         return stored
-    return StoredFrame(values=first[..., 0])
+    return StoredFrame(values=first[..., 0], bits=stored.bits)
 
 
 def _white_level(stored: StoredFrame, stated: float | None, path: Path) -> float:
     white = _agreed("white_level", stated, stored.white_level, path)
-    largest = float(np.iinfo(stored.values.dtype).max)
+    largest = float(2**stored.bits - 1 if stored.bits else np.iinfo(stored.values.dtype).max)
     if white is not None and white > largest:
         raise FrameError(f"white_level is stated as {white}, but the samples of {path} end at {largest:.0f}")
     return largest if white is None else white

@@ -20,7 +20,7 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     from tifffile import TiffPage
 
-__all__ = ["TiffFile"]
+__all__ = ["TiffFile", "checked_page", "page_frame"]
 
 _UNCOMPRESSED = 1
 _BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
@@ -43,12 +43,25 @@ class TiffFile(FrameSource):
     def _stored(self, index: int) -> StoredFrame:
         with tiff_pages(self.path) as pages:
             page = _single_page(pages, self.path)
-            values = _samples(page, self.path)
-            if page.photometric == _PALETTE:
-                _check_grey_table(page, values.dtype, self.path)
-            elif page.photometric == _MIN_IS_WHITE:
-                values = np.iinfo(values.dtype).max - values
-            return StoredFrame.plain(values, self.path, cfa_pattern(page))
+            if page.compression in _BY_OPENCV:
+                return page_frame(page, self.path, _by_opencv(page, self.path))
+            return page_frame(page, self.path)
+
+
+def page_frame(page: TiffPage, path: Path, samples: AnyArray | None = None) -> StoredFrame:
+    """The frame of a checked page, from its `samples` where they were read already.
+
+    Raises
+    ------
+    FrameError
+        They are damaged, or stored in a way that is not read.
+    """
+    values = _samples(page, path) if samples is None else samples
+    if page.photometric == _PALETTE:
+        _check_grey_table(page, values.dtype, path)
+    elif page.photometric == _MIN_IS_WHITE:
+        values = np.iinfo(values.dtype).max - values
+    return StoredFrame.plain(values, path, cfa_pattern(page))
 
 
 def _single_page(pages: list[TiffPage], path: Path) -> TiffPage:
@@ -56,7 +69,18 @@ def _single_page(pages: list[TiffPage], path: Path) -> TiffPage:
         raise damaged(path, "its header leads to no image")
     if len(pages) > 1:
         raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
-    page = pages[0]
+    checked_page(pages[0], path)
+    return pages[0]
+
+
+def checked_page(page: TiffPage, path: Path) -> None:
+    """Refuse a page whose samples are no raw frame's or not all there, before anything is unpacked.
+
+    Raises
+    ------
+    FrameError
+        So they are.
+    """
     if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
         kind = page.dtype or f"{page.bitspersample}-bit"
         raise FrameError(f"{path} has {kind} samples; allowed are unsigned 8 or 16 bit")
@@ -67,25 +91,33 @@ def _single_page(pages: list[TiffPage], path: Path) -> TiffPage:
     if page.compression == _UNCOMPRESSED and not is_stored_as_is(page):
         raise damaged(path, f"its header announces {stored} bytes of image data, too few for its size")
     check_size(path, needed=page.nbytes, stored=min(stored, size))
-    return page
 
 
 def _samples(page: TiffPage, path: Path) -> AnyArray:
     """Samples of a page as they are stored, (H, W) or (H, W, C)."""
-    if page.compression in (_UNCOMPRESSED, *_BY_TIFFFILE):
-        if page.compression in _BY_TIFFFILE:
-            _check_unpacked(page, path)
-        values = np.asarray(page.asarray())
-        one_plane_after_the_other = values.ndim == 3 and page.planarconfig == 2
-        return np.moveaxis(values, 0, -1) if one_plane_after_the_other else values
+    if page.compression not in (_UNCOMPRESSED, *_BY_TIFFFILE):
+        raise _not_read(page, path)
+    if page.compression in _BY_TIFFFILE:
+        _check_unpacked(page, path)
+    values = np.asarray(page.asarray())
+    one_plane_after_the_other = values.ndim == 3 and page.planarconfig == 2
+    return np.moveaxis(values, 0, -1) if one_plane_after_the_other else values
+
+
+def _by_opencv(page: TiffPage, path: Path) -> AnyArray:
+    """Samples of the only page of a file."""
     turned = (tag(page, _ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
-    if turned or page.compression not in _BY_OPENCV:  # OpenCV turns such samples, some more than others
-        name = getattr(page.compression, "name", page.compression)
-        raise FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
+    if turned:  # OpenCV turns such samples, some more than others
+        raise _not_read(page, path)
     values = decode(path.read_bytes(), path)
     if (*values.shape[:2], values.dtype) != (page.imagelength, page.imagewidth, page.dtype):
         raise damaged(path, f"its header announces another image than its data hold, {values.shape} {values.dtype}")
     return values
+
+
+def _not_read(page: TiffPage, path: Path) -> FrameError:
+    name = getattr(page.compression, "name", page.compression)
+    return FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
 
 
 def _check_unpacked(page: TiffPage, path: Path) -> None:

@@ -24,12 +24,14 @@ if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
 __all__ = [
+    "HEADERS",
     "RawStructure",
     "cfa_pattern",
     "is_dng",
     "is_stored_as_is",
     "missing_data",
     "tag",
+    "tiff_page",
     "tiff_pages",
 ]
 
@@ -37,7 +39,7 @@ __all__ = [
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _BYTE_ORDERS: dict[bytes, Literal["little", "big"]] = {b"II*\0": "little", b"MM\0*": "big"}
-_HEADERS = (*_BYTE_ORDERS, b"II+\0", b"MM\0+")
+HEADERS = (*_BYTE_ORDERS, b"II+\0", b"MM\0+")
 """Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
 _UNCOMPRESSED = 1
 _REDUCED = 1
@@ -56,14 +58,36 @@ def tiff_pages(path: Path) -> Iterator[list[TiffPage]]:
     FrameError
         It is no TIFF file, or what is done inside fails over a damaged header.
     """
+    with _opened(path) as tiff:
+        yield [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
+
+
+@contextmanager
+def tiff_page(path: Path, offset: int) -> Iterator[TiffPage]:
+    """The image that begins at byte `offset` of a TIFF file.
+
+    Raises
+    ------
+    FrameError
+        It is no TIFF file, or what is done inside fails over a damaged header.
+    """
+    import tifffile
+
+    with _opened(path) as tiff:
+        tiff.filehandle.seek(offset)
+        yield tifffile.TiffPage(tiff, index=0)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[TiffFile]:
     import tifffile
 
     with path.open("rb") as file:
-        if file.read(4) not in _HEADERS:  # tifffile tries some camera raws that begin as a TIFF file does
+        if file.read(4) not in HEADERS:  # tifffile tries some camera raws that begin as a TIFF file does
             raise damaged(path, "it is not a TIFF file")
     try:
         with tifffile.TiffFile(path) as tiff:
-            yield [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
+            yield tiff
     except (RgbmidicError, OSError):
         raise
     except Exception as error:  # tifffile meets damaged headers with many kinds of error
