@@ -20,6 +20,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -120,19 +121,28 @@ def make(folder: Path, frames: int, size: int, lost: int) -> None:
         f"rectangle = [{margin}, {margin // 2}, {size - 1 - margin}, {size - 1 - margin // 2}]\n\n"
         f'[calibration]\nfile = "calibration.json"\n'
     )
+    with ProcessPoolExecutor(initializer=_prepare, initargs=(motion,)) as pool:
+        write_cine(
+            folder / "event.cine",
+            pool.map(_frame, map(int, numbers)),
+            count=len(numbers),
+            bits=12,
+            cfa=CFA,
+            levels=(BLACK, WHITE),
+            first=-10,
+            rate=RATE,
+            exposure_ns=2000,
+            times_ns=((numbers - 10) * (10**9 // RATE)).tolist(),
+        )
+
+
+def _prepare(motion: Motion) -> None:
+    global renderer
     renderer = _Renderer(motion)
-    write_cine(
-        folder / "event.cine",
-        (renderer.frame(int(number)) for number in numbers),
-        cfa=CFA,
-        black_level=BLACK,
-        white_level=WHITE,
-        bit_depth=12,
-        frame_rate=RATE,
-        exposure_ns=2000,
-        times_ns=(numbers - 10) * (10**9 // RATE),
-        first_image=-10,
-    )
+
+
+def _frame(number: int) -> FloatImage:
+    return renderer.frame(number)
 
 
 def _lost_numbers(count: int, lost: int) -> FloatArray:

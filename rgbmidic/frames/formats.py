@@ -63,7 +63,7 @@ class FrameFormat:
     """
 
     name: str
-    endings: tuple[str, ...]
+    endings: tuple[str, ...] = ()
     recognises: Callable[[Path, FrameSettings], bool]
     source: type[FrameSource]
     movies: tuple[str, ...] = ()
