@@ -95,7 +95,7 @@ def test_doubtful_nodes_do_not_rule_the_colours(tmp_path: Path) -> None:
     exx = np.where(edge, 0.05 * np.random.default_rng(0).normal(size=NODES), 0.002 * (X > 60))
     result = _one_frame(tmp_path / "out", exx=exx, eyy=exx, exy=exx, exx_std=np.where(edge, 0.05, 1e-4))
     norm = figures.map_figure(result, 0, "strain").axes[0].images[-1].norm
-    assert (norm.vmin, norm.vmax) == (0, 0.002)
+    assert (norm.vmin, norm.vmax) == (0, np.float32(0.002))
 
 
 @pytest.fixture
