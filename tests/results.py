@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.results import QUANTITIES, FrameRecord, Result, ResultStore
+from rgbmidic.results import QUANTITIES, FrameRecord, Origin, Result, ResultStore
 
-__all__ = ["LIGHTS", "MESH", "NODES", "make_result", "random_record"]
+__all__ = ["LIGHTS", "MESH", "NODES", "make_origin", "make_result", "random_record"]
 
 LIGHTS = ("red", "green", "blue")
 MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 5, 110, 75), (80, 120)), 20)
@@ -32,6 +32,7 @@ def random_record(seed: int) -> FrameRecord:
     history = 0.5 * 0.1 ** np.arange(1 + seed % 5)
     values |= {
         "number": seed,
+        "time_ns": seed * 1_000_003,
         "status": seed % 2,
         "reason": "did not converge: é" if seed % 2 else "",
         "iterations": len(history),
@@ -51,11 +52,16 @@ def random_record(seed: int) -> FrameRecord:
     return FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values)
 
 
-def make_result(path: Path, *, frames: int = 2, **options: Any) -> Result:
+def make_result(path: Path, *, frames: int = 2, overwrite: bool = False, **options: Any) -> Result:
     """A finished result of random records."""
-    names = [f"frame {index}" for index in range(frames)]
-    store = ResultStore.create(path, nodes=MESH.nodes, elements=MESH.elements, names=names, lights=LIGHTS, **options)
+    store = ResultStore.create(path, make_origin(frames, **options), overwrite=overwrite)
     for index in range(frames):
         store.write_frame(index, random_record(index))
     store.finish()
     return Result.open(path)
+
+
+def make_origin(frames: int, **options: Any) -> Origin:
+    """What the frames of a made-up result share."""
+    names = [f"frame {index}" for index in range(frames)]
+    return Origin(**{"nodes": MESH.nodes, "elements": MESH.elements, "names": names, "lights": LIGHTS, **options})

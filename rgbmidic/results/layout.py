@@ -23,11 +23,12 @@ from rgbmidic.results.quantities import QUANTITIES, Quantity
 
 __all__ = ["RecordLayout"]
 
-_AHEAD = 4096
-"""Bytes read where one quantity is asked for: head and plain numbers lie in them. A page of memory."""
+_AHEAD = 1024
+"""Bytes read where one quantity is asked for: head and plain numbers lie in them."""
 _FAST = 1
 """zlib's quickest level."""
 
+_NUMBER = struct.Struct("<I")
 _RATIO = 1032
 """How many times its size packed content can have at most (zlib's technical details, "Maximum Compression Factor")."""
 
@@ -46,7 +47,7 @@ class _Open(NamedTuple):
     """Where the head tells of another quantity: its checksum, its shape, its size in bytes."""
 
     check: int
-    shape: slice
+    shape: range
     size: int
 
 
@@ -59,7 +60,7 @@ class RecordLayout:
     sizes
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
     head
-        The numbers of the head.
+        Bytes of the head.
     fixed, open
         The quantities in the order in which they lie: those of one shape in all frames, then the others.
     length
@@ -67,7 +68,7 @@ class RecordLayout:
     """
 
     sizes: Mapping[str, int]
-    head: struct.Struct
+    head: int
     fixed: Mapping[str, _Fixed]
     open: Mapping[str, _Open]
     length: int
@@ -79,15 +80,15 @@ class RecordLayout:
         fixed, count, open_ = sorted(blank, key=lambda name: blank[name].nbytes), len(QUANTITIES), {}
         for check, name in enumerate((name for name in QUANTITIES if name not in blank), start=len(fixed)):
             axes = len(QUANTITIES[name].axes)
-            open_[name] = _Open(check, slice(count, count + axes), count + axes)
+            open_[name] = _Open(check, range(count, count + axes), count + axes)
             count += axes + 1
-        head = struct.Struct(f"<{count}I")
-        sums = accumulate((blank[name].nbytes for name in fixed), initial=head.size)
+        head = count * _NUMBER.size
+        sums = accumulate((blank[name].nbytes for name in fixed), initial=head)
         places = {
             name: _Fixed(first, blank[name].nbytes, check, _stored(QUANTITIES[name]), blank[name].shape)
             for check, (name, first) in enumerate(zip(fixed, sums, strict=False))
         }
-        length = head.size + sum(one.size for one in places.values())
+        length = head + sum(one.size for one in places.values())
         return cls(sizes=dict(sizes), head=head, fixed=places, open=open_, length=length)
 
     def encode(self, values: Mapping[str, Any]) -> tuple[bytes, int]:
@@ -98,7 +99,7 @@ class RecordLayout:
         numbers = [zlib.crc32(part) for part in parts]
         for name, part in packed.items():
             numbers += [*np.shape(values[name]), len(part)]
-        head = self.head.pack(*numbers)
+        head = struct.pack(f"<{len(numbers)}I", *numbers)
         return b"".join([head, *parts]), zlib.crc32(head)
 
     def decode(
@@ -113,36 +114,42 @@ class RecordLayout:
         """
         file.seek(start)
         block = file.read(length if names is None or length < _AHEAD else _AHEAD)
-        if length < self.length or zlib.crc32(block[: self.head.size]) != check:
+        if length < self.length or zlib.crc32(block[: self.head]) != check:
             raise ResultError("its head is damaged, or of another mesh or other lights")
-        head = self.head.unpack_from(block)
         values = {}
         for name in (*self.fixed, *self.open) if names is None else names:
-            first, size = self._place(name, head)
+            first, size = self._place(name, block)
             if first + size <= len(block):
                 part = block[first : first + size]
             else:
                 file.seek(start + first)
                 part = file.read(min(size, length))
-            values[name] = self._value(name, head, part)
+            values[name] = self._value(name, block, part)
         return values
 
-    def _place(self, name: str, head: Sequence[int]) -> tuple[int, int]:
+    def _place(self, name: str, head: bytes) -> tuple[int, int]:
         """First byte and size of a quantity."""
         if name in self.fixed:
             return self.fixed[name][:2]
         before = takewhile(lambda other: other != name, self.open)
-        return self.length + sum(head[self.open[other].size] for other in before), head[self.open[name].size]
+        first = self.length + sum(_number(head, self.open[other].size) for other in before)
+        return first, _number(head, self.open[name].size)
 
-    def _value(self, name: str, head: Sequence[int], part: bytes) -> Any:
+    def _value(self, name: str, head: bytes, part: bytes) -> Any:
         fixed = self.fixed.get(name)
-        if zlib.crc32(part) != head[(fixed or self.open[name]).check]:
+        if zlib.crc32(part) != _number(head, (fixed or self.open[name]).check):
             raise ResultError(f"the checksum of {name} is wrong")
         entry = QUANTITIES[name]
         if fixed is None:
-            return entry.convert(_unpacked(entry, part, head[self.open[name].shape]), self.sizes)
+            shape = [_number(head, place) for place in self.open[name].shape]
+            return entry.convert(_unpacked(entry, part, shape), self.sizes)
         array = np.frombuffer(part, dtype=fixed.dtype)
         return array.reshape(fixed.shape).astype(entry.dtype) if fixed.shape else array.item()
+
+
+def _number(head: bytes, place: int) -> int:
+    number: int = _NUMBER.unpack_from(head, _NUMBER.size * place)[0]
+    return number
 
 
 def _stored(entry: Quantity) -> np.dtype[Any]:

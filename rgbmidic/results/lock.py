@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import secrets
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from rgbmidic.errors import ResultError
-from rgbmidic.results.files import read_json, write_json, writing
+from rgbmidic.results.files import read_json, writing
 
 __all__ = ["ALL_FRAMES", "Claim"]
 
@@ -53,7 +54,7 @@ class Claim:
         for pause in _PAUSES:
             file = folder / f"in_use.{secrets.token_hex(8)}.json"
             if not (other := next(_others(file, frames), None)):
-                write_json(file, {**_this_process(), "first": frames.start, "stop": frames.stop})
+                _write(file, {**_this_process(), "first": frames.start, "stop": frames.stop})
                 if not (other := next(_others(file, frames), None)):
                     return cls(file=file, process=os.getpid())
                 file.unlink(missing_ok=True)
@@ -70,6 +71,14 @@ class Claim:
         if self.process == os.getpid():
             with writing(self.file):
                 self.file.unlink(missing_ok=True)
+
+
+def _write(file: Path, holder: dict[str, Any]) -> None:
+    """Whole at once; it need not outlive the machine."""
+    part = file.with_suffix(".part")
+    with writing(file):
+        part.write_text(json.dumps(holder), encoding="utf-8")
+        part.replace(file)
 
 
 def _others(mine: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:

@@ -31,6 +31,9 @@ __all__ = ["FrameTable", "ShardWriter", "shard_files"]
 
 _SHARD_FRAMES = 500
 """Frames of a pair of files: 100,000 frames are 200 pairs, which open in milliseconds; 5,000 nodes each are 150 MB."""
+_BUFFER = 2**16
+"""Bytes that the system is asked for at once: a call takes some us, as long as copying these. Small records come by the
+dozen, large ones pass by the buffer."""
 _NAME = re.compile(r"([0-9]{6,})\.(frames|index)")
 _ENTRY = np.dtype([("frame", "<u8"), ("start", "<u8"), ("length", "<u8"), ("head", "<u4"), ("check", "<u4")])
 _CHECKED = _ENTRY.itemsize - 4
@@ -192,17 +195,17 @@ class FrameTable:
         """The named quantities (None: all) of one frame after the other; errors as `read`."""
         chosen = np.fromiter(frames, dtype=np.int64)
         columns = (column[chosen].tolist() for column in (self.shard, self.start, self.length, self.head))
-        blank = self._blank(names)
-        opened, file = -1, None
+        opened, file, blank = -1, None, dict[str, Any]()
         try:
             for frame, shard, start, length, head in zip(chosen.tolist(), *columns, strict=True):  # noqa: B007 told below
                 if shard < 0:
+                    blank = blank or self._blank(names)
                     yield dict(blank)
                     continue
                 if shard != opened:
                     if file is not None:
                         file.close()
-                    opened, file = shard, self.files[shard].open("rb")
+                    opened, file = shard, self.files[shard].open("rb", buffering=_BUFFER)
                 assert file is not None
                 yield self.layout.decode(file, start, length, head, names)
         except OSError as error:

@@ -283,11 +283,12 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
 
 def _start(path: Path, origin: Origin) -> None:
     """Let the folder hold what all frames share; refuse one of another origin."""
-    foreign = [name for name in (_MESH, _REFERENCE, _NAMES, _FRAMES) if (path / name).exists()]
+    foreign = [file for name in (_MESH, _REFERENCE, _NAMES) if (file := path / name).exists()]
+    foreign += shard_files(path / _FRAMES)
     provenance = origin.provenance()
     if not (path / PROVENANCE).exists():  # looked at after the others: it is the first to appear
         if foreign:
-            raise ResultError(f"{path} holds a {foreign[0]} that is not of a result; give another folder")
+            raise ResultError(f"{path} holds a {foreign[0].name} that is not of a result; give another folder")
         write_new_json(path / PROVENANCE, provenance)
     check_same(path, read_provenance(path), provenance)
     with writing(path):

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from results import make_result, random_record
+from results import make_origin, make_result, random_record
 
 from rgbmidic import __version__, cli
 from rgbmidic.command import execute, read_shape
 from rgbmidic.errors import FrameError
-from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 
 TEST = '[frames]\npath = "f*.tif"\nkind = "monochrome"\n[region]\nrectangle = [40, 40, 160, 120]\n'
 
@@ -140,9 +140,8 @@ def _measure_of(*ends: str) -> Callable[..., Result]:
 
     def measure(_: Any, out: Path, **__: Any) -> Result:
         names = [f"f{index}" for index in range(1 + len(ends))]
-        store = ResultStore.create(
-            out, nodes=np.zeros((4, 2)), elements=[[0, 1, 2]], names=names, lights=["light"], overwrite=True
-        )
+        origin = Origin(nodes=np.zeros((4, 2)), elements=[[0, 1, 2]], names=names, lights=["light"])
+        store = ResultStore.create(out, origin, overwrite=True)
         good = FrameRecord.of(nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_share=np.ones((4, 1)))
         for index, reason in enumerate(("", *ends)):
             store.write_frame(index, FrameRecord.failed(reason, nodes=4, lights=1) if reason else good)
@@ -185,10 +184,14 @@ def test_figures_later(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert {"convergence.png", "strain_000000.png", "misfit_000002.png"} <= drawn
     assert not {"strain_000001.png", "strain_000003.png"} & drawn
     assert set(printed.split()) == {str(result.path / "figures" / name) for name in drawn}
-    (result.path / "solution" / "frame_000002.npz").unlink()
+    for file in (result.path / "solution").iterdir():
+        file.unlink()
+    with ResultStore.resume(result.path, make_origin(4)) as store:
+        for index in (0, 1, 3):
+            store.write_frame(index, random_record(index))
     assert command("figures", result.path, "--out", tmp_path / "few")[0] == 2
     assert command("figures", result.path, "--out", tmp_path / "few", "--partial")[0] == 0
-    assert (tmp_path / "few" / "strain_000001.png").is_file()
+    assert {file.name for file in (tmp_path / "few").glob("strain*")} == {"strain_000001.png", "strain_000003.png"}
     for frames, word in (("0,x", "whole numbers"), ("9", "no frame 9")):
         status, _, error = command("figures", result.path, "--out", tmp_path / "none", "--frames", frames, "--partial")
         assert status == 2
@@ -209,16 +212,13 @@ def test_export(command: Run, tmp_path: Path) -> None:
 
 
 def test_export_of_an_interrupted_run(command: Run, tmp_path: Path) -> None:
-    names = ["f0", "f1", "f2"]
-    result = make_result(tmp_path / "whole")
-    store = ResultStore.create(
-        tmp_path / "out", nodes=result.nodes, elements=result.elements, names=names, lights=result.lights
-    )
-    store.write_frame(0, random_record(0))
+    with ResultStore.create(tmp_path / "out", make_origin(3)) as store:
+        store.write_frame(1, random_record(1))
     assert command("export", tmp_path / "out", "--out", tmp_path / "a.npz")[0] == 2
     assert command("export", tmp_path / "out", "--out", tmp_path / "a.npz", "--partial")[0] == 0
     with np.load(tmp_path / "a.npz") as archive:
-        assert archive["names"].tolist() == ["f0"]
+        assert archive["names"].tolist() == ["frame 0", "frame 1", "frame 2"]
+        assert np.isnan(archive["u"]).all(axis=1).tolist() == [True, False, True]
 
 
 def test_from_frames_to_export(command: Run, test_file: Path) -> None:

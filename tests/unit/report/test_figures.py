@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from results import LIGHTS, MESH, NODES, make_result
+from results import LIGHTS, MESH, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.report import figures, gallery, remove_figures, save_figure, style, write_figures
@@ -24,10 +24,8 @@ EVERY_FRAME = {"displacement", "uncertainty", "strain", "misfit", "shares"}
 
 def _one_frame(path: Path, reference: AnyArray | None = None, **values: Any) -> Result:
     """A result of one frame with the quantities given."""
-    store = ResultStore.create(
-        path, nodes=MESH.nodes, elements=MESH.elements, names=["only"], lights=LIGHTS, reference=reference
-    )
-    store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values))
+    with ResultStore.create(path, make_origin(1, reference=reference)) as store:
+        store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values))
     return Result.open(path)
 
 
@@ -97,7 +95,7 @@ def test_doubtful_nodes_do_not_rule_the_colours(tmp_path: Path) -> None:
     exx = np.where(edge, 0.05 * np.random.default_rng(0).normal(size=NODES), 0.002 * (X > 60))
     result = _one_frame(tmp_path / "out", exx=exx, eyy=exx, exy=exx, exx_std=np.where(edge, 0.05, 1e-4))
     norm = figures.map_figure(result, 0, "strain").axes[0].images[-1].norm
-    assert (norm.vmin, norm.vmax) == (0, 0.002)
+    assert (norm.vmin, norm.vmax) == (0, np.float32(0.002))
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from rgbmidic.results import (
     EXPORT_FORMATS,
     QUANTITIES,
     FrameRecord,
+    Origin,
     Quantity,
     Result,
     ResultStore,
@@ -57,9 +58,8 @@ def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(
 ) -> None:
     monkeypatch.setitem(QUANTITIES, "depth", Quantity("depth", ("node",), "px", "", "how deep"))
     depth = np.arange(3.0)
-    with ResultStore.create(
-        tmp_path / "out", nodes=np.eye(3)[:, :2], elements=[[0, 1, 2]], names=["only"], lights=["one"]
-    ) as store:
+    origin = Origin(nodes=np.eye(3)[:, :2], elements=[[0, 1, 2]], names=["only"], lights=["one"])
+    with ResultStore.create(tmp_path / "out", origin) as store:
         store.write_frame(0, FrameRecord.of(nodes=3, lights=1, depth=depth))
     result = Result.open(tmp_path / "out")
     np.testing.assert_array_equal(result.depth, [depth])
@@ -88,7 +88,8 @@ def test_what_cannot_be_exported_leaves_nothing(result: Result, tmp_path: Path) 
         export_result(result, "npz", tmp_path / "none" / "a")
     with pytest.raises(ResultError, match="already exists"):
         export_result(result, "npz", tmp_path, overwrite=True)
-    (result.path / "solution" / "frame_000002.npz").write_bytes(b"PK")
+    file = result.path / "solution" / "000000.frames"
+    file.write_bytes(bytes(file.stat().st_size))
     for to in EXPORT_FORMATS:
         with pytest.raises(ResultError, match="damaged"):
             export_result(Result.open(result.path), to, tmp_path / "b")

@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import socket
 import tracemalloc
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,16 +18,19 @@ from results import make_result
 
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
+from rgbmidic.results.store import load_frames
 from rgbmidic.typing import AnyArray
 
 COPIES = 120
-"""Mutated copies of each file of a result."""
+"""Mutated copies of each small file of a result."""
+SHARD_COPIES = 1000
+"""Mutated copies of each file that holds frames."""
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     reference = np.random.default_rng(0).normal(1000, 100, (3, 40, 60))
-    return make_result(tmp_path_factory.mktemp("files") / "out", frames=1, reference=reference)
+    return make_result(tmp_path_factory.mktemp("files") / "out", frames=2, reference=reference)
 
 
 @pytest.fixture
@@ -35,17 +40,18 @@ def copy(result: Result, tmp_path: Path) -> Path:
 
 def _read_all(path: Path) -> tuple[AnyArray, ...]:
     result = Result.open(path)
-    assert result.deformed == ()
-    return result.nodes, result.elements, result.reference, *result.frame(0).values.values()
+    assert result.deformed == (1,)
+    values = (*result.frame(0).values.values(), *result.frame(1).values.values())
+    return result.nodes, result.elements, result.reference, *values
 
 
-def _mutations(content: bytes, seed: int) -> Iterator[bytes]:
+def _mutations(content: bytes, seed: int, copies: int = COPIES) -> Iterator[bytes]:
     """Copies with bytes changed, most of them in headers, cut short, or with a piece lost or doubled."""
     random = np.random.default_rng(seed)
     headers = [
         i for mark in (b"\x93NUMPY", b"PK\x01\x02", b"{") for i in range(len(content)) if content[i:].startswith(mark)
-    ]
-    for number in range(COPIES):
+    ] or [0]
+    for number in range(copies):
         copied = bytearray(content)
         near = int(random.choice(headers)) if number % 4 else int(random.integers(len(content)))
         place = min(near + int(random.integers(128)), len(content) - 1)
@@ -59,7 +65,7 @@ def _mutations(content: bytes, seed: int) -> Iterator[bytes]:
         yield bytes(copied)
 
 
-@pytest.mark.parametrize("name", ["provenance.json", "mesh.npz", "reference.npz", "solution/frame_000000.npz"])
+@pytest.mark.parametrize("name", ["provenance.json", "frames.json", "mesh.npz", "reference.npz"])
 def test_a_mutated_file_is_read_or_told(copy: Path, name: str) -> None:
     content, whole, told = (copy / name).read_bytes(), _read_all(copy), []
     for mutated in _mutations(content, seed=len(name)):
@@ -70,6 +76,48 @@ def test_a_mutated_file_is_read_or_told(copy: Path, name: str) -> None:
             told.append(str(error))
     assert len(told) > COPIES / 3
     assert all(str(copy) in message for message in told)
+
+
+@pytest.mark.parametrize("ending", ["frames", "index"])
+def test_mutated_frames_are_read_told_or_not_measured_yet(copy: Path, ending: str) -> None:
+    """Also quantity by quantity, and opened as a run that goes on: never anything else than what was written."""
+    file, whole = copy / "solution" / f"000000.{ending}", Result.open(copy)
+    content, records = file.read_bytes(), [whole.frame(index).values for index in range(2)]
+    told, absent = list[str](), 0
+    for mutated in _mutations(content, len(ending), SHARD_COPIES):
+        file.write_bytes(mutated)
+        try:
+            table = load_frames(copy, whole.table.layout.sizes, 2)
+            there = np.flatnonzero(table.finished)
+            absent += 2 - len(there)
+            for index, values in zip(there, table.each(["u", "status", "reason"], there), strict=True):
+                np.testing.assert_equal(values, {name: records[index][name] for name in values})
+                np.testing.assert_equal(dict(table.read(index).values), dict(records[index]))
+        except RgbmidicError as error:
+            told.append(str(error))
+    assert all("000000." in message for message in told)
+    assert len(told) + absent > SHARD_COPIES / 2
+
+
+@pytest.mark.parametrize("size", [0, 7, 2**31, 2**32 - 1])
+@pytest.mark.parametrize("name", ["history", "inputs", "rigid", "weights_thumbnail"])
+def test_a_forged_head_is_told(copy: Path, name: str, size: int) -> None:
+    """Sizes that no record has, their checksums right: no memory is taken for what is not there."""
+    table = Result.open(copy).table
+    file = table.files[0]
+    content = bytearray(file.read_bytes())
+    place = table.layout.open[name]
+    for number in place.shape:
+        content[4 * number : 4 * number + 4] = size.to_bytes(4, "little")
+    file.write_bytes(content)
+    table.head[0] = zlib.crc32(content[: table.layout.head])
+    tracemalloc.start()
+    try:
+        with pytest.raises(ResultError, match="damaged in frame 0"):
+            table.read(0)
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def _forged(copy: Path, header: bytes, *, entry: str = "nodes") -> Path:
@@ -122,7 +170,7 @@ def test_json_that_cannot_be_read_is_told(copy: Path, text: str) -> None:
 @pytest.mark.parametrize("to", EXPORT_FORMATS)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_export_to_a_full_disk_is_told(result: Result, tmp_path: Path, to: str) -> None:
-    (tmp_path / f"fields.{os.getpid()}.part").symlink_to("/dev/full")
+    (tmp_path / f"fields.{socket.gethostname()}.{os.getpid()}.part").symlink_to("/dev/full")
     with pytest.raises(ResultError, match=r"fields cannot be written: No space left"):
         export_result(result, to, tmp_path / "fields")
     assert not list(tmp_path.iterdir())

@@ -1,32 +1,37 @@
-"""Two runs never write into one folder; a dead one does not keep it."""
+"""Two runs never write the same frames of one folder; a dead one does not keep them."""
 
 from __future__ import annotations
 
 import json
 import os
+import pickle
 import socket
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from results import LIGHTS, MESH, make_result, random_record
+from results import make_origin, make_result, random_record
 
-from rgbmidic.errors import ResultError
-from rgbmidic.results import Result, ResultStore
-
-LOCK = "in_use.json"
-
-
-def _create(path: Path, **options: bool) -> ResultStore:
-    return ResultStore.create(
-        path, nodes=MESH.nodes, elements=MESH.elements, names=["f0", "f1"], lights=LIGHTS, **options
-    )
+from rgbmidic.errors import InputError, ResultError
+from rgbmidic.results import Result, ResultStore, finish_result
+from rgbmidic.results.lock import Claim
 
 
-def _write_lock(path: Path, process: int, host: str) -> None:
+def _create(path: Path, *, overwrite: bool = False) -> ResultStore:
+    return ResultStore.create(path, make_origin(2), overwrite=overwrite)
+
+
+def _claims(path: Path) -> list[Path]:
+    return list(path.glob("in_use.*"))
+
+
+def _write_claim(path: Path, process: int, host: str) -> Path:
     path.mkdir(exist_ok=True)
-    (path / LOCK).write_text(json.dumps({"process": process, "host": host}))
+    file = path / "in_use.other.json"
+    file.write_text(json.dumps({"process": process, "host": host, "first": 0, "stop": 9}))
+    return file
 
 
 def _dead_process() -> int:
@@ -50,28 +55,58 @@ def test_second_run_is_refused_and_the_first_goes_on(tmp_path: Path) -> None:
 def test_the_folder_is_free_after_an_exception(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), _create(tmp_path / "out"):
         raise KeyboardInterrupt
-    assert not (tmp_path / "out" / LOCK).exists()
+    assert not _claims(tmp_path / "out")
     with pytest.raises(ResultError, match="already holds a result"):
         _create(tmp_path / "out")
-    assert not (tmp_path / "out" / LOCK).exists()
+    assert not _claims(tmp_path / "out")
 
 
-def test_only_the_lock_of_a_dead_process_of_this_host_is_taken_over(tmp_path: Path) -> None:
+def test_only_the_claim_of_a_dead_process_of_this_host_is_taken_over(tmp_path: Path) -> None:
     alive, dead, here = os.getppid(), _dead_process(), socket.gethostname()
-    _write_lock(tmp_path / "dead", dead, here)
+    _write_claim(tmp_path / "dead", dead, here)
     assert len(make_result(tmp_path / "dead")) == 2
-    assert not (tmp_path / "dead" / LOCK).exists()
+    assert not _claims(tmp_path / "dead")
     for name, process, host in (("alive", alive, here), ("elsewhere", dead, "elsewhere")):
-        _write_lock(tmp_path / name, process, host)
-        with pytest.raises(ResultError, match=f"in use by process {process} on {host}"):
+        file = _write_claim(tmp_path / name, process, host)
+        with pytest.raises(ResultError, match=f"in use by process {process} on {host}.*delete {file}"):
             _create(tmp_path / name)
-    (tmp_path / "alive" / LOCK).write_text("half a li")
-    with pytest.raises(ResultError, match=f"delete {tmp_path / 'alive' / LOCK}"):
-        _create(tmp_path / "alive")
+        assert file.exists()
+    file.write_text("half a li")
+    with pytest.raises(ResultError, match=f"delete {file}"):
+        _create(tmp_path / "elsewhere")
 
 
-def test_the_lock_of_another_is_never_released(tmp_path: Path) -> None:
-    store = _create(tmp_path / "out")
-    _write_lock(tmp_path / "out", os.getppid(), socket.gethostname())
-    store.finish()
-    assert (tmp_path / "out" / LOCK).exists()
+def test_a_claim_is_released_by_who_holds_it_only(tmp_path: Path) -> None:
+    Claim(file=_write_claim(tmp_path, 1, "elsewhere"), process=os.getpid() + 1).release()
+    assert _claims(tmp_path)
+
+
+def test_parts_are_written_side_by_side_and_exclude_only_each_other(tmp_path: Path) -> None:
+    origin, out = make_origin(4), tmp_path / "out"
+    with (
+        ResultStore.join(out, origin, frames=range(2, 9)) as second,
+        ResultStore.join(out, origin, frames=range(2)) as first,
+    ):
+        for frames in (range(1, 3), None):
+            with pytest.raises(ResultError, match="in use"):
+                ResultStore.join(out, origin, frames=frames)
+        with pytest.raises(ResultError, match="in use"):
+            ResultStore.create(out, origin, overwrite=True)
+        with pytest.raises(InputError, match="frames 0 to 1 of 4 are written here"):
+            first.write_frame(2, random_record(2))
+        for store, index in ((second, 3), (first, 1), (second, 2)):
+            store.write_frame(index, random_record(index))
+        with pytest.raises(ResultError, match="frame 0"):
+            finish_result(out)
+        first.write_frame(0, random_record(0))
+    finish_result(out)
+    np.testing.assert_array_equal(Result.open(out).u, [random_record(index).u for index in range(4)])
+
+
+def test_a_copy_in_another_process_writes_files_of_its_own(tmp_path: Path) -> None:
+    with _create(tmp_path / "out") as store:
+        store.write_frame(0, random_record(0))
+        pickle.loads(pickle.dumps(store)).write_frame(1, random_record(1))
+        store.write_frame(0, random_record(0))
+    assert len(list((tmp_path / "out" / "solution").glob("*.index"))) == 2
+    np.testing.assert_array_equal(Result.open(tmp_path / "out").u, [random_record(0).u, random_record(1).u])

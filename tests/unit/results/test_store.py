@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from results import LIGHTS, MESH, NODES, make_result, random_record
+from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.correlation import NodeStatus, Solution, Status
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results import QUANTITIES, FrameRecord, Result, ResultStore
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, FrameRecord, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 
 
@@ -31,7 +30,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> ResultStore:
 def test_record_written_and_read_is_the_same(store: ResultStore, seed: int) -> None:
     record = random_record(seed)
     store.write_frame(0, record)
-    back = store.read_frame(0)
+    back = Result.open(store.path, partial=True).frame(0)
     for name, quantity in QUANTITIES.items():
         np.testing.assert_equal(getattr(back, name), getattr(record, name))
         if quantity.axes:
@@ -64,6 +63,7 @@ def test_frames_may_come_in_any_order_and_twice(tmp_path: Path) -> None:
     for index in (2, 0, 1, 0):
         store.write_frame(index, random_record(index))
     np.testing.assert_array_equal(Result.open(tmp_path / "out").frame(2).u, random_record(2).u)
+    store.finish()
     assert not list((tmp_path / "out").rglob("*.part"))
 
 
@@ -75,13 +75,15 @@ def test_provenance(tmp_path: Path) -> None:
         calibration_file=tmp_path / "calibration.json",
         base=tmp_path,
     )
-    result = make_result(tmp_path / "out", settings=test, notes={"note": "n"})
+    result = make_result(tmp_path / "out", settings=test, notes={"frame_rate": 1e6}, inputs={"shot.cine": "ab"})
     document = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert document["settings"] == test.to_mapping()
     assert document["calibration"]["sha256"].startswith("44136fa355b3678a")
     assert result.inputs == {"/data/0.dng": "00", "/data/1.dng": "01"}
     assert document["lights"] == list(LIGHTS)
-    assert document["note"] == "n"
+    assert document["frame_rate"] == 1e6
+    assert document["inputs"] == {"shot.cine": "ab"}
+    assert document["frames"]["count"] == 2
     assert {"rgbmidic", "python", "numpy", "numba"} <= set(document["versions"])
     assert document["created"] <= document["finished"]
 
@@ -95,69 +97,119 @@ def test_existing_result_is_kept_unless_overwriting_is_allowed(tmp_path: Path) -
     (tmp_path / "out" / "solution" / "notes.txt").write_text("mine")
     assert len(make_result(tmp_path / "out", frames=1, overwrite=True)) == 1
     left = sorted(str(file.relative_to(tmp_path / "out")) for file in (tmp_path / "out").rglob("*") if file.is_file())
-    assert left == ["mesh.npz", "notes.txt", "provenance.json", "solution/frame_000000.npz", "solution/notes.txt"]
+    assert left == [
+        "frames.json",
+        "mesh.npz",
+        "notes.txt",
+        "provenance.json",
+        "solution/000000.frames",
+        "solution/000000.index",
+        "solution/notes.txt",
+    ]
 
 
 def test_foreign_files_are_never_replaced(tmp_path: Path) -> None:
-    for name, content in {"provenance.json": "{}", "mesh.npz": "", "reference.npz": ""}.items():
+    for name, content in {"provenance.json": "{}", "mesh.npz": "", "reference.npz": "", "frames.json": ""}.items():
         out = tmp_path / name.partition(".")[0]
         out.mkdir()
         (out / name).write_text(content)
         with pytest.raises(ResultError, match=name):
             _create(out, 1, overwrite=True)
         assert (out / name).read_text() == content
+        with pytest.raises(ResultError, match=name):
+            ResultStore.join(out, make_origin(1))
     (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "frame_000000.tif").touch()
+    (tmp_path / "photos" / "000000.frames").touch()
     make_result(tmp_path / "photos", frames=1)
-    assert (tmp_path / "photos" / "frame_000000.tif").exists()
+    assert (tmp_path / "photos" / "000000.frames").exists()
 
 
 def test_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
     store = _create(tmp_path / "out", 4)
-    with pytest.raises(ResultError, match="incomplete"):
-        Result.open(tmp_path / "out", partial=True)
-    for index in (0, 1, 3):
+    assert not Result.open(tmp_path / "out", partial=True).finished.any()
+    for index in (0, 3):
         store.write_frame(index, random_record(index))
-    with pytest.raises(ResultError, match=r"frame 2 \(frame 2\) of 4 is missing"):
+    with pytest.raises(ResultError, match=r"frame 1 \(frame 1\) of 4 is missing and 1 more"):
         Result.open(tmp_path / "out")
-    assert Result.open(tmp_path / "out", partial=True).u.shape == (2, NODES)
+    with pytest.raises(ResultError, match=r"frame 1 \(frame 1\) of 4 is missing"):
+        store.finish()
+    result = Result.open(tmp_path / "out", partial=True)
+    assert len(result) == 4
+    assert result.finished.tolist() == [True, False, False, True]
+    np.testing.assert_array_equal(result.u[[0, 3]], [random_record(0).u, random_record(3).u])
+    assert np.isnan(result.u[1:3]).all()
+    assert result.reasons[1:3] == ("not measured yet",) * 2
+    assert result.frame(1).time_ns == UNKNOWN_TIME
+
+
+def test_a_growing_result_is_seen_to_grow(tmp_path: Path) -> None:
+    with _create(tmp_path / "out", 3) as store:
+        first = Result.open(tmp_path / "out", partial=True)
+        for index in (1, 2, 0):
+            store.write_frame(index, random_record(index))
+        store.finish()
+    second = first.refresh()
+    assert first.finished.tolist() == [False] * 3
+    assert second.finished.all()
+    np.testing.assert_array_equal(second.u[1], random_record(1).u)
+    make_result(tmp_path / "out", frames=2, overwrite=True)
+    with pytest.raises(ResultError, match="another result"):
+        second.refresh()
 
 
 @given(share=st.floats(0, 1, exclude_max=True))
 @settings(max_examples=40, deadline=None)
-def test_truncated_frame_file_is_told(store: ResultStore, share: float) -> None:
-    store.write_frame(1, random_record(0))
-    file = store.path / "solution" / "frame_000001.npz"
-    content = file.read_bytes()
-    file.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ResultError, match=r"frame_000001\.npz is damaged"):
-        store.read_frame(1)
+def test_truncated_files_hold_the_frames_that_are_whole(truncated: tuple[Path, int], share: float) -> None:
+    """A torn record or entry, as a kill leaves it, is passed over; every frame before it is there."""
+    path, frames = truncated
+    for name in ("000000.frames", "000000.index"):
+        content = (path / "solution" / name).read_bytes()
+        (path / "solution" / name).write_bytes(content[: int(share * len(content))])
+        result = Result.open(path, partial=True)
+        (path / "solution" / name).write_bytes(content)
+        there = int(result.finished.sum())
+        assert result.finished.tolist() == [True] * there + [False] * (frames - there)
+        assert abs(there - share * frames) <= 1
+        for index in range(there):
+            np.testing.assert_array_equal(result.frame(index).u, random_record(2 * index).u)
 
 
-def test_a_quantity_is_read_without_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a run of many frames costs: one frame at a time, nothing kept, nothing read back at the end."""
+@pytest.fixture(scope="module")
+def truncated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    path, frames = tmp_path_factory.mktemp("truncated") / "out", 5
+    with _create(path, frames) as store:
+        for index in range(frames):
+            store.write_frame(index, random_record(2 * index))
+    return path, frames
+
+
+def test_many_frames_lie_in_few_files(tmp_path: Path) -> None:
+    count = 1201
+    names = [f"frame {index}" for index in range(count)]
+    origin = Origin(nodes=np.zeros((3, 2)), elements=[[0, 1, 2]], names=names, lights=["one"])
+    random = np.random.default_rng(0)
+    order, u = random.permutation(count), random.normal(size=(count, 3))
+    with ResultStore.create(tmp_path / "out", origin) as store:
+        for index in order:
+            store.write_frame(index, FrameRecord.of(nodes=3, lights=1, u=u[index], reason=str(index)))
+        store.finish()
+    assert len(list((tmp_path / "out" / "solution").iterdir())) == 6
+    result = Result.open(tmp_path / "out")
+    np.testing.assert_array_equal(result.u, u)
+    assert result.reasons == tuple(map(str, range(count)))
+
+
+def test_a_quantity_is_read_once_and_kept_a_record_is_not(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=3)
-    reads: list[tuple[int, list[str]]] = []
-    read = ResultStore.read
-
-    def counted(self: ResultStore, index: int, names: Any) -> Any:
-        reads.append((index, list(names)))
-        return read(self, index, names)
-
-    monkeypatch.setattr(ResultStore, "read", counted)
-    result.store.finish()
-    assert reads == []
     assert result.u is result.u
-    assert reads == [(0, ["u"]), (1, ["u"]), (2, ["u"])]
-    result.frame(1)
-    assert [index for index, _ in reads[3:]] == [1]
+    assert result.frame(1) is not result.frame(1)
+    result.frame(1).u[:] = 0  # a record is its reader's own
+    np.testing.assert_array_equal(result.frame(1).u, random_record(1).u)
 
 
 def test_the_deformed_frames_are_those_that_are_no_reference(tmp_path: Path) -> None:
-    test = TestSettings(
-        frames=FrameSettings(path=("*",), reference=(1, 2)), region=RegionSettings(rectangle=(0, 0, 9, 9))
-    )
-    assert make_result(tmp_path / "two", frames=4, settings=test).deformed == (0, 3)
+    assert make_result(tmp_path / "two", frames=4, references=(1, 2)).deformed == (0, 3)
+    assert make_result(tmp_path / "none", frames=2, references=()).deformed == (0, 1)
     result = make_result(tmp_path / "untold", frames=3)
     assert result.deformed == (1, 2)
     assert [u[0] for u in result.each("u", result.deformed)] == pytest.approx(result.u[1:, 0].tolist(), nan_ok=True)
@@ -185,13 +237,17 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
     assert "schema version 9" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 9}')
-    start = b'{"schema": "rgbmidic-result", "schema_version": 3'
-    for rest in (b"}", b', "frames": [1], "lights": []}', b', "frames": [], "lights": [], "settings": {"a": 1}}'):
-        assert "names of frames and lights, or the settings" in damaged("provenance.json", start + rest)
+    assert "schema version 3" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 3}')
+    whole = make_result(tmp_path / "whole").provenance
+    for part, odd in {"frames": [1], "lights": [1], "settings": {"a": 1}, "references": ["a"], "inputs": None}.items():
+        assert "is not as written" in damaged("provenance.json", json.dumps({**whole, part: odd}).encode())
+    assert "frames.json is missing" in damaged("frames.json", None)
+    assert "frames.json is damaged" in damaged("frames.json", b'["frame 0", "frame 2"]')
     assert "mesh.npz is missing" in damaged("mesh.npz", None)
     assert "mesh.npz is damaged" in damaged("mesh.npz", b"PK")
-    assert "frame 1 (frame 1) of 2 is missing" in damaged("solution/frame_000001.npz", None)
-    assert "frame_000001.npz is damaged" in damaged("solution/frame_000001.npz", bytes(3000))
+    assert "frame 0 (frame 0) of 2 is missing" in damaged("solution/000000.index", None)
+    assert "000000.frames" in damaged("solution/000000.frames", None)
+    assert "000000.frames is damaged in frame 0" in damaged("solution/000000.frames", bytes(30_000))
 
 
 def test_frame_of_another_mesh_is_refused(tmp_path: Path) -> None:
@@ -201,9 +257,10 @@ def test_frame_of_another_mesh_is_refused(tmp_path: Path) -> None:
         store.write_frame(0, other)
     with pytest.raises(InputError, match="no frame 1"):
         store.write_frame(1, random_record(0))
-    replace(store, sizes=other.sizes).write_frame(0, other)
-    with pytest.raises(ResultError, match="does not belong to this mesh"):
-        Result.open(tmp_path / "out").frame(0)
+    store.write_frame(0, random_record(0))
+    np.savez(tmp_path / "out" / "mesh.npz", nodes=MESH.nodes[:-1], elements=MESH.elements)
+    with pytest.raises(ResultError, match=r"mesh\.npz is damaged or of another result"):
+        Result.open(tmp_path / "out")
 
 
 def test_failed_record_measures_nothing_and_says_why() -> None:
@@ -251,13 +308,15 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
     brightness = values.random((2, 2))
     record = pickle.loads(pickle.dumps(FrameRecord.from_solution(solution, inputs={"a": "b"}, brightness=brightness)))
     np.testing.assert_array_equal(np.stack([record.u, record.v], axis=1), solution.displacement)
-    np.testing.assert_array_equal(np.stack([record.u_std, record.v_std], axis=1), solution.displacement_std)
-    np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), solution.strain)
-    np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), solution.strain_std)
+    single = {name: getattr(solution, name).astype(np.float32) for name in ("displacement_std", "strain", "strain_std")}
+    np.testing.assert_array_equal(np.stack([record.u_std, record.v_std], axis=1), single["displacement_std"])
+    np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), single["strain"])
+    np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), single["strain_std"])
     for name in ("node_status", "light_share", "misfit", "rigid", "residual", "weight_share", "history"):
-        np.testing.assert_array_equal(getattr(record, name), getattr(solution, name), err_msg=name)
+        single = np.asarray(getattr(solution, name), dtype=QUANTITIES[name].dtype)
+        np.testing.assert_array_equal(getattr(record, name), single, err_msg=name)
     assert (record.status, record.reason, record.iterations) == (1, "why", 6)
-    np.testing.assert_array_equal(record.brightness, brightness)
+    np.testing.assert_array_equal(record.brightness, brightness.astype(np.float32))
     assert record.inputs.tolist() == [["a", "b"]]
 
 
@@ -277,5 +336,4 @@ def test_reference_is_kept_as_pictures(tmp_path: Path) -> None:
 
 
 def _create(path: Path, frames: int, **options: Any) -> ResultStore:
-    names = [f"frame {index}" for index in range(frames)]
-    return ResultStore.create(path, nodes=MESH.nodes, elements=MESH.elements, names=names, lights=LIGHTS, **options)
+    return ResultStore.create(path, make_origin(frames), **options)

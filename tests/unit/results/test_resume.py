@@ -1,0 +1,174 @@
+"""A run that is killed goes on where it was; nobody goes on with another test's result."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import time
+from dataclasses import replace
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import numpy as np
+import pytest
+from results import MESH, make_origin, make_result, random_record
+
+from rgbmidic.errors import ResultError
+from rgbmidic.results import Result, ResultStore, finish_result, provenance
+from rgbmidic.settings import FrameSettings, RegionSettings, SolverSettings, TestSettings
+
+FRAMES = 600
+KILLS = 20
+RECORDS = [random_record(seed) for seed in range(20)] * (FRAMES // 20)
+_FORK = multiprocessing.get_context("fork") if hasattr(os, "fork") else None
+forking = pytest.mark.skipif(_FORK is None, reason="no fork")
+
+
+def _write(out: Path, started: Event | None = None) -> None:
+    with ResultStore.join(out, make_origin(FRAMES)) as store:
+        if started is not None:
+            started.set()
+        for index in np.flatnonzero(~store.finished())[::-1]:
+            store.write_frame(index, RECORDS[index])
+
+
+@forking
+def test_killed_at_any_moment_it_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    """Every other time while it writes frames, else perhaps before."""
+    assert _FORK is not None
+    out, random, finished = tmp_path / "out", np.random.default_rng(0), [np.zeros(FRAMES, dtype=bool)]
+    for kill in range(KILLS):
+        started = _FORK.Event()
+        process = _FORK.Process(target=_write, args=(out, started))
+        process.start()
+        if kill % 2:
+            started.wait()
+        time.sleep(random.uniform(0, 0.03))
+        process.kill()
+        process.join()
+        if (out / "mesh.npz").exists():
+            finished.append(Result.open(out, partial=True).finished)
+            assert finished[-1][finished[-2]].all()
+    assert len({int(there.sum()) for there in finished} - {0, FRAMES}) > 2
+    _write(out)
+    finish_result(out)
+    result = Result.open(out)
+    for index, record in enumerate(RECORDS):
+        np.testing.assert_equal(dict(result.frame(index).values), dict(record.values))
+
+
+@forking
+def test_all_who_join_at_once_write_one_result(tmp_path: Path) -> None:
+    assert _FORK is not None
+    count = 12
+    barrier = _FORK.Barrier(count)
+
+    def write(index: int) -> None:
+        origin = make_origin(count)
+        barrier.wait()
+        with ResultStore.join(tmp_path / "out", origin, frames=range(index, index + 1)) as store:
+            store.write_frame(index, RECORDS[index])
+
+    runs = [_FORK.Process(target=write, args=(index,)) for index in range(count)]
+    for run in runs:
+        run.start()
+    for run in runs:
+        run.join()
+    assert [run.exitcode for run in runs] == [0] * count
+    np.testing.assert_array_equal(Result.open(tmp_path / "out").u, [record.u for record in RECORDS[:count]])
+    assert not list((tmp_path / "out").glob("*.part"))
+
+
+def _settings(folder: Path, tolerance: float) -> TestSettings:
+    (folder / "calibration.json").write_text("{}")
+    return TestSettings(
+        frames=FrameSettings(path=("*.dng",)),
+        region=RegionSettings(rectangle=(0, 0, 9, 9)),
+        solver=SolverSettings(tolerance=tolerance),
+        calibration_file=folder / "calibration.json",
+        base=folder,
+    )
+
+
+def test_the_result_of_another_test_is_refused_with_the_difference(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, inputs = tmp_path / "out", {"shot.cine": "abc", "lamps": "def"}
+    origin = make_origin(3, settings=_settings(tmp_path, 0.001), inputs=inputs)
+    with ResultStore.create(out, origin) as store:
+        store.write_frame(1, random_record(1))
+    with ResultStore.resume(out, origin) as store:
+        assert store.finished().tolist() == [False, True, False]
+    nodes = MESH.nodes + 1
+    for told, changed in {
+        "solver.tolerance was 0.001, now 0.002": {"settings": _settings(tmp_path, 0.002)},
+        'the input shot.cine was "abc", now "xyz"; give': {"inputs": {**inputs, "shot.cine": "xyz"}},
+        'the input lamps was "def", now nothing': {"inputs": {"shot.cine": "abc"}},
+        "the list of frames was": {"names": ["a", "b", "c"]},
+        "the number of frames was 3, now 2": {"names": ["a", "b"]},
+        "the mesh was": {"nodes": nodes},
+        r'lights was \["red", "green", "blue"\], now \["r", "g", "b"\]': {"lights": ["r", "g", "b"]},
+        r"references was \[0\], now \[\]": {"references": ()},
+    }.items():
+        for enter in (ResultStore.resume, ResultStore.join):
+            with pytest.raises(ResultError, match=told):
+                enter(out, replace(origin, **changed))
+    (tmp_path / "calibration.json").write_text("{ }")
+    with pytest.raises(ResultError, match="the calibration was"):
+        ResultStore.resume(out, origin)
+    (tmp_path / "calibration.json").write_text("{}")
+    monkeypatch.setattr(provenance, "__version__", "0.0.1")
+    with pytest.raises(ResultError, match=r'the version of rgbmidic was .*, now "0\.0\.1"'):
+        ResultStore.resume(out, origin)
+    assert not list(out.glob("in_use.*"))
+    np.testing.assert_array_equal(Result.open(out, partial=True).frame(1).u, random_record(1).u)
+
+
+def test_only_a_result_is_gone_on_with(tmp_path: Path) -> None:
+    with pytest.raises(ResultError, match="is not a result folder"):
+        ResultStore.resume(tmp_path / "none", make_origin(2))
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_start_that_was_killed_is_completed(tmp_path: Path) -> None:
+    """The provenance comes first; whatever follows it is made good by whoever comes next."""
+    images = np.random.default_rng(0).normal(1000, 100, (3, 20, 30))
+    for missing in ("frames.json", "mesh.npz", "reference.npz"):
+        out = tmp_path / missing
+        make_result(out, reference=images)
+        (out / missing).unlink()
+        with ResultStore.resume(out, make_origin(2, reference=images)):
+            pass
+        result = Result.open(out)
+        assert result.reference is not None
+        np.testing.assert_array_equal(result.u[1], random_record(1).u)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no limits")
+def test_a_full_disk_is_told_and_the_frames_before_are_kept(tmp_path: Path) -> None:
+    """A file that may not grow, as the system says it in the middle of a write."""
+    sizes = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with ResultStore.create(tmp_path / "out", make_origin(40)) as store:
+        file, told = tmp_path / "out" / "solution" / "000000.frames", list[str]()
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, sizes[1]))
+            index = next(index for index in range(40) if not _written(store, index, told))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, sizes)
+        assert told == [f"{file} cannot be written: File too large"]
+        result = Result.open(tmp_path / "out", partial=True)
+        assert 0 < result.finished.sum() == index < 40
+        assert file.stat().st_size == result.table.length.sum()
+        for later in range(index, 40):  # when there is room again
+            store.write_frame(later, random_record(1))
+        store.finish()
+    np.testing.assert_array_equal(Result.open(tmp_path / "out").u, [random_record(1).u] * 40)
+
+
+def _written(store: ResultStore, index: int, told: list[str]) -> bool:
+    try:
+        store.write_frame(index, random_record(1))
+    except ResultError as error:
+        told.append(str(error))
+    return not told
