@@ -103,7 +103,7 @@ class CineHeader:
     def last_whole(self) -> int:
         """Index of the last frame before the first that the file does not hold whole; -1 where it holds none."""
         begun = (self.pointers >= self.first_byte) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
-        return int(np.argmin([*begun, False])) - 1
+        return int(np.argmin(np.append(begun, False))) - 1
 
     def lines(self, size: int) -> tuple[int, int] | None:
         """Number and bytes of the lines that a frame of `size` bytes is stored in; None where its size cannot be."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from cine_files import write_cine
 from results import make_origin, make_result, random_record
 
 from rgbmidic import __version__, cli
@@ -54,8 +56,8 @@ def test_version_and_help(command: Run) -> None:
     for arguments in ((), ("--help",)):
         status, out, _ = command(*arguments)
         assert status == 0
-        assert all(word in out for word in ("run", "export", "figures", "demo", "virtual", "plan"))
-    for name in ("run", "export", "figures", "demo", "virtual", "plan"):
+        assert all(word in out for word in ("run", "export", "figures", "frames", "demo", "virtual", "plan"))
+    for name in ("run", "export", "figures", "frames", "demo", "virtual", "plan"):
         assert command(name, "--help")[0] == 0
 
 
@@ -219,6 +221,47 @@ def test_export_of_an_interrupted_run(command: Run, tmp_path: Path) -> None:
     with np.load(tmp_path / "a.npz") as archive:
         assert archive["names"].tolist() == ["frame 0", "frame 1", "frame 2"]
         assert np.isnan(archive["u"]).all(axis=1).tolist() == [True, False, True]
+
+
+def test_frames_says_what_a_reader_sees(command: Run, tmp_path: Path) -> None:
+    path, out = tmp_path / "f.cine", tmp_path / "f.tif"
+    values = np.random.default_rng(0).integers(0, 4096, (3, 12, 16))
+    write_cine(path, values, count=3, cfa="GBRG")
+    status, printed, error = command("frames", path, "--json", "--save", 1, out)
+    assert (status, error) == (0, "")
+    seen = json.loads(printed)
+    assert (seen["count"], seen["shape"], seen["cfa"], seen["lost_frames"]) == (3, [12, 16], "GBRG", 0)
+    np.testing.assert_array_equal(tifffile.imread(out), values[1])
+    status, printed, error = command("frames", path, "--save", 1, out)
+    assert (status, printed) == (2, "")
+    assert error.endswith("f.tif exists already; --overwrite replaces it\n")
+    path.write_bytes(path.read_bytes()[:-10])
+    status, printed, error = command("frames", path)
+    assert (status, printed.split()[:2]) == (0, ["reader", "Phantom"])
+    assert error.startswith("warning: ")
+    assert error.endswith("ends after frame 1 of 3 (0 to 2): truncated or still being written\n")
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["none.cine"], "no file matches: none.cine"),
+        (["f.txt"], "f.txt is not a frame that rgbmidic reads"),
+        (["f.cine"], "f.cine is no Phantom movie"),
+        (["f.cine", "--kind", "blue"], 'kind must be one of "bayer", "rgb", "monochrome", not "blue"'),
+        (["f.cine", "--cfa", "RGB"], "cfa must be one of RGGB"),
+        (["f.cine", "--save", "one", "a.tif"], "--save"),
+    ],
+)
+def test_frames_that_cannot_be_read_are_one_line(
+    command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], reason: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("f.cine", "f.txt"):
+        (tmp_path / name).write_bytes(bytes(200))
+    status, printed, error = command("frames", *options)
+    assert (status, printed, error.count("\n")) == (2, "", 1)
+    assert reason in error
 
 
 def test_from_frames_to_export(command: Run, test_file: Path) -> None:

@@ -281,8 +281,7 @@ def test_levels_that_contradict_each_other_are_no_fault_of_the_file(tmp_path: Pa
 @pytest.mark.parametrize(
     ("name", "advice"),
     [
-        ("f.cine", "export its frames as DNG or 16-bit TIFF, without demosaicing"),
-        ("f.MRAW", "export its frames"),
+        ("f.MRAW", "export its frames as DNG or 16-bit TIFF, without demosaicing"),
         ("f.avi", "compressed or demosaiced: export them from the camera's own file"),
         ("f.jpg", "no raw frame: let the camera record DNG"),
         ("f.RAW", "header: state its shape and dtype .*frames.shape and frames.dtype, or --shape and --dtype"),

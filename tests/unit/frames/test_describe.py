@@ -1,0 +1,129 @@
+"""What a reader sees of files, folders and patterns, and the frames that are saved from them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from cine_files import even_times, write_cine
+from frames import noisy_mosaic
+
+from rgbmidic.errors import FrameError, InputError
+from rgbmidic.frames import write_dng, write_tiff
+from rgbmidic.frames.describe import describe, save_frame
+from rgbmidic.settings import FrameSettings
+
+KEYS = [
+    *("reader", "count", "shape", "cfa", "bit_depth", "black_level", "white_level"),
+    *("frame_rate", "exposure", "trigger", "lost_frames"),
+]
+
+
+def _seen(path: Path, **stated: Any) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads(describe(FrameSettings(path=(str(path),), **stated)).as_json())
+    assert set(KEYS) < set(told)
+    return told
+
+
+def _movie(path: Path, **options: Any) -> Any:
+    frames = np.random.default_rng(1).integers(0, 4096, (6, 12, 16))
+    times = even_times(6, 2000, first=-2, lost=(1, 4))
+    write_cine(path, frames, count=6, first=-2, rate=2000, times_ns=times, exposure_ns=250_000, **options)
+    return frames
+
+
+def test_a_movie_tells_all(tmp_path: Path) -> None:
+    _movie(tmp_path / "f.cine", cfa="GBRG")
+    seen = _seen(tmp_path / "f.cine")
+    values = ["Phantom .cine", 6, [12, 16], "GBRG", 12, 64, 4064, 2000, 0.00025, 2, 2]
+    assert [seen[key] for key in KEYS] == values
+    assert (seen["kind"], seen["first_time_ns"], seen["last_time_ns"]) == ("bayer", -1_000_000, 2_500_000)
+    assert seen["warnings"] == []
+
+
+def test_what_nobody_tells_is_null_and_what_is_stated_is_told(tmp_path: Path) -> None:
+    write_tiff(tmp_path / "f.tif", noisy_mosaic((24, 30)))
+    seen = _seen(tmp_path / "f.tif")
+    assert [seen[key] for key in KEYS] == ["TIFF", 1, [24, 30], None, None, None, None, None, None, None, None]
+    stated = _seen(tmp_path / "f.tif", cfa="BGGR", black_level=64.0, white_level=4000.0)
+    assert (stated["cfa"], stated["kind"], stated["black_level"], stated["white_level"]) == ("BGGR", "bayer", 64, 4000)
+    assert _seen(tmp_path / "f.tif", kind="monochrome")["kind"] == "monochrome"
+
+
+def test_a_folder_and_a_pattern_are_counted_with_what_is_lost(tmp_path: Path) -> None:
+    for number in (1, 2, 5):
+        write_dng(tmp_path / f"f{number}.dng", noisy_mosaic((24, 30), black=np.array([[60, 61], [62, 63]])))
+    for path in (tmp_path, tmp_path / "*.dng"):
+        seen = _seen(path)
+        assert (seen["count"], seen["shape"], seen["lost_frames"]) == (3, [24, 30], 2)
+        assert (seen["cfa"], seen["black_level"], seen["white_level"]) == ("RGGB", [60, 61, 62, 63], 4095)
+
+
+def test_text_has_a_line_for_what_is_known(tmp_path: Path) -> None:
+    _movie(tmp_path / "f.cine")
+    lines = describe(FrameSettings(path=(str(tmp_path / "f.cine"),))).as_text().splitlines()
+    assert lines[:3] == ["reader         Phantom .cine", "count          6", "shape          12, 16"]
+    assert not any(line.startswith("cfa") for line in lines)
+
+
+def test_a_truncated_movie_is_described_and_its_end_told(tmp_path: Path) -> None:
+    path = tmp_path / "f.cine"
+    _movie(path)
+    path.write_bytes(path.read_bytes()[:-400])
+    seen = _seen(path)
+    assert seen["count"] == 6
+    assert "ends after frame 3 of 6 (0 to 5): truncated or still being written" in seen["warnings"][0]
+
+
+def test_what_is_stated_must_agree_with_the_file(tmp_path: Path) -> None:
+    _movie(tmp_path / "f.cine", cfa="GBRG")
+    with pytest.raises(FrameError, match="cfa is stated as RGGB, but"):
+        _seen(tmp_path / "f.cine", cfa="RGGB")
+
+
+@pytest.mark.parametrize("options", [{}, {"cfa": "GBRG"}, {"compression": 2}])
+def test_a_saved_frame_has_the_raw_values(tmp_path: Path, options: dict[str, Any]) -> None:
+    frames = _movie(tmp_path / "f.cine", **options)
+    settings = FrameSettings(path=(str(tmp_path / "f.cine"),))
+    save_frame(settings, 4, tmp_path / "frame.tif")
+    saved = tifffile.imread(tmp_path / "frame.tif")
+    assert saved.dtype == np.uint16
+    np.testing.assert_array_equal(saved, frames[4])
+
+
+def test_a_frame_is_saved_over_another_only_where_told(tmp_path: Path) -> None:
+    frames = _movie(tmp_path / "f.cine")
+    settings, out = FrameSettings(path=(str(tmp_path / "f.cine"),)), tmp_path / "frame.tif"
+    save_frame(settings, 0, out)
+    with pytest.raises(InputError, match=r"frame\.tif exists already; --overwrite replaces it"):
+        save_frame(settings, 1, out)
+    save_frame(settings, 1, out, overwrite=True)
+    np.testing.assert_array_equal(tifffile.imread(out), frames[1])
+
+
+@pytest.mark.parametrize(
+    ("index", "name", "reason"),
+    [
+        (6, "a.tif", r"no frame 6: .*f\.cine holds 6 \(0 to 5\)"),
+        (-1, "a.tif", "no frame -1"),
+        (0, "a.png", r"saved as \.tif, not as .*a\.png"),
+        (0, "none/a.tif", "there is no folder .*none"),
+    ],
+)
+def test_what_cannot_be_saved_is_said(tmp_path: Path, index: int, name: str, reason: str) -> None:
+    _movie(tmp_path / "f.cine")
+    with pytest.raises(InputError, match=reason):
+        save_frame(FrameSettings(path=(str(tmp_path / "f.cine"),)), index, tmp_path / name)
+
+
+def test_real_files(shared_data: Path) -> None:
+    chart = _seen(shared_data / "cine_color_packed10" / "chart1.cine")
+    assert [chart[key] for key in KEYS[:8]] == ["Phantom .cine", 1, [1080, 2048], "GBRG", 12, 64, 4064, 25]
+    assert (chart["trigger"], chart["lost_frames"]) == (123, 0)
+    assert chart["exposure"] == pytest.approx(0.02, rel=1e-3)
+    dng = _seen(shared_data / "raw_colorchart_dng")
+    assert (dng["count"], dng["kind"]) == (1, "bayer")
