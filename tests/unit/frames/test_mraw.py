@@ -26,7 +26,7 @@ def _frames(bits: int, count: int = 5) -> np.ndarray[Any, Any]:
 
 
 def _source(path: Path, **stated: Any) -> FrameSource:
-    return open_source(path, FrameSettings(path=("frame",), **({"kind": "monochrome"} if not stated else stated)))
+    return open_source(path, FrameSettings(path=("frame",), **(stated or {"kind": "monochrome"})))
 
 
 def _series(path: Path) -> FrameSeries:
