@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from mraw_files import pack_bits, write_mraw
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames import FrameSeries, Mosaic, open_series, open_source
+from rgbmidic.frames import FrameSeries, Mosaic, mraw, open_series, open_source
 from rgbmidic.frames.layout import unpack_bits
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.settings import FrameSettings
@@ -151,6 +152,29 @@ def test_a_folder_with_movies_only_names_one(tmp_path: Path) -> None:
     write_mraw(tmp_path, _frames(12), bits=12)
     with pytest.raises(FrameError, match=r"folder without frames.*movie\.cihx is a movie .*name the movie itself"):
         _series(tmp_path)
+
+
+def test_the_header_is_read_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed: list[int] = []
+    lines = mraw._lines
+    monkeypatch.setattr(mraw, "_lines", lambda content: parsed.append(len(content)) or lines(content))
+    source = _source(write_mraw(tmp_path, _frames(8), bits=8, ending=".cih"))
+    for index in range(5):
+        source.read(index)
+    assert len(parsed) == 1
+    write_mraw(tmp_path, _frames(8, 11), bits=8, ending=".cih")
+    assert (len(source), len(parsed)) == (11, 2)
+
+
+def test_a_movie_of_many_gigabytes_is_read_frame_by_frame(tmp_path: Path) -> None:
+    path = write_mraw(tmp_path, np.zeros((1, 1024, 1024), dtype=np.uint16), bits=12, **{"Total Frame": 20_000})
+    with path.open("r+b") as file:
+        file.seek(19_999 * 3 * 2**19)  # 31 GB, a hole in the disk
+        file.write(pack_bits(np.full(2**20, 0xABC), 12))
+    tracemalloc.start()
+    assert (_source(path).read(19_999).values == 0xABC).all()
+    assert tracemalloc.get_traced_memory()[1] < 30e6
+    tracemalloc.stop()
 
 
 def test_a_movie_that_ends_early_gives_its_whole_frames(tmp_path: Path) -> None:
