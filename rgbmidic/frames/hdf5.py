@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.errors import FrameError, RgbmidicError
-from rgbmidic.frames.layout import check_count, cut_short
+from rgbmidic.frames.layout import MAXIMUM_FRAMES, check_count, cut_short
 from rgbmidic.frames.npy import StackShape
 from rgbmidic.frames.recording import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
@@ -79,6 +79,7 @@ class Hdf5File(Movie):
         if name not in headers:
             told = ", ".join(headers) or "none"
             raise FrameError(f"{self.path} has no dataset of frames {name}; those there are: {told}")
+        check_count(self.path, headers[name].stack.count)
         return headers[name]
 
 
@@ -117,7 +118,7 @@ def _headers(path: Path) -> dict[str, _Header]:
             stack = StackShape.of(item.shape or (), item.dtype, name)
         except (FrameError, TypeError):
             return
-        found[f"/{name}"] = _Header(name=name, stack=stack, recording=_recording(item, stack.count, path))
+        found[f"/{name}"] = _Header(name=name, stack=stack, recording=_recording(item, stack.count))
 
     with _opened(path) as file:
         file.visititems(look)
@@ -136,9 +137,10 @@ def _only(headers: dict[str, _Header], path: Path) -> str:
     )
 
 
-def _recording(dataset: h5py.Dataset, count: int, path: Path) -> Recording:
+def _recording(dataset: h5py.Dataset, count: int) -> Recording:
     """From the attributes `times_ns` (one whole number a frame) or `frame_rate`."""
-    check_count(path, count)
+    if count > MAXIMUM_FRAMES:  # refused when it is asked for: another dataset may be meant
+        return Recording(count=count)
     rate, times = dataset.attrs.get("frame_rate"), dataset.attrs.get("times_ns")
     known = rate is not None and np.ndim(rate) == 0 and np.isreal(rate) and 1e-3 <= float(rate) <= 1e12
     if times is not None and np.shape(times) == (count,) and np.asarray(times).dtype.kind in "iu":

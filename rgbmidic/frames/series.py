@@ -167,8 +167,7 @@ def open_series(
         `FrameSeries.read` to tell.
     """
     files = [list_frames(text, base) for text in settings.path]
-    # a movie and its header, both matched by a pattern, are one source
-    lights = tuple(tuple(dict.fromkeys(open_source(path, settings, camera) for path in paths)) for paths in files)
+    lights = tuple(_sources(paths, settings, camera) for paths in files)
     _check_counts(settings, lights)
     numbers = _numbers(settings, lights) if in_order else ()
     if settings.lights > 1:
@@ -178,6 +177,12 @@ def open_series(
         series = FrameSeries(lights=lights, numbers=numbers)
     _check_sizes(series)
     return replace(series, chosen=_chosen(settings, len(series)))
+
+
+def _sources(paths: Sequence[Path], settings: FrameSettings, camera: Camera | None) -> tuple[FrameSource, ...]:
+    """One for each file; a movie in two files, samples and header, is one source where a pattern matches both."""
+    sources = [open_source(path, settings, camera) for path in paths]
+    return tuple({source.path: source for source in sources}.values())
 
 
 def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

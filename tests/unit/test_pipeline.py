@@ -288,6 +288,20 @@ def test_lights_fired_in_succession_are_solved_together(tmp_path):
     assert len(result.inputs) == 6
 
 
+def test_lights_in_turn_in_one_stack_give_what_two_series_give(tmp_path):
+    write_series(tmp_path / "left", 0)
+    write_series(tmp_path / "right", 1)
+    names = [f"{light}/frame_{number}.tif" for number in range(3) for light in ("left", "right")]
+    frames = [read_frame(tmp_path / name, kind="monochrome").values[0] for name in names]
+    np.save(tmp_path / "stack.npy", np.stack(frames))
+    two = measure(settings_of(tmp_path, f'path = ["left", "right"]\n{STATED}'), tmp_path / "two")
+    one = measure(settings_of(tmp_path, f'path = "stack.npy"\nlights = 2\n{STATED}'), tmp_path / "one")
+    assert (one.status == Status.CONVERGED).all()
+    assert one.names[1] == "stack.npy frame 2 + stack.npy frame 3"
+    for quantity in ("u", "v", "residual", "status"):
+        np.testing.assert_array_equal(getattr(one, quantity), getattr(two, quantity))
+
+
 def test_lights_in_succession_must_have_equally_many_frames(tmp_path):
     write_series(tmp_path / "left", 0)
     write_series(tmp_path / "right", 1, MOTIONS[:2])

@@ -104,7 +104,6 @@ def test_what_is_no_raw_frame_is_refused(tmp_path: Path) -> None:
     cases: dict[str, tuple[dict[str, Any], np.ndarray[Any, Any]]] = {
         "32": ({}, GREY.astype(np.float32)),
         "int16": ({}, GREY.astype(np.int16)),
-        "2 frames": ({"photometric": "minisblack"}, np.stack([GREY, GREY])),
         "samples of shape": ({"photometric": "rgb"}, alpha),
     }
     for reason, (options, values) in cases.items():
@@ -278,11 +277,13 @@ def test_levels_that_contradict_each_other_are_no_fault_of_the_file(tmp_path: Pa
         read_frame(tmp_path / "f.tif", black_level=64, white_level=10)
 
 
+MOVIES = ("mp4", "avi", "MOV", "mkv", "wmv")
+
+
 @pytest.mark.parametrize(
     ("name", "advice"),
     [
-        ("f.MRAW", "export its frames as DNG or 16-bit TIFF, without demosaicing"),
-        ("f.avi", "compressed or demosaiced: export them from the camera's own file"),
+        *((f"f.{ending}", "demosaiced, so .* no longer the sensor's: give the camera's own file") for ending in MOVIES),
         ("f.jpg", "no raw frame: let the camera record DNG"),
         ("f.RAW", "header: state its shape and dtype .*frames.shape and frames.dtype, or --shape and --dtype"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,15 +14,16 @@ import pytest
 from frames import noisy_mosaic
 from hypothesis import given
 from hypothesis import strategies as st
+from seq_files import write_seq
 
-from rgbmidic.errors import FrameError
+from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.frames import FrameSeries, FrameSource, file_hash, formats, list_frames, open_series
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.formats import FrameFormat
 from rgbmidic.frames.stored import StoredFrame
 from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.settings import FrameSettings
+from rgbmidic.settings import FrameSettings, TestSettings
 
 
 def _write(folder: Path, names: list[str], shape: tuple[int, int] = (24, 30)) -> None:
@@ -192,6 +194,87 @@ def test_reference_must_exist(tmp_path: Path) -> None:
     _write(tmp_path, ["f1.tif", "f2.tif"])
     with pytest.raises(FrameError, match=r"reference names frame 2, but there are 2 \(0 to 1\)"):
         open_series(FrameSettings(path=("*.tif",), cfa="RGGB", reference=(0, 2)), tmp_path)
+
+
+GREYS = np.arange(10, 130, 10)
+"""Grey level of each frame of a stack."""
+
+
+def _in_turn(folder: Path, lost: Sequence[int] = (), **stated: Any) -> FrameSeries:
+    """A monochrome camera's stack, frame i of grey level 10 (i + 1), without some frames but with their times."""
+    kept = [index for index in range(len(GREYS)) if index not in lost]
+    frames = np.broadcast_to(GREYS[kept, None, None], (len(kept), 12, 16)).astype(np.uint8)
+    write_seq(folder / "m.seq", frames, bits=8, times_us=[250 * index for index in kept])
+    return open_series(FrameSettings(path=("m.seq",), kind="monochrome", **stated), folder)
+
+
+def _levels(series: FrameSeries) -> list[list[int]]:
+    return [[int(frame.values[0, 0, 0]) for frame in series.read(index)] for index in range(len(series))]
+
+
+def test_lights_that_fire_in_turn_share_one_series(tmp_path: Path) -> None:
+    series = _in_turn(tmp_path, lights=2)
+    assert _levels(series) == GREYS.reshape(-1, 2).tolist()
+    assert (list(series.numbers), series.lost, list(series.chosen)) == ([0, 1, 2, 3, 4, 5], 0, [0, 1, 2, 3, 4, 5])
+    assert (series.name(1), series.time_ns(1)) == ("m.seq frame 2 + m.seq frame 3", 500_000)
+    assert _levels(_in_turn(tmp_path, lights=3)) == GREYS.reshape(-1, 3).tolist()
+    assert len(_in_turn(tmp_path, lights=5)) == 2  # two frames are left over
+    with pytest.raises(FrameError, match="13 lights in turn, but no 13 frames make a state"):
+        _in_turn(tmp_path, lights=13)
+
+
+@pytest.mark.parametrize(
+    ("lost", "levels", "numbers"),
+    [
+        ((4,), [[10, 20], [30, 40], [70, 80], [90, 100], [110, 120]], [0, 1, 3, 4, 5]),
+        ((5,), [[10, 20], [30, 40], [70, 80], [90, 100], [110, 120]], [0, 1, 3, 4, 5]),
+        ((5, 6), [[10, 20], [30, 40], [90, 100], [110, 120]], [0, 1, 4, 5]),
+        ((4, 5), [[10, 20], [30, 40], [70, 80], [90, 100], [110, 120]], [0, 1, 3, 4, 5]),
+    ],
+)
+def test_a_lost_frame_drops_its_state_and_shifts_no_light(
+    tmp_path: Path, lost: tuple[int, ...], levels: list[list[int]], numbers: list[int]
+) -> None:
+    series = _in_turn(tmp_path, lost, lights=2)
+    assert (_levels(series), list(series.numbers)) == (levels, numbers)
+    assert series.lost == 6 - len(levels)
+
+
+def test_with_lights_in_turn_all_keys_count_states(tmp_path: Path) -> None:
+    series = _in_turn(tmp_path, lights=2, first=1, last=5, step=2, reference=(0, 5))
+    assert list(series.chosen) == [1, 3, 5]
+    with pytest.raises(FrameError, match=r"frames\.last names frame 6, but there are 6 \(0 to 5\)"):
+        _in_turn(tmp_path, lights=2, last=6)
+    with pytest.raises(FrameError, match=r"frames\.reference names frame 5, but there are 5 \(0 to 4\)"):
+        _in_turn(tmp_path, (4,), lights=2, reference=(0, 5))
+
+
+def test_first_last_and_step_choose_frames(tmp_path: Path) -> None:
+    assert list(_in_turn(tmp_path).chosen) == list(range(12))
+    chosen = _in_turn(tmp_path, first=3, last=9, step=3)
+    assert (list(chosen.chosen), len(chosen), chosen.lost) == ([3, 6, 9], 12, 0)
+    assert list(_in_turn(tmp_path, first=10).chosen) == [10, 11]
+    assert _in_turn(tmp_path, (7,), first=4).lost == 1
+    assert _in_turn(tmp_path, (7,), last=4).lost == 0
+    for key in ("first", "last"):
+        with pytest.raises(FrameError, match=rf"frames\.{key} names frame 12, but there are 12 \(0 to 11\)"):
+            _in_turn(tmp_path, **{key: 12})
+
+
+def test_the_reference_may_be_a_range(tmp_path: Path) -> None:
+    _in_turn(tmp_path)
+    for text, frames in (("0:5", (0, 1, 2, 3, 4)), (" 7 : 9 ", (7, 8))):
+        document = {"frames": {"path": "m.seq", "kind": "monochrome", "reference": text}}
+        stated = TestSettings.from_mapping({**document, "region": {"rectangle": [2, 2, 9, 9]}}, tmp_path).frames
+        assert stated.reference == frames
+        assert len(open_series(stated, tmp_path)) == 12
+    with pytest.raises(FrameError, match="reference names frame 12, but there are 12"):
+        open_series(replace(stated, reference=tuple(range(5, 13))), tmp_path)
+    for text in ("5:5", "5", "a:b", "-1:3", "0:5:2"):
+        with pytest.raises(ConfigurationError, match=r"frames\.reference must be a range such as \"0:20\" \(0 to 19\)"):
+            TestSettings.from_mapping(
+                {"frames": {"path": "m.seq", "reference": text}, "region": {"rectangle": [2, 2, 9, 9]}}, tmp_path
+            )
 
 
 class _Film(FrameSource):
