@@ -85,7 +85,7 @@ def write_cine(
     blocks = _block(1002, np.array(stamps, dtype="<u8")) + _block(1003, np.full(count, exposure, dtype="<u4"))
     table = 84 + setup_length + len(blocks)
     pointer = "<i8" if version else "<u4"
-    size = rows * columns * bits // 8
+    size = -(-rows * columns * bits // 8)
     begin = table + count * np.dtype(pointer).itemsize
     step = 8 + len(annotation) + size
     kind = (2 if cfa else 0) if compression is None else compression

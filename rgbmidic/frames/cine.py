@@ -97,12 +97,11 @@ class CineFile(Movie):
 @remembered
 def _header(path: Path) -> CineHeader:
     header = read_header(path)
-    if not header.coded:
+    if not header.coded or header.white_level >= len(_LINEAR):
         return header
-    # what the header tells of levels are codes like the samples
+    # levels of 10 bit are codes as the samples are
     black = None if header.black_level is None else int(_LINEAR[header.black_level])
-    recording = replace(header.recording, bit_depth=12)
-    return replace(header, recording=recording, black_level=black, white_level=int(_LINEAR[header.white_level]))
+    return replace(header, black_level=black, white_level=int(_LINEAR[header.white_level]))
 
 
 def _samples(header: CineHeader, lines: npt.NDArray[np.uint8]) -> AnyArray:

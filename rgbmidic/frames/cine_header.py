@@ -71,7 +71,7 @@ class CineHeader:
     kind, cfa
         Pattern of the frame's first pixels; None where the header does not tell.
     black_level, white_level
-        Grey levels as the samples are stored; no black level where that of the header cannot be.
+        Grey levels as the header tells them; no black level where that cannot be.
     recording
         How the frames were recorded.
     pointers : ndarray, shape (count,), int64
@@ -236,9 +236,9 @@ def _bits(path: Path, bit_count: int, packing: int) -> int:
 
 
 def _depth(bits: int, real: int, levels: int) -> int:
-    """Bits of a sample as it is stored: the header's number, else as its number of levels needs."""
+    """Bits of a sample, packed 10 bit being a code for 12: the header's number, else as its number of levels needs."""
     if bits in (10, 12):
-        return bits
+        return 12
     return next((told for told in (real, (levels - 1).bit_length()) if 8 <= told <= bits), bits)
 
 
