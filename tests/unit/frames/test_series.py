@@ -154,7 +154,7 @@ def test_a_link_to_nothing_keeps_its_place_and_is_told(tmp_path: Path, pattern: 
 def test_a_folder_without_frames_says_what_to_do_with_what_it_holds(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     (tmp_path / "test.cine").touch()
-    with pytest.raises(FrameError, match=r"without frames.*test\.cine is a camera's movie: name the file itself"):
+    with pytest.raises(FrameError, match=r"without frames.*test\.cine is a movie or a stack: .* name the movie itself"):
         list_frames(tmp_path)
 
 

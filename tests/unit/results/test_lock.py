@@ -92,9 +92,9 @@ def test_parts_are_written_side_by_side_and_exclude_only_each_other(tmp_path: Pa
                 ResultStore.join(out, origin, frames=frames)
         with pytest.raises(ResultError, match="in use"):
             ResultStore.create(out, origin, overwrite=True)
-        with pytest.raises(InputError, match="frames 0 to 1 of 4 are written here"):
-            first.write_frame(2, random_record(2))
-        for store, index in ((second, 3), (first, 1), (second, 2)):
+        with pytest.raises(InputError, match="no frame 4 in a result of 4"):
+            first.write_frame(4, random_record(2))
+        for store, index in ((second, 3), (first, 1), (first, 2), (second, 2)):  # one needs a frame of the other
             store.write_frame(index, random_record(index))
         with pytest.raises(ResultError, match="frame 0"):
             finish_result(out)
