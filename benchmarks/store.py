@@ -2,8 +2,8 @@
 
     python benchmarks/store.py [--frames 100000] [--large 500] [--folder DIR]
 
-Frames hold noise, so nothing but plain pictures can be packed. Figures are of a file that the system has just written
-and still holds in memory, where it does: the disk's own speed comes on top.
+Frames hold noise, so nothing but plain pictures can be packed. Times are the processor's, so that a busy machine counts
+little; the files were just written and are still in memory, where they fit: the disk's own speed comes on top.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ def write(folder: Path, record: FrameRecord, frames: int) -> list[float]:
     times = []
     with ResultStore.create(folder, origin, overwrite=True) as store:
         for index in range(frames):
-            started = time.perf_counter()
+            started = time.process_time()
             store.write_frame(index, record)
-            times.append(time.perf_counter() - started)
+            times.append(time.process_time() - started)
         row("finish", timed(store.finish)[0], "s")
     return times
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds that it takes, and what it gives."""
-    started = time.perf_counter()
+    """Seconds of the processor that it takes, and what it gives."""
+    started = time.process_time()
     made = work()
-    return time.perf_counter() - started, made
+    return time.process_time() - started, made
 
 
 def row(what: str, value: float, unit: str) -> None:

@@ -134,7 +134,7 @@ def test_the_reference_is_left_out_of_what_happens_over_the_frames(tmp_path: Pat
     settings = TestSettings(
         frames=FrameSettings(path=("*",), reference=(1, 3)), region=RegionSettings(rectangle=(0, 0, 9, 9))
     )
-    result = make_result(tmp_path / "out", frames=6, settings=settings)
+    result = make_result(tmp_path / "out", frames=6, settings=settings, references=(1, 3))
     for figure in (figures.residual_figure(result), figures.brightness_figure(result)):
         for line in (line for axis in figure.axes for line in axis.lines):
             assert line.get_xdata().tolist() == [0, 2, 4, 5]
