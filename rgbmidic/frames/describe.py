@@ -35,9 +35,10 @@ class Description:
     kind, cfa
         What the frames are, and the Bayer pattern of their first pixels.
     bit_depth
-        Bits of a sample.
+        Bits of a sample: of the camera where the file tells it, else of the file.
     black_level, white_level
-        Grey levels (DN); four black levels where they differ over the positions of the 2x2 cell.
+        Grey levels (DN) that a run takes, told or not; four black levels where they differ over the positions of the
+        2x2 cell.
     frame_rate
         Frames per second, as the camera was set.
     exposure
@@ -57,9 +58,9 @@ class Description:
     shape: tuple[int, int]
     kind: str | None
     cfa: str | None
-    bit_depth: int | None
-    black_level: float | tuple[float, ...] | None
-    white_level: float | None
+    bit_depth: int
+    black_level: float | tuple[float, ...]
+    white_level: float
     frame_rate: float | None
     exposure: float | None
     trigger: int | None
@@ -103,9 +104,9 @@ def describe(settings: FrameSettings) -> Description:
         shape=(frame.values.shape[-2], frame.values.shape[-1]),
         kind="bayer" if cfa else settings.kind or stored.kind,
         cfa=cfa,
-        bit_depth=recording.bit_depth,
-        black_level=settings.black_level if stored.black_level is None else _level(stored.black_level),
-        white_level=settings.white_level if stored.white_level is None else stored.white_level,
+        bit_depth=recording.bit_depth or stored.bits or 8 * stored.values.itemsize,
+        black_level=_level(frame.black_level),
+        white_level=frame.white_level,
         frame_rate=recording.frame_rate,
         exposure=None if recording.exposure_ns is None else recording.exposure_ns / _SECOND,
         trigger=recording.trigger,
