@@ -37,7 +37,7 @@ def bspline_coefficients(image, out):
 @over_ranges("values", axis=1, grain=_BLOCK)
 @compiled(fastmath=_FAST)
 def _filter_columns(start, stop, values):
-    """Turn the columns of `values` into B-spline coefficients in place (mirror boundary); inner loops run along memory."""
+    """Turn the columns of `values` into B-spline coefficients in place (mirror boundary), side by side in memory."""
     n = values.shape[0]
     if n == 1:
         return

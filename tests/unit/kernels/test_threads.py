@@ -28,6 +28,7 @@ class Counted:
     def __init__(self):
         self.ranges = []
 
+    @staticmethod
     def py_func(start, stop, other, items): ...
 
     __name__ = "counted"
