@@ -8,8 +8,8 @@ element's origin pixel: float32 then resolves 1e-5 px on images of any size.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.interpolation import _FAST, PAD
 from rgbmidic._kernels.threads import over_ranges
 
@@ -29,7 +29,7 @@ _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath=_FAST)
+@helper(forceinline=True, fastmath=_FAST)
 def _spline(coefficients, row, column, tx, ty):
     """Cubic B-spline value at pixel (row, column) plus the fraction (tx, ty); `coefficients` carry the padding."""
     t2 = tx * tx
@@ -78,7 +78,7 @@ def _spline(coefficients, row, column, tx, ty):
     )
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
+@helper(forceinline=True)
 def _place(px, py, base_x, base_y, height, width):
     """Pixel (column, row) and fraction of a local position, and whether it lies outside the image."""
     cx = np.floor(px)
@@ -92,7 +92,7 @@ def _place(px, py, base_x, base_y, height, width):
     return column, row, tx, ty, beyond_x or beyond_y
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
+@helper(forceinline=True)
 def _element_motion(displacement, elements, barycentric, origin, e):
     """Affine displacement of element e about its origin pixel: whole-pixel part, constant rest and slopes."""
     ux = uy = uxx = uxy = uyx = uyy = 0.0
@@ -121,10 +121,10 @@ def _element_motion(displacement, elements, barycentric, origin, e):
 
 
 @over_ranges("elements")
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def element_right_side(
-    start, stop, coefficients, reference, gradient_x, gradient_y, weight, local_x, local_y, offsets, origin, elements, barycentric,
-    displacement, out, sums,
+    start, stop, coefficients, reference, gradient_x, gradient_y, weight, local_x, local_y, offsets, origin, elements,
+    barycentric, displacement, out, sums,
 ):  # fmt: skip
     """Right-hand side of one light, element by element.
 
@@ -190,7 +190,7 @@ def element_right_side(
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_y, offsets, barycentric, out):
     """Hessian (correlation matrix) of one light: ``out`` (E, 3, 3, 3) receives ``sum w D phi_a phi_b``.
 
@@ -253,7 +253,7 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
 
 
 @over_ranges("elements")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def warp(start, stop, coefficients, local_x, local_y, offsets, origin, elements, barycentric, displacement, out):
     """Deformed image brought back to the reference: ``out`` (P,) float32 receives g(x + u), NaN outside the image."""
     height = coefficients.shape[0] - 2 * PAD
@@ -271,7 +271,7 @@ def warp(start, stop, coefficients, local_x, local_y, offsets, origin, elements,
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def element_moments(start, stop, reference, warped, weight, offsets, out):
     """Weighted moments of reference and warped deformed image: ``out`` (E, 6) receives the sums of
     w, w f, w g, w f f, w f g, w g g over the pixels with weight and a finite g."""
@@ -293,7 +293,7 @@ def element_moments(start, stop, reference, warped, weight, offsets, out):
 
 
 @over_ranges("elements")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def pull_back(start, stop, deformed_weight, reference_weight, local_x, local_y, offsets, origin, elements, barycentric,
               displacement, out):  # fmt: skip
     """Weight of each owned pixel: the reference's times the deformed image's at the displaced position (bilinear).
@@ -322,7 +322,7 @@ def pull_back(start, stop, deformed_weight, reference_weight, local_x, local_y, 
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def element_vector(start, stop, first, second, local_x, local_y, offsets, barycentric, out):
     """Projection of two pixel fields on the shape functions: ``out`` (E, 3, 2) receives their sums times phi."""
     for e in range(start, stop):
@@ -348,7 +348,7 @@ def element_vector(start, stop, first, second, local_x, local_y, offsets, baryce
 
 
 @over_ranges("elements")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, barycentric, out):
     """Nodal field (N, 2) at the owned pixels: ``out`` (2, P) float32."""
     for e in range(start, stop):
@@ -364,7 +364,7 @@ def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, 
 
 
 @over_ranges("elements")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def curvature_deviation(start, stop, nodes, elements, curvature, local_x, local_y, offsets, barycentric, out):
     """Deviation of a curved field from its linear interpolant, ``out`` (2, P) float32.
 
@@ -383,7 +383,7 @@ def curvature_deviation(start, stop, nodes, elements, curvature, local_x, local_
                 out[c, i] = half_01 * l0 * l1 + half_12 * l1 * l2 + half_20 * l2 * l0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _half_sag(nodes, a, b, curvature, e, c):
     """Half the second difference of component c along the edge from node a to node b of element e."""
     dx = nodes[a, 0] - nodes[b, 0]

@@ -6,8 +6,8 @@ of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
 """
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["PAD", "malvar", "pad_mosaic"]
@@ -16,7 +16,7 @@ PAD = 2
 """Pixels added on every side by `pad_mosaic`."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _mirror(index, size):
     period = 2 * (size - 1)
     index = abs(index) % period
@@ -24,7 +24,7 @@ def _mirror(index, size):
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def pad_mosaic(start, stop, values, invalid, out):
     """Copy (H, W) `values` into (H + 4, W + 4) `out`, mirrored at the borders, NaN where `invalid`; H, W >= 2."""
     rows, columns = values.shape
@@ -40,10 +40,10 @@ def pad_mosaic(start, stop, values, invalid, out):
 
 
 @over_ranges("out", axis=1)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def malvar(start, stop, padded, red_row, red_column, out):
     """Bilinear average corrected by the Laplacian of the sampled channel (Malvar 2004); fills (3, H, W) `out`."""
-    rows, columns = out.shape[1:]
+    columns = out.shape[2]
     for i in range(start, stop):
         above2, above, here, below, below2 = padded[i], padded[i + 1], padded[i + 2], padded[i + 3], padded[i + 4]
         in_red_row = i % 2 == red_row

@@ -1,8 +1,8 @@
 """Compiled loops between the owned pixels and coarse grids of square blocks."""
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["block_index", "block_sums", "grid_at_pixels", "score_sums"]
@@ -12,7 +12,7 @@ _SLAB = 16384
 
 
 @over_ranges("out", grain=_SLAB)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def block_index(start, stop, rows, columns, top, left, block, width, out):
     """Number of the block (of a grid `width` blocks wide) in which each pixel lies: ``out`` (P,) int32."""
     for i in range(start, stop):
@@ -20,7 +20,7 @@ def block_index(start, stop, rows, columns, top, left, block, width, out):
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def block_sums(start, stop, values, index, out):
     """Sums of fields (n, P) over blocks: ``out`` (n, B), zero before."""
     for n in range(start, stop):
@@ -29,7 +29,7 @@ def block_sums(start, stop, values, index, out):
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def score_sums(start, stop, residual, weight, gradient_x, gradient_y, index, out):
     """Per light, sums over blocks of ``w r gx``, ``w r gy``, ``w (gx gx + gy gy)`` and of the pixels with weight.
 
@@ -49,7 +49,7 @@ def score_sums(start, stop, residual, weight, gradient_x, gradient_y, index, out
 
 
 @over_ranges("out", grain=_SLAB)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def grid_at_pixels(start, stop, grid, rows, columns, top, left, block, out):
     """A grid of blocks interpolated linearly between their centres, level beyond the outer ones: ``out`` (P,)."""
     height, width = grid.shape

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["PAD", "bspline_coefficients", "sample_with_gradient"]
@@ -35,9 +35,9 @@ def bspline_coefficients(image, out):
 
 
 @over_ranges("values", axis=1, grain=_BLOCK)
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _filter_columns(start, stop, values):
-    """Turn the columns of `values` into B-spline coefficients in place (mirror boundary), the inner loops along memory."""
+    """Turn the columns of `values` into B-spline coefficients in place (mirror boundary), side by side in memory."""
     n = values.shape[0]
     if n == 1:
         return
@@ -67,7 +67,7 @@ def _filter_columns(start, stop, values):
 
 
 @over_ranges("rows")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def _filter_rows(start, stop, rows):
     """The same along each of `rows` (H, W + 2 PAD), whose ends then mirror what lies inside."""
     n = rows.shape[1] - 2 * PAD
@@ -80,7 +80,7 @@ def _filter_rows(start, stop, rows):
             line[n - 1 + p] = line[max(n - 1 - p, 0)]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _filter_line(line, n):
     z = _POLE
     first = line[0]
@@ -96,7 +96,7 @@ def _filter_line(line, n):
         line[i] = z * (line[i + 1] - line[i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _mirrored(i, n):
     """Sample of n > 1 that stands for the i-th, mirrored about the last and the first."""
     j = i % (2 * n - 2)
@@ -104,7 +104,7 @@ def _mirrored(i, n):
 
 
 @over_ranges("x", grain=4096)
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gradient_y):
     """Value and spatial gradient of the spline at the points (x, y), 1-D float64; points outside are clamped.
 
@@ -135,7 +135,7 @@ def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gra
         gradient_y[i] = gy
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@helper(fastmath=_FAST)
 def _weights(t):
     """The four cubic B-spline weights at the fraction t behind the second sample, and their slopes."""
     t2, rest = t * t, 1.0 - t

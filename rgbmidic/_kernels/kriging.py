@@ -1,8 +1,8 @@
 """Compiled loops of the reconstruction by local linear prediction: fixed filters per tile, chosen from a table."""
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.texture import expand_row
 from rgbmidic._kernels.threads import over_ranges
 
@@ -12,7 +12,7 @@ TILE = 16
 """Side in px of the squares within which the filters are the same."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _channel(i, j, red_row, red_column):
     if i % 2 == red_row:
         return 0 if j % 2 == red_column else 1
@@ -20,7 +20,7 @@ def _channel(i, j, red_row, red_column):
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def fill_unknown(start, stop, padded, share, red_row, red_column, pad, out, unknown):
     """Replace samples that are NaN by what the known ones around tell of the common texture.
 
@@ -51,33 +51,39 @@ def fill_unknown(start, stop, padded, share, red_row, red_column, pad, out, unkn
 
 
 # contraction to fused multiply-add alone: NaN and infinity keep their meaning
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _add_five(line, c0, c1, c2, c3, c4, total):
-    for j in range(total.size):
-        total[j] += (
-            c0[j] * line[j] + c1[j] * line[j + 1] + c2[j] * line[j + 2] + c3[j] * line[j + 3] + c4[j] * line[j + 4]
-        )
+@helper(fastmath={"contract"})
+def _add_taps(line, lines, first, size, total):
+    """Add the products of a row of samples with the `size` filters `lines` from `first`, five at a time."""
+    b = 0
+    while b + 5 <= size:
+        k = first + b
+        for j in range(total.size):
+            total[j] += (
+                lines[k, j] * line[b + j]
+                + lines[k + 1, j] * line[b + j + 1]
+                + lines[k + 2, j] * line[b + j + 2]
+                + lines[k + 3, j] * line[b + j + 3]
+                + lines[k + 4, j] * line[b + j + 4]
+            )
+        b += 5
+    while b < size:
+        for j in range(total.size):
+            total[j] += lines[first + b, j] * line[b + j]
+        b += 1
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _add_one(line, c, total):
-    for j in range(total.size):
-        total[j] += c[j] * line[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _spread(taps, index, parity, output, lines):
+@helper()
+def _spread(taps, index, row, parity, output, lines):
     """Filters of a row of tiles, tap by tap, written out along the pixels: `lines` (size², 16 w)."""
-    for tile in range(index.size):
-        chosen = taps[index[tile], parity, output]
+    for tile in range(index.shape[1]):
+        chosen = index[row, tile]
         for k in range(lines.shape[0]):
-            target, source = lines[k, tile * TILE : (tile + 1) * TILE], chosen[k]
-            for j in range(target.size):
-                target[j] = source[j]
+            for j in range(TILE):
+                lines[k, tile * TILE + j] = taps[chosen, parity, output, k, j]
 
 
 @over_ranges("index")
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, mean_block, out):
     """Channels from the scaled contrast: ``out = mean + scale * sum of taps x samples around``.
 
@@ -102,27 +108,12 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
         scratch_scale, scratch_mean = np.empty(scale.shape[2], np.float32), np.empty(mean.shape[2], np.float32)
         for n in range(outputs):
             for parity in range(2):
-                _spread(taps, index[ti], parity, n, lines)
+                _spread(taps, index, ti, parity, n, lines)
                 for i in range(ti * TILE + parity, min((ti + 1) * TILE, rows), 2):
                     for j in range(width):
                         total[j] = 0.0
                     for a in range(size):
-                        b = 0
-                        while b + 5 <= size:
-                            k = a * size + b
-                            _add_five(
-                                padded[i + a, b:],
-                                lines[k],
-                                lines[k + 1],
-                                lines[k + 2],
-                                lines[k + 3],
-                                lines[k + 4],
-                                total,
-                            )
-                            b += 5
-                        while b < size:
-                            _add_one(padded[i + a, b:], lines[a * size + b], total)
-                            b += 1
+                        _add_taps(padded[i + a], lines, a * size, size, total)
                     expand_row(scale[n], i, scale_block, scratch_scale, gain)
                     expand_row(mean[n], i, mean_block, scratch_mean, level)
                     target = out[n, i]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from rgbmidic._kernels.compilation import compiled
 
 __all__ = ["claim_pixels", "list_pixels"]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def claim_pixels(nodes, elements, owner, counts):
     """Give every pixel of the region to the first element that contains its centre.
 
@@ -40,7 +41,7 @@ def claim_pixels(nodes, elements, owner, counts):
         counts[e] = count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def list_pixels(owner, position, rows, columns):
     """Write the pixels of each element, row by row; `position` (E,) int64 holds each first slot and is consumed."""
     for row in range(owner.shape[0]):

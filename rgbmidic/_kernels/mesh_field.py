@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["interpolate_nodal"]
@@ -15,7 +15,7 @@ _EDGE = -1e-9
 
 
 @over_ranges("out", grain=4096)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def interpolate_nodal(start, stop, out, x, y, nodes, elements, values, box, first, members):
     """Write the linear interpolation (2,) of `values` (N, 2) at every point, NaN outside the mesh.
 

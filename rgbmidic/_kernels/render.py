@@ -20,8 +20,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["CYLINDER", "PLATE", "SPHERE", "filter_columns", "sample_paint", "trace_rows"]
@@ -43,7 +43,7 @@ _FIELDS = 28
 _A, _B, _C = 0.80473785, -0.31061722, 0.50587936
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _hash(i, j, k, seed):
     """32 random bits of a lattice point (finaliser: "lowbias32" of C. Wellons)."""
     h = np.uint32(np.uint32(i) * np.uint32(0x8DA6B343))
@@ -52,31 +52,31 @@ def _hash(i, j, k, seed):
     return _mix(np.uint32(h ^ seed))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _mix(h):
     h = np.uint32(np.uint32(h ^ np.uint32(h >> np.uint32(16))) * np.uint32(0x7FEB352D))
     h = np.uint32(np.uint32(h ^ np.uint32(h >> np.uint32(15))) * np.uint32(0x846CA68B))
     return np.uint32(h ^ np.uint32(h >> np.uint32(16)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _unit(h):
     """A hash as a number in [0, 1)."""
     return np.float64(h) * (1.0 / 4294967296.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _fade(t):
     return t * t * t * (t * (t * np.float32(6.0) - np.float32(15.0)) + np.float32(10.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _fade_slope(t):
     rest = t * (t - np.float32(1.0))
     return np.float32(30.0) * rest * rest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _corner(h, u, v, w, wu, wv, ww, du, dv, dw):
     """One lattice corner's share of the noise and of its gradient."""
     scale, one = np.float32(2.0 / 1023.0), np.float32(1.0)
@@ -88,7 +88,7 @@ def _corner(h, u, v, w, wu, wv, ww, du, dv, dw):
     return weight * dot, weight * p + dot * du * vw, weight * q + dot * wu * dv * ww, weight * r + dot * wu * wv * dw
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _enter_lattice(work, grid, cells, paint):
     """Position of the samples in the wrinkle lattice: cell and place within it."""
     for s in range(work.shape[1]):
@@ -100,7 +100,7 @@ def _enter_lattice(work, grid, cells, paint):
         grid[0, s], grid[1, s], grid[2, s] = np.float32(u - i), np.float32(v - j), np.float32(w - k)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _noise(grid, cells, seed):
     """Gradient noise (row 3 of `grid`) and its gradient (rows 4 to 6), in lattice units and axes."""
     one = np.float32(1.0)
@@ -125,7 +125,7 @@ def _noise(grid, cells, seed):
         grid[6, s] = ((r0 + r1) + (r2 + r3)) + ((r4 + r5) + (r6 + r7))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _gather(found, x, y, z, slack, body, paint, counts, seed):
     """Droplets (centre on the surface, radius) that can touch a point within `slack` of the given one; their number."""
     cell, reach = paint[0], paint[2] + slack
@@ -141,7 +141,7 @@ def _gather(found, x, y, z, slack, body, paint, counts, seed):
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _to_surface(x, y, z, body):
     """Height of a point above the body's surface, and the surface point below it."""
     if body[0] == PLATE:
@@ -151,7 +151,7 @@ def _to_surface(x, y, z, body):
     return length - body[1], x * scale, y * scale if body[0] == SPHERE else y, z * scale
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
     """Append the droplets of one cell that lie near enough."""
     cell, chance, number = paint[0], _unit(h), 0
@@ -179,7 +179,7 @@ def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _coat(work, found, n, paint):
     """Cover by black paint (0 to 1) of the samples, with height and slope of the droplet on top."""
     inverse, dome = 1.0 / max(paint[5], 1e-9), paint[6]
@@ -198,7 +198,7 @@ def _coat(work, found, n, paint):
         work[_COVER, s] = t * t * (3.0 - 2.0 * t)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _dome(work, x, y, z, radius, dome):
     """Height dome (1 - r**2)**2 of one droplet, where it is the highest."""
     for s in range(work.shape[1]):
@@ -213,7 +213,7 @@ def _dome(work, x, y, z, radius, dome):
             work[_DZ, s] = slope * (dz - normal * work[_NZ, s])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _relief(work, grid, cells, paint, seed):
     """Add the wrinkles to height and slope."""
     _enter_lattice(work, grid, cells, paint)
@@ -230,7 +230,7 @@ def _relief(work, grid, cells, paint, seed):
         work[_DZ, s] += gz - normal * work[_NZ, s]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _finish(work, paint):
     """Micro-normal and reflection properties of the samples."""
     for s in range(work.shape[1]):
@@ -243,7 +243,7 @@ def _finish(work, paint):
         work[_VARIANCE, s] = (1.0 - cover) * paint[11] + cover * paint[16]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _locate(work, x0, y0, lens, frame, body, affine):
     """Where the rays through the pixels (x0 + `_CX`, y0 + `_CY`) meet the body; `_SEEN` is 1 or 0."""
     scale = 1.0 / (lens[0] * (1.0 + lens[3]))
@@ -271,7 +271,7 @@ def _locate(work, x0, y0, lens, frame, body, affine):
     _settle(work, body, affine)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _settle(work, body, affine):
     """Material point and normal of the points hit; none where the surface turns its back."""
     plate, round_y = body[0] == PLATE, 1.0 if body[0] == SPHERE else 0.0
@@ -289,7 +289,7 @@ def _settle(work, body, affine):
         work[_SEEN, s] = work[_SEEN, s] if facing > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _limit(work, body):
     """Nothing is seen beyond the body's edge."""
     for s in range(work.shape[1]):
@@ -297,7 +297,7 @@ def _limit(work, body):
         work[_SEEN, s] = work[_SEEN, s] if inside else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _spray(work, middle, found, body, paint, counts, seed):
     """Droplets of a tile: gathered once about its middle sample, or sample by sample where the tile spreads too far."""
     far = 0.0
@@ -315,19 +315,22 @@ def _spray(work, middle, found, body, paint, counts, seed):
         n = 0
         if work[_SEEN, s] > 0.0:
             n = _gather(found, work[_MX, s], work[_MY, s], work[_MZ, s], 0.0, body, paint, counts, seed)
-        one[:, 0] = work[:, s]
+        for field in range(_FIELDS):
+            one[field, 0] = work[field, s]
         _coat(one, found, n, paint)
-        work[:, s] = one[:, 0]
+        for field in range(_FIELDS):
+            work[field, s] = one[field, 0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _light(work, light):
+@helper()
+def _light(work, lights, j):
     """Radiance towards the camera in units of what an ideal white, facing the light at its nominal distance, gives.
 
     Lambert plus a micro-facet lobe exp((m.h - 1)/variance) with the masking of Cook and Torrance (1982).
     """
+    px, py, pz, power = lights[j, 0], lights[j, 1], lights[j, 2], lights[j, 3]
     for s in range(work.shape[1]):
-        lx, ly, lz = light[0] - work[_X, s], light[1] - work[_Y, s], light[2] - work[_Z, s]
+        lx, ly, lz = px - work[_X, s], py - work[_Y, s], pz - work[_Z, s]
         square = lx * lx + ly * ly + lz * lz
         inverse = 1.0 / math.sqrt(square)
         lx, ly, lz = lx * inverse, ly * inverse, lz * inverse
@@ -338,7 +341,7 @@ def _light(work, light):
         hx, hy, hz = lx + vx, ly + vy, lz + vz
         length = math.sqrt(hx * hx + hy * hy + hz * hz)
         mh = (ml + mv) / length
-        lit = light[3] / square if (work[_SEEN, s] > 0.0) & (nl > 0.0) & (ml > 0.0) else 0.0
+        lit = power / square if (work[_SEEN, s] > 0.0) & (nl > 0.0) & (ml > 0.0) else 0.0
         # a facet beyond twice its share is in the shadow of its neighbours: no step at the terminator
         work[_ENERGY, s] = lit * work[_ALBEDO, s] * min(ml, 2.0 * nl)
         reflected = lit * work[_GLOSS, s] if mv > 0.0 else 0.0
@@ -349,41 +352,42 @@ def _light(work, light):
             work[_ENERGY, s] += work[_HEIGHT, s] * math.exp(work[_EXPONENT, s])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _trace_tile(out, x0, y0, lens, frame, body, affine, material, lights, paint, counts, seed):
-    """Radiance (k, sub-row, sub-column, pixel) of the samples of a tile; the first lies at pixel (x0, y0)."""
-    samples, across = out.shape[1], out.shape[3]
-    found = np.empty((MAX_CANDIDATES, 4))
-    work = np.empty((_FIELDS, samples * samples * across))
-    grid, cells = np.empty((7, work.shape[1]), dtype=np.float32), np.empty((3, work.shape[1]), dtype=np.int32)
-    shape = (samples, samples, across)
-    cx, cy = work[_CX].reshape(shape), work[_CY].reshape(shape)
-    mx, my = work[_MX].reshape(shape), work[_MY].reshape(shape)
+@helper()
+def _enter_tile(work, samples, width):
+    """Pixel offsets of the samples of a tile, ordered by sub-row, sub-column and pixel."""
+    s = 0
     for r in range(samples):
         for q in range(samples):
-            for c in range(across):
-                cx[r, q, c], cy[r, q, c] = c + q / samples, r / samples
-    _locate(work, x0, y0, lens, frame, body, affine)
-    if material.size > 0:
-        for r in range(samples):
-            for q in range(samples):
-                for c in range(across):
-                    mx[r, q, c], my[r, q, c] = material[r, c * samples + q, 0], material[r, c * samples + q, 1]
-    _limit(work, body)
-    _spray(work, work.shape[1] // 2 + across // 2, found, body, paint, counts, seed)
-    _relief(work, grid, cells, paint, np.uint32(seed ^ np.uint32(0x5BD1E995)))
-    _finish(work, paint)
-    for j in range(lights.shape[0]):
-        _light(work, lights[j])
-        energy, seen = work[_ENERGY].reshape(shape), work[_SEEN].reshape(shape)
-        for r in range(samples):
-            for q in range(samples):
-                for c in range(across):
-                    out[j, r, q, c] = energy[r, q, c] if seen[r, q, c] > 0.0 else 0.0
+            for c in range(width):
+                work[_CX, s], work[_CY, s] = c + q / samples, r / samples
+                s += 1
+
+
+@helper()
+def _enter_material(work, samples, width, material, row, left):
+    """Material points of a tile, taken from those of all samples; `row` and `left` are the first sub-pixel's."""
+    s = 0
+    for r in range(samples):
+        for q in range(samples):
+            for c in range(width):
+                column = left + c * samples + q
+                work[_MX, s], work[_MY, s] = material[row + r, column, 0], material[row + r, column, 1]
+                s += 1
+
+
+@helper()
+def _collect(line, work, left, width):
+    """Radiance of a tile's samples into `line` (sub-row, sub-column, pixel), from pixel `left`."""
+    s = 0
+    for r in range(line.shape[0]):
+        for q in range(line.shape[0]):
+            for c in range(width):
+                line[r, q, left + c] = work[_ENERGY, s] if work[_SEEN, s] > 0.0 else 0.0
+                s += 1
 
 
 @over_ranges("out", axis=1)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def trace_rows(
     start, stop, out, first_row, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed
 ):
@@ -405,22 +409,33 @@ def trace_rows(
         Position in the body's frame and power.
     """
     samples, across = out.shape[2], out.shape[3] + 2 * pad
+    found = np.empty((MAX_CANDIDATES, 4))
+    line = np.empty((lights.shape[0], samples, samples, across), dtype=np.float32)
+    wrinkles = np.uint32(seed ^ np.uint32(0x5BD1E995))
     for block in range(start, stop):
-        line = np.empty((lights.shape[0], samples, samples, across), dtype=np.float32)
-        row = block * samples
-        y0 = (first_row + row + 0.5) / samples - 0.5
+        y0 = (first_row + block * samples + 0.5) / samples - 0.5
         for left in range(0, across, TILE):
-            right = min(left + TILE, across)
-            points = material[row : row + samples, left * samples : right * samples] if material.size > 0 else material
-            x0 = left - pad + 0.5 / samples - 0.5
-            tile = line[:, :, :, left:right]
-            _trace_tile(tile, x0, y0, lens, frame, body, affine, points, lights, paint, counts, seed)
+            width = min(TILE, across - left)
+            number = samples * samples * width
+            work = np.empty((_FIELDS, number))
+            grid, cells = np.empty((7, number), dtype=np.float32), np.empty((3, number), dtype=np.int32)
+            _enter_tile(work, samples, width)
+            _locate(work, left - pad + 0.5 / samples - 0.5, y0, lens, frame, body, affine)
+            if material.size > 0:
+                _enter_material(work, samples, width, material, block * samples, left * samples)
+            _limit(work, body)
+            _spray(work, number // 2 + width // 2, found, body, paint, counts, seed)
+            _relief(work, grid, cells, paint, wrinkles)
+            _finish(work, paint)
+            for j in range(lights.shape[0]):
+                _light(work, lights, j)
+                _collect(line[j], work, left, width)
         for j in range(lights.shape[0]):
             for r in range(samples):
                 _decimate(out[j, block, r], line[j, r], taps)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _decimate(out, line, taps):
     """Weighted sums of the sub-pixel samples (sub-column, pixel) of a row, one per pixel."""
     samples = line.shape[0]
@@ -434,7 +449,7 @@ def _decimate(out, line, taps):
 
 
 @over_ranges("out", axis=1)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def filter_columns(start, stop, out, rows, samples, taps):
     """Pixel aperture and lens blur along y: sub-pixel rows (k, n, W) to pixel rows `out` (k, h, W)."""
     total = np.empty(out.shape[2])
@@ -451,7 +466,7 @@ def filter_columns(start, stop, out, rows, samples, taps):
 
 
 @over_ranges("out", grain=_POINTS)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def sample_paint(start, stop, out, points, body, paint, counts, seed):
     """Cover, height (mm) and slope vector of the paint at points on the body: `out` (N, 5)."""
     for first in range(start, stop, _POINTS):

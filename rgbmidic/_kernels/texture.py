@@ -6,8 +6,8 @@ interpolated linearly, beyond the outermost they are constant. ``red_row, red_co
 """
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["block_sums", "cell_moments", "expand_row", "lag_products", "scaled_contrast", "subtract_mean"]
@@ -17,7 +17,7 @@ REACH = 3
 
 
 @over_ranges("sums", axis=1)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def block_sums(start, stop, values, red_row, red_column, block, sums, counts):
     """Sum and number of finite samples of each channel in each block: `sums`, `counts` (3, h, w) float64."""
     rows, columns = values.shape
@@ -35,7 +35,7 @@ def block_sums(start, stop, values, red_row, red_column, block, sums, counts):
                         counts[channel, bi, bj] += 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def expand_row(grid, row, block, line, out):
     """Row of pixels `out` (W,) interpolated from a grid (h, w); `line` (w,) is scratch."""
     position = min(max((row + 0.5) / block - 0.5, 0.0), grid.shape[0] - 1.0)
@@ -58,7 +58,7 @@ def expand_row(grid, row, block, line, out):
         out[j] = line[last]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@helper()
 def _expand_own(grid, i, block, red_row, red_column, line, other, out):
     """Row i of a grid (3, h, w) of blocks, at each pixel that of the pixel's own channel, into `out` (W,)."""
     own = 0 if i % 2 == red_row else 2
@@ -70,10 +70,10 @@ def _expand_own(grid, i, block, red_row, red_column, line, other, out):
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def subtract_mean(start, stop, values, mean, red_row, red_column, block, out):
     """``out = values - local mean of the pixel's channel``; `mean` (3, h, w) float32."""
-    rows, columns = values.shape
+    columns = values.shape[1]
     for i in range(start, stop):
         line = np.empty(mean.shape[2], dtype=np.float32)
         other, green = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
@@ -83,7 +83,7 @@ def subtract_mean(start, stop, values, mean, red_row, red_column, block, out):
 
 
 @over_ranges("out")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def scaled_contrast(start, stop, contrast, scale, red_row, red_column, block, pad, out):
     """``out = contrast * scale of the pixel's channel``, mirrored by `pad` pixels on every side.
 
@@ -107,8 +107,16 @@ def scaled_contrast(start, stop, contrast, scale, red_row, red_column, block, pa
             target[j] = 0.0
 
 
+@helper()
+def _along(line, j, odd):
+    """Binomial sum about the middle of the cell at column j, of its even or its odd columns."""
+    if odd:
+        return 5 * line[j - 1] + 10 * line[j + 1] + line[j + 3]
+    return line[j - 2] + 10 * line[j] + 5 * line[j + 2]
+
+
 @over_ranges("counts")
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def cell_moments(start, stop, contrast, red_row, red_column, block, sums, counts):
     """Second moments of the four planes' low-passed contrast, summed over the cells of each block.
 
@@ -141,14 +149,8 @@ def cell_moments(start, stop, contrast, red_row, red_column, block, sums, counts
                     j = 2 * cj
                     if j < 2 or j + REACH >= columns:
                         continue
-                    first = red[j - 2] + 10 * red[j] + 5 * red[j + 2]
-                    second = 5 * red[j - 1] + 10 * red[j + 1] + red[j + 3]
-                    third = blue[j - 2] + 10 * blue[j] + 5 * blue[j + 2]
-                    fourth = 5 * blue[j - 1] + 10 * blue[j + 1] + blue[j + 3]
-                    if red_column == 0:
-                        r, g1, g2, b = first, second, third, fourth
-                    else:
-                        g1, r, b, g2 = first, second, third, fourth
+                    r, g1 = _along(red, j, red_column), _along(red, j, 1 - red_column)
+                    g2, b = _along(blue, j, red_column), _along(blue, j, 1 - red_column)
                     total = r + g1 + g2 + b
                     if not np.isfinite(total):
                         continue
@@ -163,7 +165,7 @@ def cell_moments(start, stop, contrast, red_row, red_column, block, sums, counts
                     counts[bi, bj] += 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def lag_products(contrast, red_row, red_column, lags, step, sums, counts):
     """Products of samples at each lag (row, column), apart for red-green, red-blue, green-blue and each colour alone.
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
+from itertools import pairwise
 from typing import Any
 
 from rgbmidic.errors import InputError
@@ -21,8 +22,8 @@ _chosen: list[int] = []
 
 
 def threads() -> int:
-    """Number of threads that share a kernel: what `set_threads` was given, else the environment's RGBMIDIC_THREADS, else
-    the processors this process may use.
+    """Threads that share a kernel: what `set_threads` was given, else the environment's RGBMIDIC_THREADS, else the
+    processors this process may use.
 
     Raises
     ------
@@ -46,7 +47,7 @@ def set_threads(number: int) -> None:
 
 
 def over_ranges(array: str, *, axis: int = 0, grain: int = 1) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Share the items of a compiled ``kernel(start, stop, *arguments)`` among the threads; it is called without the two.
+    """Share the items of a compiled ``kernel(start, stop, *arguments)``, which is called without the first two.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def _share(kernel: Callable[..., None], arguments: tuple[Any, ...], items: int, 
         return
     edges = [min(grains * part // parts * grain, items) for part in range(parts + 1)]
     pool = _pool(os.getpid(), threads() - 1)
-    others = [pool.submit(kernel, *edge, *arguments) for edge in zip(edges[1:], edges[2:], strict=False)]
+    others = [pool.submit(kernel, *edge, *arguments) for edge in pairwise(edges[1:])]
     kernel(0, edges[1], *arguments)
     for other in others:
         other.result()

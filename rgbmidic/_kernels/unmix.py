@@ -1,8 +1,8 @@
 """Compiled loop that turns camera channels into lights, pixel by pixel."""
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["unmix"]
@@ -12,7 +12,7 @@ BLOCK = 4096
 
 
 @over_ranges("out", axis=1, grain=BLOCK)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def unmix(start, stop, channels, valid, matrix, needed, out, out_valid):
     """``out = matrix @ channels`` at every pixel; invalid, and NaN, where a `needed` channel is invalid.
 

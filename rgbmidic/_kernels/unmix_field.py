@@ -1,15 +1,15 @@
 """Compiled loop that turns camera channels into lights with a matrix that varies slowly over the field."""
 
 import numpy as np
-from numba import njit
 
+from rgbmidic._kernels.compilation import compiled
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["unmix_field"]
 
 
 @over_ranges("out", axis=1)
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def unmix_field(start, stop, channels, valid, grid, step, needed, out, out_valid):
     """``out = matrix(x, y) @ channels`` with the matrix interpolated linearly between grid points `step` px apart.
 
@@ -17,8 +17,7 @@ def unmix_field(start, stop, channels, valid, grid, step, needed, out, out_valid
     (k, C); out, out_valid: (k, H, W). Invalid where a `needed` channel is; one not needed
     contributes the value it has, NaN nothing.
     """
-    colours, height, width = channels.shape
-    lights = out.shape[0]
+    colours, lights, width = channels.shape[0], out.shape[0], out.shape[2]
     for y in range(start, stop):
         gy = y // step
         down = np.float32(y - gy * step) / np.float32(step)

@@ -1,0 +1,105 @@
+"""The threads that share a kernel: every item once, in ranges of whole grains, from anywhere, after a fork too."""
+
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from rgbmidic._kernels.grid import block_index
+from rgbmidic._kernels.threads import over_ranges, set_threads, threads
+from rgbmidic.errors import InputError
+
+
+@pytest.fixture(autouse=True)
+def as_before():
+    before = threads()
+    yield
+    set_threads(before)
+
+
+class Counted:
+    """A stand-in for a compiled kernel that writes down its ranges."""
+
+    def __init__(self):
+        self.ranges = []
+
+    @staticmethod
+    def py_func(start, stop, other, items): ...
+
+    __name__ = "counted"
+
+    def __call__(self, start, stop, other, items):
+        self.ranges.append((start, stop))
+        items[:, start:stop] += 1
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 64, 65, 1000])
+@pytest.mark.parametrize("grain", [1, 64])
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_every_item_is_done_once_in_whole_grains(count, grain, number):
+    set_threads(number)
+    kernel, items = Counted(), np.zeros((2, count))
+    over_ranges("items", axis=1, grain=grain)(kernel)(None, items)
+    assert (items == 1).all()
+    assert len(kernel.ranges) == max(1, min(number, -(-count // grain)))
+    assert all(start % grain == 0 for start, _ in kernel.ranges)
+
+
+def test_a_failure_in_any_thread_is_told():
+    class Failing(Counted):
+        def __call__(self, start, stop, other, items):
+            if start > 0:
+                raise ValueError("the last one")
+
+    set_threads(3)
+    with pytest.raises(ValueError, match="the last one"):
+        over_ranges("items")(Failing())(None, np.zeros(9))
+
+
+def blocks(seed):
+    """A kernel's result and what it should be."""
+    set_threads(2)
+    rows, columns = np.random.default_rng(seed).integers(0, 500, (2, 200_000), dtype=np.int32)
+    out = np.empty(rows.size, dtype=np.int32)
+    block_index(rows, columns, 0, 0, 7, 80, out)
+    return bool((out == rows // 7 * 80 + columns // 7).all())
+
+
+def test_many_threads_may_call_at_once():
+    with ThreadPoolExecutor(8) as callers:
+        assert all(callers.map(blocks, range(40)))
+
+
+@pytest.mark.parametrize("way", sorted({"fork", "spawn"} & set(multiprocessing.get_all_start_methods())))
+def test_other_processes_make_their_own_pool(way):
+    assert blocks(0)
+    with multiprocessing.get_context(way).Pool(2) as pool:
+        assert all(pool.map_async(blocks, range(4)).get(timeout=120))
+
+
+def test_a_shared_kernel_can_be_sent_to_another_process():
+    assert pickle.loads(pickle.dumps(block_index)) is block_index
+
+
+def said(value):
+    code = (
+        "from rgbmidic._kernels.threads import threads\ntry: print(threads())\nexcept Exception as error: print(error)"
+    )
+    environment = {**os.environ, "RGBMIDIC_THREADS": value}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment).stdout.strip()
+
+
+def test_the_environment_sets_the_number():
+    assert said("3") == "3"
+    for wrong in ("0", "-2", "many", ""):
+        assert said(wrong) == f"RGBMIDIC_THREADS must be a whole number from 1; given is {wrong!r}"
+
+
+def test_fewer_than_one_thread_is_refused():
+    with pytest.raises(InputError, match="at least 1; given is 0"):
+        set_threads(0)
