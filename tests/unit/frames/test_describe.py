@@ -49,7 +49,7 @@ def test_a_movie_tells_all(tmp_path: Path) -> None:
 def test_what_nobody_tells_is_null_and_what_is_stated_is_told(tmp_path: Path) -> None:
     write_tiff(tmp_path / "f.tif", noisy_mosaic((24, 30)))
     seen = _seen(tmp_path / "f.tif")
-    assert [seen[key] for key in KEYS] == ["TIFF", 1, [24, 30], None, 16, 0.0, 65535.0, None, None, None, 0]
+    assert [seen[key] for key in KEYS] == ["TIFF", 1, [24, 30], None, 16, 0.0, 65535.0, None, None, None, None]
     stated = _seen(tmp_path / "f.tif", cfa="BGGR", black_level=64.0, white_level=4000.0)
     assert (stated["cfa"], stated["kind"], stated["black_level"], stated["white_level"]) == ("BGGR", "bayer", 64, 4000)
     assert _seen(tmp_path / "f.tif", kind="monochrome")["kind"] == "monochrome"
