@@ -97,13 +97,17 @@ class Keypoints:
         grey = np.clip(128 + _GREY * picture, 0, 255).astype(np.uint8)
         # the precise upscale keeps positions free of a bias of a quarter of a pixel
         sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
-        found = [key for key in sift.detect(grey, None) if seen[round(key.pt[1]), round(key.pt[0])] > 0]
-        strongest = np.argsort([-key.response for key in found], kind="stable")[:most]
+        found = sift.detect(grey, None)
+        columns, rows = np.round(cv2.KeyPoint.convert(found)).astype(int).reshape(-1, 2).T
+        strength = np.where(seen[rows, columns] > 0, [key.response for key in found], 0.0)
+        strongest = np.argsort(-strength, kind="stable")[: min(most, np.count_nonzero(strength))]
         chosen, descriptors = sift.compute(grey, [found[number] for number in strongest])
         if descriptors is None:
             return cls._empty()
         return cls(
-            points=np.array([key.pt for key in chosen]) * reduction + (reduction - 1) / 2 + (box.left, box.top),
+            points=cv2.KeyPoint.convert(chosen).astype(np.float64) * reduction
+            + (reduction - 1) / 2
+            + (box.left, box.top),
             size=np.array([key.size for key in chosen]),
             angle=np.radians([key.angle for key in chosen]),
             descriptors=np.asarray(descriptors, dtype=np.float32),

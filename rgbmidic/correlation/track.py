@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -45,7 +46,7 @@ class Start:
 LARGEST_TURN = 30.0
 """Turn (degrees) that the search for a start finds, with strains of 20 % or alone (benchmarks/starts.py)."""
 NEEDED = 0.15
-"""Confidence from which a start is worth a solve; wrong ones reach .1 on the coarsest speckles (benchmarks/starts.py)."""
+"""Confidence from which a start is worth a solve: another specimen gives at most .1 (benchmarks/starts.py)."""
 _LOSS = 0.01
 """Share of the nodes whose loss each further start makes acceptable, half of it at the first: a few may really go."""
 
@@ -65,14 +66,15 @@ def track(
     reference, deformed
         The two states.
     start
-        The last frame's end; without a displacement the first start is rest.
+        The last frame's end; without a displacement the start is searched.
     options, statistics
         How to solve, see `solve`.
     """
     best: Solution | None = None
-    surest: FoundStart | None = None
-    for number, found in enumerate(find_starts(reference, deformed, start.displacement)):
-        surest = found
+    surest = 0.0
+    last = [] if start.displacement is None else [FoundStart(displacement=start.displacement, confidence=np.nan)]
+    for number, found in enumerate(chain(last, find_starts(reference, deformed, start.displacement))):
+        surest = float(np.fmax(surest, found.confidence))
         if found.confidence < NEEDED:
             continue
         trial = solve(reference, deformed, found.displacement, options, statistics=statistics)
@@ -80,16 +82,14 @@ def track(
             best = trial
         if best.status is Status.CONVERGED and best.unmeasured_share <= start.unmeasured + (number + 0.5) * _LOSS:
             break
-    if best is not None:
-        return best
-    assert surest is not None
-    best = solve(reference, deformed, surest.displacement, options, statistics=statistics)
-    return replace(best, reason=f"{NO_MATCH}; {_limits(surest)}") if best.reason == NO_MATCH else best
+    if best is None:  # from rest, for the reason why there is no start
+        best = solve(reference, deformed, np.zeros_like(reference.mesh.nodes), options, statistics=statistics)
+    return replace(best, reason=f"{NO_MATCH}; {_looked_for(surest)}") if best.reason == NO_MATCH else best
 
 
-def _limits(surest: FoundStart) -> str:
+def _looked_for(surest: float) -> str:
     return (
-        f"no start was found: at the best one the images agree around {surest.confidence:.0%} of the nodes, of "
-        f"{NEEDED:.0%} needed. Looked for were motions up to the region's longer side (at least 128 px) and turns up to "
-        f"about {LARGEST_TURN:g} degrees from the reference: take frames in between"
+        f"no start found: at the best one the images agree around {surest:.0%} of the nodes, of {NEEDED:.0%} needed. "
+        f"Looked for were motions up to the region's longer side, at least 128 px, and turns up to about "
+        f"{LARGEST_TURN:g} degrees: take frames in between"
     )
