@@ -116,7 +116,8 @@ def under_lights(image: FloatImage, name: str, random: np.random.Generator) -> t
 def search(
     side: int, textures: tuple[FloatImage, FloatImage], size: int, lights: str, motion: Motion, seed: int
 ) -> tuple[bool | None, FoundStart, float]:
-    """Whether a start of a square region in the middle of a picture is found (None: nothing is seen), the start, and the seconds it took."""
+    """Whether a start of a square region in the middle of a picture is found, the start, and the
+    seconds it took; None where nothing is seen."""
     random = np.random.default_rng(seed)
     rest = Motion(gradient=np.eye(2), shift=np.zeros(2))
     images, weights = under_lights(moved(textures[0], size, rest), lights, random)
