@@ -96,16 +96,16 @@ class Keypoints:
             return cls._empty()
         grey = np.clip(128 + _GREY * picture, 0, 255).astype(np.uint8)
         # the precise upscale keeps positions free of a bias of a quarter of a pixel
-        sift = cv2.SIFT_create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+        sift = cv2.SIFT.create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
         found = sift.detect(grey, None)
         columns, rows = np.round(cv2.KeyPoint.convert(found)).astype(int).reshape(-1, 2).T
         strength = np.where(seen[rows, columns] > 0, [key.response for key in found], 0.0)
         strongest = np.argsort(-strength, kind="stable")[: min(most, np.count_nonzero(strength))]
-        chosen, descriptors = sift.compute(grey, [found[number] for number in strongest])
-        if descriptors is None:
+        if not len(strongest):
             return cls._empty()
+        chosen, descriptors = sift.compute(grey, [found[number] for number in strongest])
         return cls(
-            points=cv2.KeyPoint.convert(chosen).astype(np.float64) * reduction
+            points=np.asarray(cv2.KeyPoint.convert(chosen), dtype=np.float64) * reduction
             + (reduction - 1) / 2
             + (box.left, box.top),
             size=np.array([key.size for key in chosen]),
@@ -126,7 +126,7 @@ def pairs(first: Keypoints, second: Keypoints, tolerance: float) -> tuple[FloatA
     if len(here) <= _VOTES:
         return np.zeros((0, 2)), np.zeros((0, 2))
     points, motion = first.points[here], second.points[there] - first.points[here]
-    around = cKDTree(points).query(points, k=min(_VOTERS + 1, len(points)))[1][:, 1:]
+    around = np.asarray(cKDTree(points).query(points, k=min(_VOTERS + 1, len(points)))[1])[:, 1:]
     step = points[around] - points[:, None]
     scale, turn = second.size[there] / first.size[here], second.angle[there] - first.angle[here]
     cos, sin = (scale * np.cos(turn))[:, None], (scale * np.sin(turn))[:, None]
@@ -143,7 +143,8 @@ def _nearest(first: Keypoints, second: Keypoints) -> tuple[npt.NDArray[np.intp],
     # sums of products of whole numbers under 2^24: exact in float32, hence the same in any order and on any threads
     likeness = first.descriptors @ second.descriptors.T
     there = likeness.argmax(axis=1)
-    here = np.flatnonzero(likeness.argmax(axis=0)[there] == np.arange(len(there)))
+    back = np.asarray(likeness.argmax(axis=0))
+    here = np.flatnonzero(back[there] == np.arange(len(there)))
     return here, there[here]
 
 
