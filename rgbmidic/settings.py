@@ -232,8 +232,6 @@ class SolverSettings:
     fill
         Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
         flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
-    search_radius
-        Largest motion in px that the coarse start looks for.
     tolerance
         The iteration stops when no node moves by more than this (px).
     max_iterations
@@ -245,7 +243,6 @@ class SolverSettings:
     brightness: Literal["none", "global", "local"] = "none"
     curvature: bool = False
     fill: float = _bounded(0.0, at_least=0)
-    search_radius: float = _bounded(64.0, at_least=0)
     tolerance: float = _bounded(1e-3, above=0)
     max_iterations: int = _bounded(50, at_least=1)
 

@@ -247,7 +247,7 @@ def _match(
     inside = region if region is not None else (BORDER, BORDER, width - 1 - BORDER, height - 1 - BORDER)
     told = f"the pictures of lights {names[0]} and {names[1]}"
     try:
-        solution = correlate(reference, other, region=inside, element_size=element_size, search_radius=32.0)
+        solution = correlate(reference, other, region=inside, element_size=element_size)
     except RgbmidicError as error:
         raise CalibrationError(
             f"the pictures of lights {names[0]} and {names[1]} cannot be compared: {error}"

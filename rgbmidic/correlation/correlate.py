@@ -49,7 +49,7 @@ def correlate(
     weights : array_like, shape (H, W) or (k, H, W), optional
         Weight of each light at each pixel of the reference, finite and not negative; 0 excludes.
     initial : array_like, shape (2,) or (N, 2), optional
-        Displacement (u, v) in px to start from; None looks for it within `search_radius`.
+        Displacement (u, v) in px to start from; None looks for it.
     deformed_weights
         Like `weights`, on the deformed images.
     normalise
@@ -58,7 +58,7 @@ def correlate(
         Weight every light by the inverse variance of its own residual around each pixel, robustly.
     **options
         Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, curvature,
-        search_radius, tolerance, max_iterations.
+        tolerance, max_iterations.
 
     Returns
     -------

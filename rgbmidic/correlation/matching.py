@@ -11,7 +11,7 @@ from rgbmidic.correlation.residual import Residual
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["matching_elements", "misfit"]
+__all__ = ["correlation_around", "matching_elements", "misfit"]
 
 _MATCHED = (0.4, 0.6)
 """Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
@@ -43,6 +43,14 @@ def matching_elements(
     typical = _median_around(mesh, coefficient, ff > 0)
     limits = _MATCHED if precision is None else _MATCHED_PRECISE
     return np.asarray(coefficient >= np.clip(1 - _WORSE * (1 - typical), *limits))
+
+
+def correlation_around(residual: Residual) -> FloatArray:
+    """Zero-mean correlation coefficient (N,) of all lights together in the elements around each node; NaN where the
+    states show no texture together."""
+    to_nodes = residual.reference.mesh.to_nodes
+    fg, ff, gg = (to_nodes(part) for part in _centred_products(residual, _light_precision(residual, None)))
+    return np.where(ff > 1e-9 * ff.max(initial=0.0), _correlation(fg, ff, gg), np.nan)
 
 
 def _median_around(mesh: Tri3Mesh, values: FloatArray, textured: BoolArray) -> FloatArray:

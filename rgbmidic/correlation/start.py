@@ -1,179 +1,132 @@
-"""A start for the Gauss-Newton iteration: masked block matching, coarse windows first.
+"""Starts for the Gauss-Newton iteration, however large the motion, and how sure they are; coarse pictures first.
 
-The lights' images are locally normalised (so that reflections and shading weigh little) and summed into one feature
-image per state. Large windows at half resolution find motions up to the search radius; small windows around every
-node refine them; windows that disagree with their neighbours are replaced (normalised median test, Westerweel and
-Scarano, Exp. Fluids 39, 2005).
+Keypoints that both states share (`keypoints`) are found in pictures reduced 8 times, then 4, 2 and 1 times. The nodes
+follow the pairs around them by a robust local affine fit. How sure such a start is says the correlation of the images
+around the nodes.
 """
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rgbmidic.correlation.keypoints import Box, Keypoints, pairs
+from rgbmidic.correlation.matching import correlation_around
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.correlation.residual import Residual
+from rgbmidic.typing import FloatArray
 
-__all__ = ["coarse_start", "refine_start"]
+__all__ = ["FoundStart", "confidence", "find_start", "find_starts"]
 
-logger = logging.getLogger(__name__)
-
-
-_NORMALISE = 10.0
-"""Standard deviation (px) of the local mean and contrast."""
-_WINDOW = 64
-"""Side of the coarse windows, px."""
-_FINE_WINDOW = 32
-_FINE_RADIUS = 6
-_SCORE = 0.3
-"""Correlation coefficient under which a window counts as not found."""
-
-
-def coarse_start(
-    reference: Reference, deformed: Deformed, search_radius: float, around: FloatArray | None = None
-) -> FloatArray:
-    """Displacement (N, 2) of the nodes in px, found within `search_radius` px of `around` (N, 2), or of rest."""
-    f, g = (feature_image(state.images, state.weights) for state in (reference, deformed))
-    half_f, half_g = (np.asarray(cv2.pyrDown(image), dtype=np.float32) for image in (f, g))
-    centres = _window_centres(reference)
-    side = min(_WINDOW, *(int(size) // 2 * 2 for size in f.shape))
-    guess = None if around is None else around[cKDTree(reference.mesh.nodes).query(centres)[1]] / 2
-    motion, score = _match(half_f, half_g, centres / 2, side // 2, int(np.ceil(search_radius / 2)), guess)
-    motion = _smooth_outliers(centres, 2 * motion, score, tolerance=3.0)
-    start = _interpolate(centres, motion, reference.mesh.nodes)
-    return _refine(reference, f, g, start)
+_SURE = 0.95
+"""Confidence from which finer pictures are not looked at: at .9, speckles of 3 px may be off by 1.2 px (measured)."""
+_AGREES = 0.5
+"""Correlation coefficient from which the images around a node agree."""
+_REDUCTIONS = (8, 4, 2, 1)
+_SMALL = 300.0
+"""Side (px) of regions up to which pictures of full size are looked at: larger ones have keypoints enough at half."""
+_KEYPOINTS = 1000
+"""Most keypoints of the reference: 1500 cost half again as much and were no surer on 1024 px (measured)."""
+_MOST = 5000
+"""Most keypoints of the deformed image, where there are as many per area."""
+_CONTEXT = 24.0
+"""Surroundings (px) of the region in which keypoints are looked for too."""
+_REACH = 128.0
+"""Motion (px) that is looked for at least; the longer side of the region where that is more."""
+_FITTED = 12
+"""Pairs to which the motion around a node is fitted."""
+_TURNS = 5
+"""Robust fits until the weights have settled."""
 
 
-def refine_start(reference: Reference, deformed: Deformed, start: FloatArray) -> FloatArray:
-    """Improve a start (N, 2) that is right within a few px."""
-    f, g = (feature_image(state.images, state.weights) for state in (reference, deformed))
-    return _refine(reference, f, g, start)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundStart:
+    """A displacement to start from, and how sure it is.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (N, 2)
+        px.
+    confidence : float
+        See `confidence`.
+    """
+
+    displacement: FloatArray
+    confidence: float
 
 
-def feature_image(images: FloatImage, weights: FloatImage) -> FloatImage:
-    """Sum over the lights of the locally normalised images (k, H, W), 0 where excluded; shape (H, W)."""
-    total = np.zeros(images.shape[1:], dtype=np.float32)
-    for image, weight in zip(images, weights, strict=True):
-        norm = _blur(weight) + np.float32(1e-6)
-        centred = image - _blur(image * weight) / norm
-        contrast = np.sqrt(_blur(centred * centred * weight) / norm)
-        floor = np.float32(0.1) * contrast.max() + np.float32(1e-20)
-        total += weight * centred / (contrast + floor)
-    return total
+def confidence(reference: Reference, deformed: Deformed, displacement: FloatArray) -> float:
+    """Share of the nodes around which the images correlate by 0.5 or more at a displacement (N, 2).
+
+    Nodes count that see something in both states, and at least a tenth of those that do in the reference, so that
+    a few speckles alone make no start.
+    """
+    residual = Residual.at(reference, deformed, reference.values, [displacement] * len(reference.images))
+    around = correlation_around(residual)
+    seen = reference.mesh.to_nodes(reference.pixels.by_element(reference.pixel_weights.sum(axis=0))) > 0
+    with np.errstate(invalid="ignore"):
+        agrees = around >= _AGREES
+    return float(agrees.sum() / max(int(np.isfinite(around).sum()), 0.1 * seen.sum(), 1))
 
 
-def _blur(image: FloatImage) -> FloatImage:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), _NORMALISE, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
+def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
+    """The surest start of `find_starts`; rest where there is none."""
+    rest = FoundStart(displacement=np.zeros_like(reference.mesh.nodes), confidence=0.0)
+    return max(find_starts(reference, deformed), key=lambda found: found.confidence, default=rest)
 
 
-def _window_centres(reference: Reference) -> FloatArray:
-    """Centres (M, 2) of the coarse windows: a grid over the mesh, kept where the region is."""
-    low, high = reference.mesh.nodes.min(axis=0), reference.mesh.nodes.max(axis=0)
-    count = np.maximum(np.round((high - low) / _WINDOW), 1).astype(int)
-    axes = [a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, count, strict=True)]
-    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    covered = reference.pixels.scatter(np.ones(reference.pixels.rows.size, dtype=np.float32))
-    share = cv2.blur(covered, (_WINDOW, _WINDOW))[np.round(grid[:, 1]).astype(int), np.round(grid[:, 0]).astype(int)]
-    return np.asarray(grid[share >= min(0.25, float(share.max()))])
+def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | None = None) -> Iterator[FoundStart]:
+    """Starts from ever finer pictures, each surer than the one before, until one is sure.
 
-
-def _match(
-    f: FloatImage, g: FloatImage, centres: FloatArray, side: int, radius: int, guess: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
-    """Motion (M, 2) in px and score (M,) of the windows of f around `centres`, looked for in g around the guess."""
-    motion = np.zeros((len(centres), 2)) if guess is None else guess.copy()
-    score = np.full(len(centres), -1.0)
-    height, width = f.shape
-    for i, (x, y) in enumerate(centres):
-        left = min(max(round(x - side / 2), 0), max(width - side, 0))
-        top = min(max(round(y - side / 2), 0), max(height - side, 0))
-        template = f[top : top + side, left : left + side]
-        dx, dy = np.round(motion[i]).astype(int)
-        x0, y0 = max(left + dx - radius, 0), max(top + dy - radius, 0)
-        area = g[y0 : max(top + dy + radius + side, 0), x0 : max(left + dx + radius + side, 0)]
-        if area.shape[0] < template.shape[0] or area.shape[1] < template.shape[1] or not template.any():
+    They are looked for within the region's longer side, but at least 128 px, of rest and of `last` (N, 2).
+    """
+    nodes, shape = reference.mesh.nodes, reference.images.shape[1:]
+    side = float(np.ptp(nodes, axis=0).max())
+    here = Box.around(nodes, _CONTEXT, shape)
+    known = nodes if last is None else np.concatenate([nodes, nodes + last])
+    there = Box.around(known, max(side, _REACH), shape)
+    most = int(min(_KEYPOINTS * there.area / here.area, _MOST))
+    best = 0.0
+    for reduction in _REDUCTIONS if side <= _SMALL else _REDUCTIONS[:-1]:
+        f = Keypoints.find(reference.images, reference.weights, here, reduction, _KEYPOINTS)
+        g = Keypoints.find(deformed.images, deformed.weights, there, reduction, most)
+        points, motion = pairs(f, g, 2.0 * reduction)
+        if not len(points):
             continue
-        surface = np.asarray(cv2.matchTemplate(area, template, cv2.TM_CCORR_NORMED), dtype=np.float32)
-        _, best, _, (column, row) = cv2.minMaxLoc(surface)
-        if not np.isfinite(best):
-            continue
-        score[i] = best
-        motion[i] = (
-            x0 + column - left + _vertex(surface[row], column),
-            y0 + row - top + _vertex(surface[:, column], row),
-        )
-    return motion, score
+        displacement = _followed(points, motion, nodes, float(reduction))
+        found = FoundStart(displacement=displacement, confidence=confidence(reference, deformed, displacement))
+        if found.confidence > best:
+            best = found.confidence
+            yield found
+        if best >= _SURE:
+            return
 
 
-def _vertex(line: FloatImage, peak: int) -> float:
-    """Position of the vertex of the parabola through a peak and its two neighbours, relative to the peak."""
-    if peak == 0 or peak == len(line) - 1:
-        return 0.0
-    before, at, after = (float(value) for value in line[peak - 1 : peak + 2])
-    bend = before - 2 * at + after
-    return 0.5 * (before - after) / bend if bend < 0 else 0.0
+def _followed(points: FloatArray, motion: FloatArray, nodes: FloatArray, scale: float) -> FloatArray:
+    """Motion (N, 2) of the nodes: one affine field, and what the pairs around each add to it by a local one."""
+    middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
+    basis, at_nodes = (np.c_[np.ones(len(where)), (where - middle) / size] for where in (points, nodes))
+    affine = _robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
+    rest = motion - basis @ affine
+    distance, near = cKDTree(points).query(nodes, k=[*range(1, min(_FITTED, len(points)) + 1)])
+    step = (points[near] - nodes[:, None]) / np.maximum(distance[:, -1:, None], 1.0)
+    local = np.concatenate([np.ones((*step.shape[:2], 1)), step], axis=2)
+    return np.asarray(at_nodes @ affine + _robust_fit(local, rest[near], 0.3, scale)[:, 0])
 
 
-def _smooth_outliers(points: FloatArray, motion: FloatArray, score: FloatArray, *, tolerance: float) -> FloatArray:
-    """Replace motions with a low score or far from their neighbours' median by the median of good neighbours."""
-    if len(points) < 4:
-        good = score > _SCORE
-        return np.where(good[:, None], motion, np.median(motion[good], axis=0) if good.any() else 0.0)
-    neighbours = np.asarray(cKDTree(points).query(points, k=min(9, len(points)))[1])[:, 1:]
-    found = np.where((score > _SCORE)[:, None], motion, np.nan)
-    with np.errstate(all="ignore"):
-        for _ in range(2):
-            around = found[neighbours]
-            median = _nanmedian(around)
-            spread = _nanmedian(np.abs(around - median[:, None]))
-            off = np.abs(found - median) > tolerance + 3 * spread
-            found[off.any(axis=1)] = np.nan
-    return _fill_from_nearest(points, found)
-
-
-def _nanmedian(values: FloatArray) -> FloatArray:
-    """Median over axis 1 without NaN; NaN where nothing is left, without a warning."""
-    empty = np.asarray(np.isnan(values).all(axis=1, keepdims=True))
-    result = np.nanmedian(np.where(empty, 0.0, values), axis=1)
-    return np.where(empty[:, 0], np.nan, result)
-
-
-def _fill_from_nearest(points: FloatArray, motion: FloatArray) -> FloatArray:
-    good = np.isfinite(motion).all(axis=1)
-    if not good.any():
-        return np.zeros_like(motion)
-    count = min(4, int(good.sum()))
-    distance, index = cKDTree(points[good]).query(points[~good], k=[*range(1, count + 1)])
-    weight = 1 / np.maximum(distance, 1e-6)
-    filled = motion.copy()
-    filled[~good] = (motion[good][index] * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]
-    return filled
-
-
-def _interpolate(points: FloatArray, motion: FloatArray, nodes: FloatArray) -> FloatArray:
-    """Motion at the nodes: linear between the windows, by the best affine field beyond them."""
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import QhullError
-
-    basis = np.c_[np.ones(len(points)), points - points.mean(axis=0)]
-    if len(points) < 6:
-        return np.broadcast_to(np.median(motion, axis=0), nodes.shape).copy()
-    affine = np.linalg.lstsq(basis, motion, rcond=1e-6)[0]
-    outside = np.c_[np.ones(len(nodes)), nodes - points.mean(axis=0)] @ affine
-    try:
-        # the affine part is interpolated exactly; the rest is what the windows add to it, fading outwards
-        rest = LinearNDInterpolator(points, motion - basis @ affine)(nodes)
-    except (QhullError, ValueError):
-        return np.asarray(outside)
-    nearest = _fill_from_nearest(nodes, rest)
-    return np.asarray(outside + nearest)
-
-
-def _refine(reference: Reference, f: FloatImage, g: FloatImage, start: FloatArray) -> FloatArray:
-    nodes = reference.mesh.nodes
-    motion, score = _match(f, g, nodes, min(_FINE_WINDOW, *f.shape), _FINE_RADIUS, start)
-    # a window at the image's edge is centred inside; its motion is still the best there is
-    return _smooth_outliers(nodes, motion, score, tolerance=1.0)
+def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: float) -> FloatArray:
+    """Coefficients (T, 3, 2) of T fits of `motion` (T, K, 2) by `basis` (T, K, 3), whose first function is 1, with
+    Cauchy weights of `scale` px; `ridge` holds the slopes back where the points do not tell them."""
+    weight = np.ones(basis.shape[:2])
+    held = np.diag([1e-6, ridge, ridge])
+    for _ in range(_TURNS):
+        # no BLAS, whose sums may depend on the number of threads
+        weighted = (basis * weight[..., None])[..., None]
+        normal, right = ((weighted * side[:, :, None]).sum(axis=1) for side in (basis, motion))
+        found = np.linalg.solve(normal + held, right)
+        off = np.linalg.norm(motion - np.einsum("tka,tab->tkb", basis, found), axis=2)
+        weight = 1 / (1 + (off / scale) ** 2)
+    return np.asarray(found)

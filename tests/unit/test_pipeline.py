@@ -326,7 +326,7 @@ def test_the_last_frame_is_the_start_of_the_next(tmp_path):
     motions = [(5.0 * i, -4.0 * i) for i in range(6)]
     write_series(tmp_path / "grey", 0, motions)
     text = f'path = "grey"\n{STATED}'
-    settings = settings_of(tmp_path, text, solver={"search_radius": 8}, region={"rectangle": [20, 45, 100, 125]})
+    settings = settings_of(tmp_path, text, region={"rectangle": [20, 45, 100, 125]})
     result = measure(settings, tmp_path / "result")
     assert (result.status == Status.CONVERGED).all()
     np.testing.assert_allclose(result.u[5], 25, atol=0.05)

@@ -50,7 +50,6 @@ blur = 3
 [solver]
 prefilter = "gaussian"
 rigid = "translation"
-search_radius = 10
 tolerance = 1e-4
 max_iterations = 30
 [scale]

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from rgbmidic.correlation import Deformed, Reference, Solution, solve
-from rgbmidic.correlation.start import coarse_start
+from rgbmidic.correlation.start import find_start
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -148,13 +148,9 @@ class Competitor:
             chosen.values, _weights(chosen, self.threshold, self.blur), prefilter=self.reference.prefilter
         )
         if start is None:
-            start = coarse_start(self.reference, deformed, _SEARCH)
+            start = find_start(self.reference, deformed).displacement
         options = SolverSettings(brightness=METHODS[self.method].brightness)
         return solve(self.reference, deformed, start, options, statistics=False)
-
-
-_SEARCH = 64.0
-"""Largest motion (px) that is looked for."""
 
 
 def _weights(images: IlluminationImages, threshold: float | None, blur: float) -> FloatImage:
