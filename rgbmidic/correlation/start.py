@@ -173,7 +173,7 @@ def _interpolate(points: FloatArray, motion: FloatArray, nodes: FloatArray) -> F
 
 
 def _refine(reference: Reference, f: FloatImage, g: FloatImage, start: FloatArray) -> FloatArray:
-    nodes = reference.mesh.nodes
+    nodes = reference.mesh.places
     motion, score = _match(f, g, nodes, min(_FINE_WINDOW, *f.shape), _FINE_RADIUS, start)
     # a window at the image's edge is centred inside; its motion is still the best there is
     return _smooth_outliers(nodes, motion, score, tolerance=1.0)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
-from scipy.spatial import cKDTree
-
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import coarse_start, refine_start
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import FloatArray
 
@@ -38,9 +36,8 @@ class Start:
         measured = solution.measured
         if not measured.any():
             return self
-        nearest = cKDTree(solution.nodes[measured]).query(solution.nodes)[1]
-        filled = np.where(measured[:, None], solution.displacement, solution.displacement[measured][nearest])
-        return Start(displacement=filled, unmeasured=solution.unmeasured_share)
+        nearest = Tri3Mesh(nodes=solution.nodes, elements=solution.elements).nearest(measured)[1]
+        return Start(displacement=solution.displacement[nearest], unmeasured=solution.unmeasured_share)
 
 
 LARGEST_TURN = 8.0
