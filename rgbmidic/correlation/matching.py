@@ -11,7 +11,7 @@ from rgbmidic.correlation.residual import Residual
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["matching_elements", "misfit"]
+__all__ = ["correlation", "matching_elements", "misfit"]
 
 _MATCHED = (0.4, 0.6)
 """Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
@@ -34,9 +34,9 @@ def matching_elements(
     """
     mesh = residual.reference.mesh
     fg, ff, gg = _centred_products(residual, _light_precision(residual, precision))
-    own = _correlation(fg, ff, gg)
+    own = correlation(fg, ff, gg)
     # a few speckles can match by chance; those of all elements around a node hardly
-    around = _correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
+    around = correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
     coefficient = np.minimum(own, np.median(around[mesh.elements], axis=1))
     if least is not None:
         return np.asarray(coefficient >= least)
@@ -92,7 +92,7 @@ def _centred_products(residual: Residual, precision: FloatArray) -> FloatArray:
     return products
 
 
-def _correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
+def correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
     """Correlation coefficient from centred products; 1 where the reference has nothing to compare, 0 where only the
     deformed image has nothing."""
     empty = ff <= 1e-9 * ff.max(initial=0.0)

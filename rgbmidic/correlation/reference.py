@@ -22,7 +22,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
-__all__ = ["Deformed", "Reference"]
+__all__ = ["Deformed", "Reference", "drawn"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,8 +105,8 @@ class Reference:
         ready, usable = _prepare(images, weights, prefilter)
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
             usable = usable * usable_pixels(region.mask, prefilter)
-        if len(cracks := mesh.cracks):  # what lies beyond a crack moves otherwise
-            usable = usable * usable_pixels(~_drawn(cracks, region.mask.shape), prefilter)
+        if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
+            usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
         pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
         samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
         weighted = pixels.gather(usable)
@@ -198,7 +198,7 @@ def _prepare(images: FloatImage, weights: FloatImage | None, prefilter: str) -> 
     return ready, usable if weights is None else usable * weights
 
 
-def _drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
     """Pixels (H, W) under lines with the ends (C, 2, 2) in px."""
     image = np.zeros(shape, dtype=np.uint8)
     shift = 8  # fixed-point bits of OpenCV's coordinates

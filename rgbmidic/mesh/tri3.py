@@ -181,15 +181,12 @@ class Tri3Mesh:
         return np.asarray(pairs[count == 1])
 
     @property
-    def cracks(self) -> FloatArray:
-        """Ends (x, y) in px of the pieces of the cracks: edges at one place that belong to one element each, shape
-        (C, 2, 2)."""
-        edges = self._boundary_edges()
-        place = np.arange(len(self.nodes))
+    def crack_edges(self) -> npt.NDArray[np.int32]:
+        """Edges of both sides of the cracks, shape (C, 2): those at one place that belong to one element each."""
+        edges, place = self._boundary_edges(), np.arange(len(self.nodes))
         np.minimum.at(place, self.copies[:, 1], self.copies[:, 0])
-        keys = edge_keys(place[edges], len(place))
-        _, first, count = np.unique(keys, return_index=True, return_counts=True)
-        return self.nodes[edges[first[count > 1]]]
+        _, index, count = np.unique(edge_keys(place[edges], len(place)), return_inverse=True, return_counts=True)
+        return np.asarray(edges[count[index] > 1])
 
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
