@@ -273,6 +273,8 @@ class TestSettings:
         ``file`` in ``[calibration]``; needed for colour frames.
     element_size
         ``element_size`` in ``[mesh]``: side of the elements in px.
+    cracks
+        ``cracks`` in ``[mesh]``: paths, each of corners (x, y) in px on the reference, along which the mesh is split.
     base
         Folder that relative paths start from.
     """
@@ -283,6 +285,7 @@ class TestSettings:
     region: RegionSettings
     calibration_file: Path | None = field(default=None, metadata={"key": "calibration.file"})
     element_size: float = field(default=ELEMENT_SIZE, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
+    cracks: tuple[tuple[tuple[float, float], ...], ...] = field(default=(), metadata={"key": "mesh.cracks"})
     illumination: IlluminationSettings = field(default_factory=IlluminationSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
@@ -291,6 +294,11 @@ class TestSettings:
 
     def __post_init__(self) -> None:
         _check_bounds(self, "")
+        for number, crack in enumerate(self.cracks):
+            if len(crack) < 2:
+                raise ConfigurationError(
+                    f"mesh.cracks[{number}] needs at least two corners [x, y]; given is {_plain(crack)}"
+                )
         if self.frames.kind in ("bayer", "rgb") and self.calibration_file is None:
             raise ConfigurationError(
                 f'frames.kind = "{self.frames.kind}" needs the lights\' crosstalk: state calibration.file, a file that '
@@ -477,11 +485,20 @@ def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path) ->
     if kinds == (int, Ellipsis) and isinstance(value, str):
         return tuple(read_range(value, where))
     if len(kinds) == 2 and kinds[1] is Ellipsis:
-        entries = value if isinstance(value, list | tuple) else [value]  # a single one needs no brackets
+        entries = value if _depth(value) > _hint_depth(kinds[0]) else [value]  # a single one needs no brackets
         return tuple(convert_value(entry, kinds[0], where, base) for entry in entries)
     if not isinstance(value, list | tuple) or len(value) != len(kinds):
         raise ConfigurationError(f"{where} must be {len(kinds)} values in brackets, not {_quoted(value)}")
     return tuple(convert_value(entry, kind, where, base) for entry, kind in zip(value, kinds, strict=True))
+
+
+def _depth(value: Any) -> int:
+    """How deep lists are nested in a value; an empty one may be of any depth."""
+    return 1 + min(map(_depth, value), default=9) if isinstance(value, list | tuple) else 0
+
+
+def _hint_depth(hint: Any) -> int:
+    return 1 + _hint_depth(get_args(hint)[0]) if get_origin(hint) is tuple else 0
 
 
 def _quoted(value: Any) -> str:

@@ -2,8 +2,21 @@
 
 from rgbmidic.correlation.correlate import correlate
 from rgbmidic.correlation.reference import Deformed, Reference
+from rgbmidic.correlation.renewal import Renewal, needs_renewal
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.track import Start, track
 
-__all__ = ["Deformed", "NodeStatus", "Reference", "Solution", "Start", "Status", "correlate", "solve", "track"]
+__all__ = [
+    "Deformed",
+    "NodeStatus",
+    "Reference",
+    "Renewal",
+    "Solution",
+    "Start",
+    "Status",
+    "correlate",
+    "needs_renewal",
+    "solve",
+    "track",
+]

@@ -29,6 +29,7 @@ def correlate(
     *,
     region: Sequence[float] | Region | None = None,
     element_size: float = ELEMENT_SIZE,
+    cracks: Sequence[npt.ArrayLike] = (),
     weights: npt.ArrayLike | None = None,
     initial: npt.ArrayLike | None = None,
     deformed_weights: npt.ArrayLike | None = None,
@@ -46,6 +47,8 @@ def correlate(
         Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None takes the whole image.
     element_size
         Side of the triangles in px.
+    cracks
+        Paths, each of corners (x, y) in px, along which the mesh is split, see `Tri3Mesh.from_region`.
     weights : array_like, shape (H, W) or (k, H, W), optional
         Weight of each light at each pixel of the reference, finite and not negative; 0 excludes.
     initial : array_like, shape (2,) or (N, 2), optional
@@ -79,7 +82,7 @@ def correlate(
     height, width = f.shape[1:]
     if not isinstance(region, Region):
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
-    mesh = Tri3Mesh.from_region(region, element_size)
+    mesh = Tri3Mesh.from_region(region, element_size, cracks)
     solver = _solver_settings(options)
     if normalise is not None:
         f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))

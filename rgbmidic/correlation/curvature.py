@@ -121,7 +121,7 @@ def _curvature(reference: Reference, displacement: FloatArray, measured: BoolArr
     deep = np.flatnonzero(_deep(reference, measured))
     if not len(deep):
         return np.zeros_like(symmetric)
-    distance, nearest = (np.asarray(a) for a in cKDTree(mesh.nodes[deep]).query(mesh.nodes))
+    distance, nearest = (np.asarray(a) for a in cKDTree(mesh.nodes[deep]).query(mesh.places))
     # towards an edge the gradient is one-sided: there the curvature is that of the nearest node that knows it
     near = distance <= _FARTHEST * mesh.size
     return np.where(near[:, None, None], symmetric[deep][nearest], 0)

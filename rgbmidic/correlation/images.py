@@ -17,6 +17,7 @@ __all__ = [
     "fill_holes",
     "spline_coefficients",
     "usable_pixels",
+    "usable_reach",
 ]
 
 
@@ -77,9 +78,14 @@ def apply_prefilter(image: FloatImage, prefilter: str) -> FloatImage:
     return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
 
 
+def usable_reach(prefilter: str) -> int:
+    """Pixels to each side that a filtered value and its spline use."""
+    return len(PREFILTERS[prefilter]) // 2 + 1
+
+
 def usable_pixels(valid: BoolArray, prefilter: str) -> BoolArray:
     """Pixels whose filtered value and spline neighbourhood use valid pixels inside the image only."""
-    reach = len(PREFILTERS[prefilter]) // 2 + 1
+    reach = usable_reach(prefilter)
     element = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
     return cv2.erode(valid.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(bool)
 

@@ -11,7 +11,7 @@ from rgbmidic.correlation.residual import Residual
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["correlation_around", "matching_elements", "misfit"]
+__all__ = ["correlation", "correlation_around", "matching_elements", "misfit"]
 
 _MATCHED = (0.4, 0.6)
 """Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
@@ -34,9 +34,9 @@ def matching_elements(
     """
     mesh = residual.reference.mesh
     fg, ff, gg = _centred_products(residual, _light_precision(residual, precision))
-    own = _correlation(fg, ff, gg)
+    own = correlation(fg, ff, gg)
     # a few speckles can match by chance; those of all elements around a node hardly
-    around = _correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
+    around = correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
     coefficient = np.minimum(own, np.median(around[mesh.elements], axis=1))
     if least is not None:
         return np.asarray(coefficient >= least)
@@ -50,7 +50,7 @@ def correlation_around(residual: Residual) -> FloatArray:
     states show no texture together."""
     to_nodes = residual.reference.mesh.to_nodes
     fg, ff, gg = (to_nodes(part) for part in _centred_products(residual, _light_precision(residual, None)))
-    return np.where(ff > 1e-9 * ff.max(initial=0.0), _correlation(fg, ff, gg), np.nan)
+    return np.where(ff > 1e-9 * ff.max(initial=0.0), correlation(fg, ff, gg), np.nan)
 
 
 def _median_around(mesh: Tri3Mesh, values: FloatArray, textured: BoolArray) -> FloatArray:
@@ -100,7 +100,7 @@ def _centred_products(residual: Residual, precision: FloatArray) -> FloatArray:
     return products
 
 
-def _correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
+def correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
     """Correlation coefficient from centred products; 1 where the reference has nothing to compare, 0 where only the
     deformed image has nothing."""
     empty = ff <= 1e-9 * ff.max(initial=0.0)

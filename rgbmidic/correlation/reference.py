@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import scipy.sparse as sp
 
@@ -19,9 +20,9 @@ from rgbmidic.correlation.uncertainty.propagation import (
 )
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
-__all__ = ["Deformed", "Reference"]
+__all__ = ["Deformed", "Reference", "drawn"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,6 +105,8 @@ class Reference:
         ready, usable = _prepare(images, weights, prefilter)
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
             usable = usable * usable_pixels(region.mask, prefilter)
+        if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
+            usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
         pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
         samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
         weighted = pixels.gather(usable)
@@ -193,6 +196,14 @@ def _prepare(images: FloatImage, weights: FloatImage | None, prefilter: str) -> 
     ready = np.stack([apply_prefilter(fill_holes(image, np.isfinite(image)), prefilter) for image in images])
     usable = np.stack([usable_pixels(known, prefilter) for known in valid]).astype(np.float32)
     return ready, usable if weights is None else usable * weights
+
+
+def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+    """Pixels (H, W) under lines with the ends (C, 2, 2) in px."""
+    image = np.zeros(shape, dtype=np.uint8)
+    shift = 8  # fixed-point bits of OpenCV's coordinates
+    cv2.polylines(image, list(np.round(lines * 2**shift).astype(np.int32)), False, 1, shift=shift)
+    return image.astype(bool)
 
 
 def _values_and_gradient(image: FloatImage, pixels: PixelMap) -> FloatImage:

@@ -17,6 +17,7 @@ from rgbmidic.correlation.keypoints import Box, Keypoints, pairs
 from rgbmidic.correlation.matching import correlation_around
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import Residual
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
 __all__ = ["FoundStart", "confidence", "find_start", "find_starts"]
@@ -96,7 +97,7 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
         points, motion = pairs(f, g, 2.0 * reduction)
         if not len(points):
             continue
-        displacement = _followed(points, motion, nodes, float(reduction))
+        displacement = _followed(points, motion, reference.mesh, float(reduction))
         found = FoundStart(displacement=displacement, confidence=confidence(reference, deformed, displacement))
         if found.confidence > best:
             best = found.confidence
@@ -105,13 +106,15 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
             return
 
 
-def _followed(points: FloatArray, motion: FloatArray, nodes: FloatArray, scale: float) -> FloatArray:
-    """Motion (N, 2) of the nodes: one affine field, and what the pairs around each add to it by a local one."""
+def _followed(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
+    """Motion (N, 2) of the nodes: one affine field, and what the pairs around each add to it by a local one; around
+    the nodes at a crack those on their own side."""
+    nodes = mesh.nodes
     middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
     basis, at_nodes = (np.c_[np.ones(len(where)), (where - middle) / size] for where in (points, nodes))
     affine = _robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
     rest = motion - basis @ affine
-    distance, near = cKDTree(points).query(nodes, k=[*range(1, min(_FITTED, len(points)) + 1)])
+    distance, near = map(np.asarray, cKDTree(points).query(mesh.places, k=[*range(1, min(_FITTED, len(points)) + 1)]))
     step = (points[near] - nodes[:, None]) / np.maximum(distance[:, -1:, None], 1.0)
     local = np.concatenate([np.ones((*step.shape[:2], 1)), step], axis=2)
     return np.asarray(at_nodes @ affine + _robust_fit(local, rest[near], 0.3, scale)[:, 0])

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import FoundStart, find_starts
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -34,19 +34,19 @@ class Start:
     unmeasured: float = 0.0
 
     @classmethod
-    def after(cls, nodes: FloatArray, displacement: FloatArray, measured: BoolArray) -> Start:
+    def after(cls, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray) -> Start:
         """The start of the frame after one in which some nodes are measured: the others move as the nearest of them.
 
         Parameters
         ----------
-        nodes, displacement : ndarray, shape (N, 2)
-            Positions and displacements in px.
+        mesh
+            On the reference.
+        displacement : ndarray, shape (N, 2)
+            Of that frame, px.
         measured : ndarray, shape (N,)
             Which of them are measured: one at least.
         """
-        nearest = cKDTree(nodes[measured]).query(nodes)[1]
-        filled = np.where(measured[:, None], displacement, displacement[measured][nearest])
-        return cls(displacement=filled, unmeasured=float((~measured).mean()))
+        return cls(displacement=displacement[mesh.nearest(measured)[1]], unmeasured=float((~measured).mean()))
 
 
 LARGEST_TURN = 30.0

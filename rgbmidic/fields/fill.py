@@ -25,19 +25,17 @@ def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
 
     Filled nodes get `NodeStatus.FILLED` and a larger `displacement_std`; strains are left as they are.
     """
-    from scipy.spatial import cKDTree
-
     measured = solution.measured
     if measured.all() or measured.sum() < 6:
         return solution
-    distance, nearest = cKDTree(mesh.nodes[measured]).query(mesh.nodes)
+    distance, nearest = mesh.nearest(measured)
     filled = ~measured & (distance <= longest)
     if not filled.any():
         return solution
     trend, rest = _quadratic_trend(mesh.nodes, solution.displacement, measured)
     step = _step_between_neighbours(mesh, rest, measured)
     size = float(np.sqrt(2 * mesh.areas.mean()))
-    std = np.hypot(solution.displacement_std[measured][nearest], step * np.sqrt(distance / size)[:, None])
+    std = np.hypot(solution.displacement_std[nearest], step * np.sqrt(np.minimum(distance, longest) / size)[:, None])
     displacement = trend + _smooth(mesh, rest, measured)
     return replace(
         solution,

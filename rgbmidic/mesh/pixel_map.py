@@ -72,7 +72,7 @@ class PixelMap:
         owner = np.where(region.mask, np.int32(-1), np.int32(-2))
         counts = np.zeros(len(mesh.elements), dtype=np.int64)
         claim_pixels(mesh.nodes, mesh.elements, owner, counts)
-        if region.rectangle is None:
+        if (owner == -1).any():
             counts = _claim_rim(owner, counts)
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         if offsets[-1] == 0:

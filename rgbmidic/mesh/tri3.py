@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypedDict
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, RegionError
+from rgbmidic.mesh.cracks import edge_keys
+from rgbmidic.mesh.outline import outline_mesh
 from rgbmidic.mesh.region import Region
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -55,18 +56,29 @@ class Tri3Mesh:
         object.__setattr__(self, "elements", elements)
 
     @classmethod
-    def from_region(cls, region: Region, element_size: float) -> Tri3Mesh:
+    def from_region(cls, region: Region, element_size: float, cracks: Sequence[npt.ArrayLike] = ()) -> Tri3Mesh:
         """Mesh a region with triangles whose legs are about `element_size` px.
 
-        A rectangle gets a regular mesh; other regions a Delaunay mesh that follows their outline and holes. The log
-        tells of a region that is narrow or smaller than an element.
+        A rectangle gets a regular mesh; other regions, and those with cracks, a Delaunay mesh that follows their
+        outline, holes and cracks. The log tells of a region that is narrow or smaller than an element.
+
+        Parameters
+        ----------
+        region
+            The pixels to measure.
+        element_size
+            Side of the triangles in px.
+        cracks
+            Paths, each of corners (x, y) in px, shape (M, 2), along which the mesh is split: elements on both sides
+            share the node at a tip within the region, and no other. A path may begin beyond the region; one that ends
+            within 0.3 elements of its edge ends on it, one within half an element of an earlier path branches off it.
 
         Raises
         ------
         InputError
-            `element_size` is under 4 px: too few pixels for six unknowns.
+            `element_size` is under 4 px: too few pixels for six unknowns; a path is not two or more corners.
         RegionError
-            The region is too small for one element.
+            The region is too small for one element, or a crack misses it.
         """
         if not (np.isfinite(element_size) and element_size >= 4):
             raise InputError(f"element_size must be at least 4 px; given is {element_size!r}")
@@ -76,9 +88,11 @@ class Tri3Mesh:
             logger.warning(
                 "the elements of %g px are larger than the region, which is %d px across", element_size, region.width
             )
-        if region.rectangle is not None:
-            return cls(**_rectangle_mesh(region.rectangle, element_size))
-        return cls(**_outline_mesh(region.mask, element_size))
+        if region.rectangle is not None and not len(cracks):
+            nodes, elements = _rectangle_mesh(region.rectangle, element_size)
+            return cls(nodes=nodes, elements=elements)
+        nodes, elements = outline_mesh(region.mask, element_size, cracks)
+        return cls(nodes=nodes, elements=elements)
 
     @property
     def areas(self) -> FloatArray:
@@ -89,6 +103,39 @@ class Tri3Mesh:
     def size(self) -> float:
         """Typical leg of an element in px: that of a right isosceles triangle of the median area."""
         return float(np.sqrt(2 * np.median(self.areas)))
+
+    @property
+    def copies(self) -> npt.NDArray[np.int32]:
+        """Pairs of nodes at one place, on two sides of a crack, shape (C, 2)."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.nodes).query_pairs(1e-9, output_type="ndarray").astype(np.int32)
+
+    @property
+    def places(self) -> FloatArray:
+        """Where the images show what moves with each node, shape (N, 2): at the node, and for one on a side of a crack
+        in the middle of the elements around it."""
+        moments = (self.nodes[self.elements].mean(axis=1) * self.areas[:, None]).T
+        middle = np.stack([self.to_nodes(part) for part in moments], axis=1) / self.to_nodes(self.areas)[:, None]
+        places, split = self.nodes.copy(), self.copies.ravel()
+        places[split] = middle[split]
+        return places
+
+    def nearest(self, chosen: BoolArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+        """Distance (N,) in px and index (N,) of the nearest of the `chosen` nodes (N,), along the edges of the mesh.
+
+        The way is not across a crack or a hole; a part without any takes the nearest of another, infinitely far.
+        """
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import dijkstra
+        from scipy.spatial import cKDTree
+
+        (i, j), count, sources = self.neighbours.T, len(self.nodes), np.flatnonzero(chosen)
+        graph = coo_matrix((np.hypot(*(self.nodes[i] - self.nodes[j]).T), (i, j)), shape=(count, count))
+        distance, _, index = dijkstra(graph, directed=False, indices=sources, min_only=True, return_predecessors=True)
+        apart = ~np.isfinite(distance)
+        index[apart] = sources[cKDTree(self.nodes[sources]).query(self.nodes[apart])[1]]
+        return distance, index.astype(np.int64)
 
     def to_nodes(self, per_element: FloatArray) -> FloatArray:
         """Sum of a value per element (E,) over the elements around each node, shape (N,)."""
@@ -123,11 +170,23 @@ class Tri3Mesh:
     @property
     def on_boundary(self) -> BoolArray:
         """True for nodes on an edge that belongs to one element only, shape (N,)."""
+        boundary = np.zeros(len(self.nodes), dtype=bool)
+        boundary[self._boundary_edges()] = True
+        return boundary
+
+    def _boundary_edges(self) -> npt.NDArray[np.int32]:
+        """Edges (B, 2) that belong to one element only."""
         edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
         pairs, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-        boundary = np.zeros(len(self.nodes), dtype=bool)
-        boundary[pairs[count == 1]] = True
-        return boundary
+        return np.asarray(pairs[count == 1])
+
+    @property
+    def crack_edges(self) -> npt.NDArray[np.int32]:
+        """Edges of both sides of the cracks, shape (C, 2): those at one place that belong to one element each."""
+        edges, place = self._boundary_edges(), np.arange(len(self.nodes))
+        np.minimum.at(place, self.copies[:, 1], self.copies[:, 0])
+        _, index, count = np.unique(edge_keys(place[edges], len(place)), return_inverse=True, return_counts=True)
+        return np.asarray(edges[count[index] > 1])
 
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
@@ -136,18 +195,15 @@ class Tri3Mesh:
         return np.unique(np.sort(edges, axis=1), axis=0)
 
 
-class _Parts(TypedDict):
-    nodes: FloatArray
-    elements: npt.NDArray[np.int32]
-
-
 def _signed_area(nodes: FloatArray, elements: npt.NDArray[np.int32]) -> FloatArray:
     p = nodes[elements]
     a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     return np.asarray((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2)
 
 
-def _rectangle_mesh(rectangle: tuple[float, float, float, float], size: float) -> _Parts:
+def _rectangle_mesh(
+    rectangle: tuple[float, float, float, float], size: float
+) -> tuple[FloatArray, npt.NDArray[np.int32]]:
     x0, y0, x1, y1 = rectangle
     if min(x1 - x0, y1 - y0) < 4:
         raise RegionError(f"the region {rectangle} is too small: an element needs at least 4 x 4 px")
@@ -162,63 +218,4 @@ def _rectangle_mesh(rectangle: tuple[float, float, float, float], size: float) -
     first = np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
     second = np.where(even, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     elements = np.stack([first, second], 1).reshape(-1, 3).astype(np.int32)
-    return {"nodes": np.stack([x.ravel(), y.ravel()], 1), "elements": elements}
-
-
-def _outline_mesh(mask: BoolArray, size: float) -> _Parts:
-    from scipy.spatial import Delaunay, QhullError
-
-    outline = _outline_points(mask, size)
-    padded = np.pad(mask, 1).astype(np.uint8)
-    depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    inner = _lattice_points(mask.shape, size)
-    inner = inner[depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > 0.6 * size]
-    points = np.concatenate([outline, inner])
-    try:
-        triangles = Delaunay(points).simplices
-    except (QhullError, ValueError):
-        raise RegionError(f"the region of {int(mask.sum())} px is too small for one element of {size} px") from None
-    centre = np.round(points[triangles].mean(axis=1)).astype(int)
-    inside = mask[np.clip(centre[:, 1], 0, mask.shape[0] - 1), np.clip(centre[:, 0], 0, mask.shape[1] - 1)]
-    large = np.abs(_signed_area(points, triangles.astype(np.int32))) > 0.02 * size**2
-    triangles = triangles[inside & large]
-    if not len(triangles):
-        raise RegionError(f"the region of {int(mask.sum())} px is too small for one element of {size} px")
-    used, elements = np.unique(triangles, return_inverse=True)
-    return {"nodes": points[used], "elements": elements.reshape(-1, 3).astype(np.int32)}
-
-
-def _lattice_points(shape: tuple[int, int], size: float) -> FloatArray:
-    """Points of a triangular lattice with pitch `size` over an image of `shape`."""
-    rise = size * np.sqrt(3) / 2
-    rows = np.arange(rise / 2, shape[0] - 1, rise)
-    x = np.arange(0, shape[1] - 1 - size / 2, size)
-    points = [np.stack([x + (i % 2) * size / 2, np.full_like(x, y)], 1) for i, y in enumerate(rows)]
-    return np.concatenate(points) if points else np.empty((0, 2))
-
-
-def _outline_points(mask: BoolArray, size: float) -> FloatArray:
-    """Points about `size` px apart along the region's outline and holes; corners are kept."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    points = []
-    for contour in contours:
-        corners = cv2.approxPolyDP(contour, max(1.0, 0.06 * size), True)[:, 0].astype(np.float64)
-        if len(corners) < 3:
-            continue
-        for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            pieces = max(1, round(float(np.hypot(*(end - start))) / size))
-            points.append(start + np.arange(pieces)[:, None] / pieces * (end - start))
-    if not points:
-        return np.empty((0, 2))
-    return _without_crowding(np.concatenate(points), 0.3 * size)
-
-
-def _without_crowding(points: FloatArray, distance: float) -> FloatArray:
-    """Drop every point that lies closer than `distance` to a kept one before it."""
-    from scipy.spatial import cKDTree
-
-    keep = np.ones(len(points), dtype=bool)
-    for i, j in sorted(cKDTree(points).query_pairs(distance)):
-        if keep[i]:
-            keep[j] = False
-    return points[keep]
+    return np.stack([x.ravel(), y.ravel()], 1), elements

@@ -71,7 +71,7 @@ class Plan:
         separation = Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         images, separation = separation.reference(first, map(series.read, others))
         region = read_region(settings.region, images.shape)
-        mesh = Tri3Mesh.from_region(region, settings.element_size)
+        mesh = Tri3Mesh.from_region(region, settings.element_size, settings.cracks)
         weights = prepare_weights(
             settings, images, region, frames=len(series), images_of=lambda index: separation(series.read(index))
         )

@@ -165,7 +165,7 @@ class Schedule:
         if not measured.any():
             return None
         displacement = np.stack([kept["u"], kept["v"]], axis=1)
-        return Start.after(self._plan.reference.mesh.nodes, displacement, measured)
+        return Start.after(self._plan.reference.mesh, displacement, measured)
 
 
 def _error(future: Future[Measured]) -> BaseException | None:

@@ -115,6 +115,13 @@ def test_geometry_is_relative_to_the_file_and_survives_the_mapping(tmp_path: Pat
     assert TestSettings.from_mapping(settings.to_mapping(), settings.base) == settings
 
 
+@pytest.mark.parametrize("stated", ["[[0, 5], [9, 5.5]]", "[[[0, 5], [9, 5.5]]]"])
+def test_a_single_crack_needs_no_outer_brackets_and_survives_the_mapping(tmp_path: Path, stated: str) -> None:
+    settings = _read(tmp_path, f"{LEAST}[mesh]\ncracks = {stated}")
+    assert settings.cracks == (((0.0, 5.0), (9.0, 5.5)),)
+    assert TestSettings.from_mapping(settings.to_mapping(), settings.base) == settings
+
+
 def test_mask_is_relative_to_the_file(tmp_path: Path) -> None:
     settings = _read(tmp_path, LEAST.replace("rectangle = [10, 20, 110, 220]", 'mask = "masks/region.png"'))
     assert settings.region.mask == tmp_path.resolve() / "masks" / "region.png"
@@ -174,6 +181,8 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST.replace("rectangle = [10, 20, 110, 220]", "polygon = [[0, 0], [1, 1]]"), r"at least three corners"),
         (LEAST.replace("10, 20, 110", "10, nan, 110"), r"region\.rectangle must be finite"),
         (LEAST + "[mesh]\nelement_size = 0", r"mesh\.element_size must be above 0, not 0"),
+        (LEAST + "[mesh]\ncracks = [[[0, 5]]]", r"mesh\.cracks\[0\] needs at least two corners \[x, y\]"),
+        (LEAST + "[mesh]\ncracks = [[[0, 5], [nan, 5]]]", r"mesh\.cracks must be finite, not nan"),
         (LEAST + "[mesh]\nelement_size = true", r"mesh\.element_size must be a number, not True"),
         (LEAST + "[mesh]\nelement_size = '25'", r'mesh\.element_size must be a number, not "25"'),
         (LEAST + "[weights]\nthreshold = 1.5", r"weights\.threshold must be at most 1, not 1.5"),

@@ -44,7 +44,8 @@ class NodeColouring:
         from scipy.spatial import cKDTree
 
         count = len(mesh.nodes)
-        i, j = mesh.neighbours.T
+        # nodes at one place count as neighbours: the nearest of a colour is found by distance
+        i, j = np.concatenate([mesh.neighbours, mesh.copies]).T
         edges = sp.coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
         ring = sp.csr_matrix(edges + edges.T + sp.eye(count, dtype=np.int8))
         reach = sp.csr_matrix(ring)
