@@ -33,9 +33,10 @@ class Start:
     displacement: FloatArray | None
     unmeasured: float = 0.0
 
-    @classmethod
-    def after(cls, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray) -> Start:
-        """The start of the frame after one in which some nodes are measured: the others move as the nearest of them.
+    def after(self, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray) -> Start:
+        """The start of the frame after one that started here: nodes that it lost move as the nearest measured one.
+
+        Where it lost all of them, the next frame starts here too.
 
         Parameters
         ----------
@@ -44,9 +45,11 @@ class Start:
         displacement : ndarray, shape (N, 2)
             Of that frame, px.
         measured : ndarray, shape (N,)
-            Which of them are measured: one at least.
+            Which of them are measured.
         """
-        return cls(displacement=displacement[mesh.nearest(measured)[1]], unmeasured=float((~measured).mean()))
+        if not measured.any():
+            return self
+        return Start(displacement=displacement[mesh.nearest(measured)[1]], unmeasured=float((~measured).mean()))
 
 
 LARGEST_TURN = 30.0

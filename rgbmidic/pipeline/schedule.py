@@ -118,7 +118,7 @@ class Schedule:
             record = first
         self._store.write_frame(position, record)
         self._finished[position] = True
-        following = self._following(record.values) or start
+        following = self._following(record.values, start)
         released = [child for child in children(position, len(self._finished)) if self._wanted[child]]
         for after in (*released, *self._waiting.pop(position, ())):
             heappush(self._ready, (after, following))
@@ -155,17 +155,14 @@ class Schedule:
         """
         table = self._store.table()
         for kept in table.each(["u", "v", "node_status"], range(position, -1, -1)):
-            if start := self._following(kept):
-                return start
+            if (kept["node_status"] == NodeStatus.MEASURED).any():
+                return self._following(kept, Start(displacement=None))
         return Start(displacement=None)
 
-    def _following(self, kept: Mapping[str, Any]) -> Start | None:
-        """Where a frame starts that follows one of which this is kept; None where nothing of that is measured."""
+    def _following(self, kept: Mapping[str, Any], start: Start) -> Start:
+        """Where a frame starts that follows one that started from `start` and of which this is kept."""
         measured = kept["node_status"] == NodeStatus.MEASURED
-        if not measured.any():
-            return None
-        displacement = np.stack([kept["u"], kept["v"]], axis=1)
-        return Start.after(self._plan.reference.mesh, displacement, measured)
+        return start.after(self._plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
 
 
 def _error(future: Future[Measured]) -> BaseException | None:

@@ -107,7 +107,7 @@ def test_filled_nodes_take_their_uncertainty_from_their_own_side():
     filled = fill(mesh, gaps, 100.0)
     assert (filled.node_status[hole] == NodeStatus.FILLED).all()
     assert filled.displacement_std[hole].max() < 5
-    start = Start(displacement=None).after(gaps).displacement
+    start = Start(displacement=None).after(mesh, gaps.displacement, gaps.measured).displacement
     assert np.abs(start - truth(mesh.nodes, above, 5.0))[hole].max() < 1.5
 
 
@@ -122,7 +122,7 @@ def followed(frames):
     for number, image in enumerate(frames):
         deformed = Deformed.prepare(as_light_stack(noisy(image, 2 + number), ""), prefilter="binomial")
         solutions.append(track(reference, deformed, start, SolverSettings()))
-        start = start.after(solutions[-1])
+        start = start.after(reference.mesh, solutions[-1].displacement, solutions[-1].measured)
     return solutions
 
 

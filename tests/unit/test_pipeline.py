@@ -371,7 +371,10 @@ def test_a_frame_measured_with_a_plan_from_another_process_gives_the_same_bits(b
     record, twin = (measure_frame(one, 1, start) for one in (plan, again))
     np.testing.assert_equal(record.values, twin.values)
     # nothing but the start ties a frame to the one before it
-    rest = Start(displacement=np.zeros_like(plan.reference.mesh.nodes))
+    at_rest = measure_frame(plan, 0, start)
+    rest = start.after(
+        plan.reference.mesh, np.stack([at_rest.u, at_rest.v], axis=1), at_rest.node_status == NodeStatus.MEASURED
+    )
     np.testing.assert_equal(measure_frame(plan, 1, rest).values, bayer_result.frame(1).values)
 
 

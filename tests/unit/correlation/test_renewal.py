@@ -45,7 +45,7 @@ def chained(images, renew):
             renewal.reference, deformed, Start(displacement=start.displacement - renewal.displacement), OPTIONS
         )
         solutions.append(renewal.accumulated(step, deformed))
-        start = start.after(solutions[-1])
+        start = start.after(renewal.first.mesh, solutions[-1].displacement, solutions[-1].measured)
         if solutions[-1].measured.any() and renew(number, renewal, deformed, step):
             renewal = renewal.renewed(solutions[-1], stack(image))
             renewed.append(number)
@@ -211,7 +211,8 @@ def test_both_sides_of_an_open_crack_are_followed_on_a_renewed_reference():
     start = Start(displacement=np.zeros_like(mesh.nodes))
     for width in (4.0, 8.0):
         solution = renewal.track(prepared(opened(width)), start, OPTIONS)
-        renewal, start = renewal.renewed(solution, stack(opened(width))), start.after(solution)
+        renewal = renewal.renewed(solution, stack(opened(width)))
+        start = start.after(renewal.first.mesh, solution.displacement, solution.measured)
     half = 8.0 * np.clip(1 - mesh.nodes[:, 0] / 110, 0, None) / 2
     expected = np.where(mesh.places[:, 1] < middle, -half, half)
     assert solution.measured.all()

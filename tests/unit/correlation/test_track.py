@@ -44,7 +44,7 @@ def test_a_specimen_that_leaves_is_found_again_and_a_restored_start_gives_the_sa
     for shift in (0.0, -110.0, -400.0, 60.0):
         solution = track(reference, moved(texture, Affine(shift=(shift, 0.0))), start, OPTIONS)
         restored = replace(start, displacement=None if start.displacement is None else start.displacement.copy())
-        start = start.after(solution)
+        start = start.after(reference.mesh, solution.displacement, solution.measured)
         statuses.append(solution.status)
     assert statuses[2] is Status.FAILED
     assert statuses[3] is Status.CONVERGED
