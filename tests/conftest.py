@@ -7,10 +7,6 @@ from pathlib import Path
 
 import pytest
 
-# Several test processes share the cores: threads that spin while they wait for work take them from one another, which
-# made the kernels ten times slower. To be set before the first parallel kernel runs.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

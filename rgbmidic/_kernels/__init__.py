@@ -7,6 +7,6 @@ __all__ = ["are_compiled"]
 
 def are_compiled() -> bool:
     """Whether kernels were compiled on this machine before: one that every solve needs is in the cache."""
-    from rgbmidic._kernels.correlation import element_hessian
+    from rgbmidic._kernels.mesh import claim_pixels
 
-    return any(Path(element_hessian.__wrapped__.stats.cache_path or "").glob("correlation.element_hessian*.nbi"))
+    return any(Path(claim_pixels.stats.cache_path or "").glob("mesh.claim_pixels*.nbi"))

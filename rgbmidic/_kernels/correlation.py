@@ -2,7 +2,8 @@
 
 Pixels are stored element by element: element e owns the slots ``offsets[e]:offsets[e + 1]``. Each element writes its
 own row of the output, so the sums are the same bits on any number of threads. Positions are kept relative to the
-element's origin pixel: float32 then resolves 1e-5 px on images of any size.
+element's origin pixel: float32 then resolves 1e-5 px on images of any size. Slots are counted without sign: an index
+that may be negative would be looked at for each pixel, and the loop not vectorised.
 """
 
 from __future__ import annotations
@@ -44,37 +45,16 @@ def _spline(coefficients, row, column, tx, ty):
     y0 = _SIXTH - np.float32(0.5) * (ty - t2) - y3
     y1 = np.float32(2.0 / 3.0) - t2 + np.float32(0.5) * t3
     y2 = _ONE - y0 - y1 - y3
-    r = row + (PAD - 1)
-    c = column + (PAD - 1)
+    r0 = np.uint64(row + (PAD - 1))
+    c0 = np.uint64(column + (PAD - 1))
+    r1, r2, r3 = r0 + np.uint64(1), r0 + np.uint64(2), r0 + np.uint64(3)
+    c1, c2, c3 = c0 + np.uint64(1), c0 + np.uint64(2), c0 + np.uint64(3)
+    k = coefficients
     return (
-        y0
-        * (
-            x0 * coefficients[r, c]
-            + x1 * coefficients[r, c + 1]
-            + x2 * coefficients[r, c + 2]
-            + x3 * coefficients[r, c + 3]
-        )
-        + y1
-        * (
-            x0 * coefficients[r + 1, c]
-            + x1 * coefficients[r + 1, c + 1]
-            + x2 * coefficients[r + 1, c + 2]
-            + x3 * coefficients[r + 1, c + 3]
-        )
-        + y2
-        * (
-            x0 * coefficients[r + 2, c]
-            + x1 * coefficients[r + 2, c + 1]
-            + x2 * coefficients[r + 2, c + 2]
-            + x3 * coefficients[r + 2, c + 3]
-        )
-        + y3
-        * (
-            x0 * coefficients[r + 3, c]
-            + x1 * coefficients[r + 3, c + 1]
-            + x2 * coefficients[r + 3, c + 2]
-            + x3 * coefficients[r + 3, c + 3]
-        )
+        y0 * (x0 * k[r0, c0] + x1 * k[r0, c1] + x2 * k[r0, c2] + x3 * k[r0, c3])
+        + y1 * (x0 * k[r1, c0] + x1 * k[r1, c1] + x2 * k[r1, c2] + x3 * k[r1, c3])
+        + y2 * (x0 * k[r2, c0] + x1 * k[r2, c1] + x2 * k[r2, c2] + x3 * k[r2, c3])
+        + y3 * (x0 * k[r3, c0] + x1 * k[r3, c1] + x2 * k[r3, c2] + x3 * k[r3, c3])
     )
 
 
@@ -150,7 +130,7 @@ def element_right_side(
         b12 = np.float32(barycentric[e, 1, 2])
         s00 = s01 = s02 = s10 = s11 = s12 = _ZERO
         rest = total = lost = _ZERO
-        for i in range(offsets[e], offsets[e + 1]):
+        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             lx = local_x[i]
             ly = local_y[i]
             px = ux + fxx * lx + fxy * ly
@@ -206,7 +186,7 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
         x00 = x01 = x11 = x02 = x12 = x22 = _ZERO
         m00 = m01 = m11 = m02 = m12 = m22 = _ZERO
         y00 = y01 = y11 = y02 = y12 = y22 = _ZERO
-        for i in range(offsets[e], offsets[e + 1]):
+        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             lx = local_x[i]
             ly = local_y[i]
             l0 = b00 + b01 * lx + b02 * ly
@@ -260,7 +240,7 @@ def warp(start, stop, coefficients, local_x, local_y, offsets, origin, elements,
     width = coefficients.shape[1] - 2 * PAD
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
-        for i in range(offsets[e], offsets[e + 1]):
+        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             px = ux + fxx * local_x[i] + fxy * local_y[i]
             py = uy + fyx * local_x[i] + fyy * local_y[i]
             column, row, tx, ty, outside = _place(px, py, base_x, base_y, height, width)
@@ -277,7 +257,7 @@ def element_moments(start, stop, reference, warped, weight, offsets, out):
     w, w f, w g, w f f, w f g, w g g over the pixels with weight and a finite g."""
     for e in range(start, stop):
         total = f1 = g1 = f2 = fg = g2 = 0.0
-        for i in range(offsets[e], offsets[e + 1]):
+        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             g = warped[i]
             w = weight[i]
             if w == _ZERO or not np.isfinite(g):
@@ -303,7 +283,7 @@ def pull_back(start, stop, deformed_weight, reference_weight, local_x, local_y, 
     height, width = deformed_weight.shape
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
-        for i in range(offsets[e], offsets[e + 1]):
+        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             px = ux + fxx * local_x[i] + fxy * local_y[i]
             py = uy + fyx * local_x[i] + fyy * local_y[i]
             column, row, tx, ty, outside = _place(px, py, base_x, base_y, height, width)
@@ -333,7 +313,7 @@ def element_vector(start, stop, first, second, local_x, local_y, offsets, baryce
         b11 = np.float32(barycentric[e, 1, 1])
         b12 = np.float32(barycentric[e, 1, 2])
         p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
-        for i in range(offsets[e], offsets[e + 1]):
+        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
             l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
             p0 += first[i] * l0
@@ -359,7 +339,7 @@ def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, 
                 constant += barycentric[e, a, 0] * value
                 slope_x += barycentric[e, a, 1] * value
                 slope_y += barycentric[e, a, 2] * value
-            for i in range(offsets[e], offsets[e + 1]):
+            for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
                 out[c, i] = constant + slope_x * local_x[i] + slope_y * local_y[i]
 
 
@@ -376,7 +356,7 @@ def curvature_deviation(start, stop, nodes, elements, curvature, local_x, local_
             half_01 = _half_sag(nodes, elements[e, 0], elements[e, 1], curvature, e, c)
             half_12 = _half_sag(nodes, elements[e, 1], elements[e, 2], curvature, e, c)
             half_20 = _half_sag(nodes, elements[e, 2], elements[e, 0], curvature, e, c)
-            for i in range(offsets[e], offsets[e + 1]):
+            for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
                 l0 = barycentric[e, 0, 0] + barycentric[e, 0, 1] * local_x[i] + barycentric[e, 0, 2] * local_y[i]
                 l1 = barycentric[e, 1, 0] + barycentric[e, 1, 1] * local_x[i] + barycentric[e, 1, 2] * local_y[i]
                 l2 = 1.0 - l0 - l1

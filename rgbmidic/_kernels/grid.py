@@ -1,4 +1,7 @@
-"""Compiled loops between the owned pixels and coarse grids of square blocks."""
+"""Compiled loops between the owned pixels and coarse grids of square blocks.
+
+Pixels are counted without sign: an index that may be negative would be looked at each time.
+"""
 
 import numpy as np
 
@@ -15,7 +18,7 @@ _SLAB = 16384
 @compiled()
 def block_index(start, stop, rows, columns, top, left, block, width, out):
     """Number of the block (of a grid `width` blocks wide) in which each pixel lies: ``out`` (P,) int32."""
-    for i in range(start, stop):
+    for i in range(np.uint64(start), np.uint64(stop)):
         out[i] = (rows[i] - top) // block * width + (columns[i] - left) // block
 
 
@@ -55,7 +58,7 @@ def grid_at_pixels(start, stop, grid, rows, columns, top, left, block, out):
     height, width = grid.shape
     scale = np.float32(1.0 / block)
     shift = np.float32(0.5 * scale - 0.5)
-    for i in range(start, stop):
+    for i in range(np.uint64(start), np.uint64(stop)):
         y = min(max((rows[i] - top) * scale + shift, np.float32(0)), np.float32(height - 1))
         x = min(max((columns[i] - left) * scale + shift, np.float32(0)), np.float32(width - 1))
         a, b = int(y), int(x)

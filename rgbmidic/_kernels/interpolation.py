@@ -6,6 +6,7 @@ import numpy as np
 
 from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.threads import over_ranges
+from rgbmidic.typing import FloatImage
 
 __all__ = ["PAD", "bspline_coefficients", "sample_with_gradient"]
 
@@ -22,7 +23,7 @@ _BLOCK = 64
 """Columns filtered together: a cache line of each row."""
 
 
-def bspline_coefficients(image, out):
+def bspline_coefficients(image: FloatImage, out: FloatImage) -> None:
     """Cubic B-spline coefficients of `image` (H, W) float32 into `out` (H + 2 PAD, W + 2 PAD) float32, mirrored."""
     height, width = image.shape
     inner = out[PAD : PAD + height, PAD : PAD + width]
@@ -112,7 +113,7 @@ def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gra
     """
     height = coefficients.shape[0] - 2 * PAD
     width = coefficients.shape[1] - 2 * PAD
-    for i in range(start, stop):
+    for i in range(np.uint64(start), np.uint64(stop)):
         px = min(max(x[i], 0.0), width - 1.0)
         py = min(max(y[i], 0.0), height - 1.0)
         column = int(px)

@@ -52,23 +52,28 @@ def fill_unknown(start, stop, padded, share, red_row, red_column, pad, out, unkn
 
 # contraction to fused multiply-add alone: NaN and infinity keep their meaning
 @helper(fastmath={"contract"})
-def _add_taps(line, lines, first, size, total):
-    """Add the products of a row of samples with the `size` filters `lines` from `first`, five at a time."""
+def _add_five(line, c0, c1, c2, c3, c4, total):
+    for j in range(total.size):
+        total[j] += (
+            c0[j] * line[j] + c1[j] * line[j + 1] + c2[j] * line[j + 2] + c3[j] * line[j + 3] + c4[j] * line[j + 4]
+        )
+
+
+@helper(fastmath={"contract"})
+def _add_one(line, c, total):
+    for j in range(total.size):
+        total[j] += c[j] * line[j]
+
+
+@helper()
+def _add_taps(line, lines, k, size, total):
+    """Add the products of a row of samples with the `size` filters `lines` from the k-th, five at a time."""
     b = 0
     while b + 5 <= size:
-        k = first + b
-        for j in range(total.size):
-            total[j] += (
-                lines[k, j] * line[b + j]
-                + lines[k + 1, j] * line[b + j + 1]
-                + lines[k + 2, j] * line[b + j + 2]
-                + lines[k + 3, j] * line[b + j + 3]
-                + lines[k + 4, j] * line[b + j + 4]
-            )
+        _add_five(line[b:], lines[k + b], lines[k + b + 1], lines[k + b + 2], lines[k + b + 3], lines[k + b + 4], total)
         b += 5
     while b < size:
-        for j in range(total.size):
-            total[j] += lines[first + b, j] * line[b + j]
+        _add_one(line[b:], lines[k + b], total)
         b += 1
 
 

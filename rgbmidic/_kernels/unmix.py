@@ -23,14 +23,14 @@ def unmix(start, stop, channels, valid, matrix, needed, out, out_valid):
     for first in range(start, stop, BLOCK):
         last = min(first + BLOCK, stop)
         for light in range(lights):
-            values, ok = out[light], out_valid[light]
-            for p in range(first, last):
+            values, ok = out[light, first:last], out_valid[light, first:last]
+            for p in range(last - first):
                 values[p], ok[p] = 0.0, True
             for colour in range(colours):
                 factor, counts = matrix[light, colour], needed[light, colour]
-                for p in range(first, last):
-                    value = channels[colour, p]
+                for p in range(last - first):
+                    value = channels[colour, first + p]
                     values[p] += factor * value if np.isfinite(value) else np.float32(0.0)
-                    ok[p] &= valid[colour, p] or not counts
-            for p in range(first, last):
+                    ok[p] &= valid[colour, first + p] or not counts
+            for p in range(last - first):
                 values[p] = values[p] if ok[p] else np.float32(np.nan)

@@ -28,14 +28,14 @@ def unmix_field(start, stop, channels, valid, grid, step, needed, out, out_valid
             for colour in range(colours):
                 counts = needed[light, colour]
                 for gx in range((width + step - 1) // step):
-                    start, stop = gx * step, min((gx + 1) * step, width)
+                    first, last = gx * step, min((gx + 1) * step, width)
                     above, below = grid[gy, gx, light, colour], grid[gy + 1, gx, light, colour]
                     left = above + (below - above) * down
                     above, below = grid[gy, gx + 1, light, colour], grid[gy + 1, gx + 1, light, colour]
                     slope = (above + (below - above) * down - left) / np.float32(step)
-                    for x in range(start, stop):
+                    for x in range(first, last):
                         value = channels[colour, y, x]
-                        factor = left + slope * np.float32(x - start)
+                        factor = left + slope * np.float32(x - first)
                         values[x] += factor * value if np.isfinite(value) else np.float32(0.0)
                         ok[x] &= valid[colour, y, x] or not counts
             for x in range(width):
