@@ -26,10 +26,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+from scipy.ndimage import gaussian_filter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.frames import cfa_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.results import Result
@@ -94,13 +95,14 @@ class Motion:
         return np.asarray(np.hypot(*np.moveaxis(points - self.centre, -1, 0)) < self.radius)
 
     def origin(self, points: FloatArray, frame: int) -> FloatArray:
-        """Material points (..., 2) that are seen at points (..., 2) of a frame."""
+        """Material points (H, W, 2) that are seen at the pixels (H, W, 2) of a frame."""
         c, s = np.cos(self.angle(frame)), np.sin(self.angle(frame))
         seen = points - self.centre - self.plate(self.centre, frame)
         turned_back = seen @ np.array([[c, -s], [s, c]]) + self.centre
-        plate = points
+        seen_line = line = points[:1]  # the plate moves alike in all rows
         for _ in range(20):  # the wave's slope is .03: each step gains a factor of 30
-            plate = points - self.plate(plate, frame)
+            line = seen_line - self.plate(line, frame)
+        plate = points + (line - seen_line)
         return np.where(self.inside(turned_back)[..., None], turned_back, plate)
 
 
@@ -160,7 +162,8 @@ class _Renderer:
         self.fine = _FINE * (motion.size + 400)
         spots = gaussian_filter(rng.normal(size=(self.fine, self.fine)).astype(np.float32), 1.25 * _FINE, mode="wrap")
         paint = 0.45 + 0.3 * np.tanh(2 * spots / spots.std())
-        self.paint = spline_filter(paint, mode="grid-wrap", output=np.float32)
+        self.paint = np.empty([size + 2 * PAD for size in paint.shape], dtype=np.float32)
+        bspline_coefficients(paint, self.paint)
         self.sparkle = [
             gaussian_filter(rng.normal(size=paint.shape).astype(np.float32), 0.5 * _FINE, mode="wrap") for _ in range(3)
         ]
@@ -173,7 +176,11 @@ class _Renderer:
         """The raw mosaic of one frame, uint16, 12 bit."""
         places = (self.motion.origin(self.points, number) + 200) * _FINE
         # OpenCV rounds places to 1/32 px: enough for sparkle, not for the truth
-        paint = map_coordinates(self.paint, np.moveaxis(places, -1, 0)[::-1], mode="grid-wrap", prefilter=False)
+        paint, *slopes = np.empty((3, places[..., 0].size), dtype=np.float32)
+        sample_with_gradient(
+            self.paint, *np.ascontiguousarray(np.moveaxis(places, -1, 0)).reshape(2, -1), paint, *slopes
+        )
+        paint = paint.reshape(self.site.shape)
         lights = np.stack([0.6 * paint * self._reflected(light, number, places) for light in range(3)])
         channels = np.tensordot(CROSSTALK, lights, axes=1)
         signal = np.take_along_axis(channels, self.site[None], axis=0)[0] * (WHITE - BLACK) * 0.75

@@ -70,6 +70,9 @@ class FrameSettings:
     lights
         Number of lights that fire in turn before a monochrome camera which records one series: frame i shows light
         i mod `lights`, and so many frames make one state, which is what the other keys count.
+    renew
+        Whether a later frame becomes the reference, with the uncertainty that adds up, where the match with the one
+        before no longer serves (`rgbmidic.correlation.renewal`).
     shape, dtype
         Rows and columns, and sample type, of headerless files.
     crop_origin
@@ -87,6 +90,7 @@ class FrameSettings:
     last: int | None = _bounded(None, at_least=0)
     step: int = _bounded(1, at_least=1)
     lights: int = _bounded(1, at_least=1)
+    renew: bool = True
     shape: tuple[int, int] | None = _bounded(None, at_least=1)
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
     crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)

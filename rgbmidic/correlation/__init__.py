@@ -2,7 +2,7 @@
 
 from rgbmidic.correlation.correlate import correlate
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.renewal import Renewal, needs_renewal
+from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.track import Start, track
@@ -16,7 +16,6 @@ __all__ = [
     "Start",
     "Status",
     "correlate",
-    "needs_renewal",
     "solve",
     "track",
 ]

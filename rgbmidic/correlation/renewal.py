@@ -24,13 +24,13 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Renewal", "match_of", "needs_renewal"]
+__all__ = ["Renewal", "match_of"]
 
 _POOR = 0.95
-"""Correlation coefficient under which an element calls for another reference. Paint of speckles of 4 px that changes
-by 5 % leaves a node of 25 px elements uncertain by 0.3 px, by 10 % nearly by the 0.5 px from which it is lost. Measured
-on paint that changes by 2 % a frame, nodes left after 24 frames: 78 % with 0.95, 47 with 0.9, 39 with 0.8; without
-renewal all are lost from frame 12 on."""
+"""Correlation coefficient, over the best median, under which an element calls for another reference. Paint of speckles
+of 4 px that changes by 5 % leaves a node of 25 px elements uncertain by 0.3 px, by 10 % nearly by the 0.5 px from which
+it is lost. Measured on paint that changes by 2 % a frame, nodes left after 24 frames: 78 % with 0.95, 47 with 0.9, 39
+with 0.8; without renewal all are lost from frame 12 on."""
 _POOR_SHARE = 0.1
 """Share of the elements in the picture that must call for it."""
 _STEEP = 0.3
@@ -115,6 +115,35 @@ class Renewal:
             strain_std=np.sqrt(self.strain_variance + own * step.strain_std**2),
             rigid=self.rigid + step.rigid if step.rigid.size else step.rigid,
         )
+
+    def match(self, deformed: Deformed, solution: Solution) -> FloatArray:
+        """Correlation coefficient (E,) of the elements with this reference; see `match_of`."""
+        return match_of(self.reference, deformed, solution.displacement - self.displacement)
+
+    def is_due(self, solution: Solution, match: FloatArray, best: float) -> bool:
+        """Whether a frame with a `solution` on the first one should become the next reference.
+
+        So it is where a tenth of the elements in the picture match poorly or not at all, and where rotation or strain
+        since the reference slow the iteration down. A frame in which nothing is measured cannot.
+
+        Parameters
+        ----------
+        solution
+            Of the frame.
+        match
+            See `match`.
+        best
+            Largest median of `match` of the frames on this reference: camera noise alone keeps it below 1.
+        """
+        lost = (solution.node_status == NodeStatus.DECORRELATED)[solution.elements].any(axis=1)
+        known = np.isfinite(match)
+        called = lost | (match < _POOR * best)
+        if not known.any():
+            return False
+        if called.sum() > _POOR_SHARE * (lost | known).sum():
+            return True
+        slopes = self.reference.mesh.element_gradient(solution.displacement - self.displacement)[known]
+        return bool(np.median(np.linalg.norm(slopes, ord=2, axis=(1, 2))) > _STEEP)
 
     def renewed(self, solution: Solution, images: FloatImage, weights: FloatImage | None = None) -> Renewal:
         """The reference of a frame with a `solution` on the first one and images and weights (k, H, W) as
@@ -221,22 +250,3 @@ def match_of(reference: Reference, deformed: Deformed, displacement: FloatArray)
         own = correlation(product - f * g / some, f2 - f * f / some, g2 - g * g / some)
         best = np.where(total > 0, np.maximum(best, own), best)
     return np.where(known & (best > -np.inf), best, np.nan)
-
-
-def needs_renewal(reference: Reference, deformed: Deformed, step: Solution) -> bool:
-    """Whether a frame, with its `step` on the current reference, should become the next one.
-
-    So it is where a tenth of the elements in the picture match poorly or not at all, and where rotation or strain since
-    the reference slow the iteration down. A frame in which nothing is measured cannot.
-    """
-    match = match_of(reference, deformed, step.displacement)
-    elements = step.elements
-    decorrelated = np.asarray(step.node_status == NodeStatus.DECORRELATED)
-    lost = decorrelated[elements].any(axis=1)
-    called = lost | (match < _POOR)
-    known = np.asarray(np.isfinite(match))
-    judged = np.asarray(lost | known)
-    if called.sum() > _POOR_SHARE * judged.sum():
-        return True
-    slopes = reference.mesh.element_gradient(step.displacement)[known]
-    return bool(len(slopes)) and bool(np.median(np.linalg.norm(slopes, ord=2, axis=(1, 2))) > _STEEP)

@@ -28,10 +28,16 @@ class Start:
         The last frame's displacement in px, gaps filled; None where there is none yet.
     unmeasured : float
         Share of the nodes that the last frame could not measure.
+    renewals : tuple of int
+        The frames that have become the reference in turn.
+    best_match : float
+        How well a frame has matched the last of them, see `Renewal.match`; 0 where none has.
     """
 
     displacement: FloatArray | None
     unmeasured: float = 0.0
+    renewals: tuple[int, ...] = ()
+    best_match: float = 0.0
 
     def after(self, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray) -> Start:
         """The start of the frame after one that started here: nodes that it lost move as the nearest measured one.
@@ -49,7 +55,8 @@ class Start:
         """
         if not measured.any():
             return self
-        return Start(displacement=displacement[mesh.nearest(measured)[1]], unmeasured=float((~measured).mean()))
+        nearest = mesh.nearest(measured)[1]
+        return replace(self, displacement=displacement[nearest], unmeasured=float((~measured).mean()))
 
 
 LARGEST_TURN = 30.0

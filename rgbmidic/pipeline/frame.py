@@ -7,13 +7,16 @@ brightness of the lights -> record.
 from __future__ import annotations
 
 import logging
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation import Deformed, Start, Status, track
+from rgbmidic.correlation import Deformed, Solution, Start, Status
 from rgbmidic.correlation.light_levels import brightness_change
+from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.fields import fill
 from rgbmidic.pipeline.plan import Plan
@@ -32,7 +35,7 @@ _DARK = 0.3
 """Share of its light in the reference under which a light is told to be failing."""
 
 
-def measure_frame(plan: Plan, index: int, start: Start) -> FrameRecord:
+def measure_frame(plan: Plan, index: int, start: Start, renewed: Sequence[tuple[int, Solution]] = ()) -> FrameRecord:
     """Measure one frame of a test.
 
     A frame that cannot be read or measured gives a record with the reason, an error that is not one of rgbmidic's own
@@ -46,9 +49,11 @@ def measure_frame(plan: Plan, index: int, start: Start) -> FrameRecord:
         Which frame of the series.
     start
         From where its displacement is looked for; a frame of the reference starts from rest.
+    renewed
+        Index and solution of the last two of ``start.renewals``: all that the reference depends on that they make.
     """
     try:
-        return _measure(plan, index, start)
+        return _measure(plan, index, start, _renewal(plan, renewed))
     except RgbmidicError as error:
         reason = str(error)
         logger.warning("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
@@ -69,7 +74,7 @@ def failed_frame(plan: Plan, index: int, reason: str) -> FrameRecord:
     )
 
 
-def _measure(plan: Plan, index: int, start: Start) -> FrameRecord:
+def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> FrameRecord:
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
     state = plan.series.read(index)
     images = plan.separation(state)
@@ -78,9 +83,9 @@ def _measure(plan: Plan, index: int, start: Start) -> FrameRecord:
     weights = plan.weights.deformed(images, index)
     deformed = Deformed.prepare(correlated(images, settings.illumination), weights, prefilter=settings.solver.prefilter)
     if index in settings.frames.reference:
-        start = Start(displacement=np.zeros_like(reference.mesh.nodes))
+        start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
     statistics = settings.weights.method == "statistics"
-    solution = track(reference, deformed, start, settings.solver, statistics=statistics)
+    solution = renewal.track(deformed, start, settings.solver, statistics=statistics)
     if solution.status is Status.FAILED:
         if fault := exposure_fault(state, plan.region.mask):
             solution = replace(solution, reason=f"{fault} ({solution.reason})")
@@ -88,15 +93,54 @@ def _measure(plan: Plan, index: int, start: Start) -> FrameRecord:
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
     _tell_dark(name, images.names, brightness)
+    match, best, renewals = _compared(plan, index, start, renewal, deformed, solution)
     return FrameRecord.from_solution(
         kept,
         number=plan.series.numbers[index],
         time_ns=plan.series.time_ns(index),
         brightness=brightness,
+        match=match,
+        best_match=best,
+        renewals=renewals,
         weights_thumbnail=_thumbnail(weights),
         reflection_thumbnail=None if images.reflection_index is None else _thumbnail(images.reflection_index),
         inputs=plan.series.inputs(index),
     )
+
+
+_Known = tuple[Plan, tuple[int, ...], Renewal]
+_known: deque[_Known] = deque(maxlen=2)
+"""References that later frames have become in this process: the last two."""
+
+
+def _renewal(plan: Plan, renewed: Sequence[tuple[int, Solution]]) -> Renewal:
+    """The reference that the frames `renewed` make in turn."""
+    indices = tuple(index for index, _ in renewed)
+    for known, frames, renewal in _known:
+        if known is plan and frames == indices:
+            return renewal
+    renewal = Renewal.none(plan.reference)
+    for index, solution in renewed:
+        images = plan.separation(plan.series.read(index))
+        weights = plan.weights.deformed(images, index)
+        renewal = renewal.renewed(solution, correlated(images, plan.settings.illumination), weights)
+    _known.append((plan, indices, renewal))
+    return renewal
+
+
+def _compared(
+    plan: Plan, index: int, start: Start, renewal: Renewal, deformed: Deformed, solution: Solution
+) -> tuple[float, float, tuple[int, ...]]:
+    """How well a frame matches its reference, the best match of the frames on it, and who follows as the reference."""
+    if not (plan.settings.frames.renew and solution.measured.any()):
+        return float("nan"), start.best_match, start.renewals
+    match = renewal.match(deformed, solution)
+    median = float(np.nanmedian(match)) if np.isfinite(match).any() else float("nan")
+    best = float(np.fmax(start.best_match, np.float32(median)))
+    if index in plan.settings.frames.reference or not renewal.is_due(solution, match, best):
+        return median, best, start.renewals
+    logger.warning("frame %d (%s) becomes the reference of those after it", index, plan.series.name(index))
+    return median, 0.0, (*start.renewals, plan.series.chosen.index(index))
 
 
 def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> None:

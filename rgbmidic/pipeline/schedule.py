@@ -5,18 +5,21 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from dataclasses import replace
 from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import NodeStatus, Start, Status
+from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.errors import RgbmidicError
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
 from rgbmidic.pipeline.order import children, is_key, lineage, parent
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.workers import Measured, Workers
+from rgbmidic.pipeline.workers import Measured, Renewed, Workers
 from rgbmidic.results import FrameRecord, ResultStore
+from rgbmidic.typing import FloatArray
 
 __all__ = ["Schedule"]
 
@@ -27,6 +30,11 @@ _LOSS = 0.01
 frame just before it."""
 _TRIES = 3
 """Times that a frame is given to a worker before it is told to be what kills them."""
+
+_KEPT = ("u", "v", "node_status", "renewals", "best_match")
+_STRAIN = ("exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std")
+_MEASURED = ("u", "v", "u_std", "v_std", *_STRAIN, "node_status", "rigid")
+"""Quantities of a frame that the next one starts from, and that it makes a reference with."""
 
 Progress = Callable[[int, int, str], None]
 
@@ -77,7 +85,8 @@ class Schedule:
         while not self.done and count != most:
             while self._ready and len(self._running) < (workers.slots if most is None else 1):
                 position, start = heappop(self._ready)
-                self._running[workers.submit(self._index(position), start)] = position, start
+                future = workers.submit(self._index(position), start, self._renewed(start.renewals))
+                self._running[future] = position, start
             ended = wait(self._running, return_when=FIRST_COMPLETED).done
             if any(isinstance(_error(future), BrokenExecutor) for future in ended):
                 ended = wait(self._running).done  # with one of its processes all work of an executor ends
@@ -154,7 +163,7 @@ class Schedule:
         Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
         """
         table = self._store.table()
-        for kept in table.each(["u", "v", "node_status"], range(position, -1, -1)):
+        for kept in table.each(_KEPT, range(position, -1, -1)):
             if (kept["node_status"] == NodeStatus.MEASURED).any():
                 return self._following(kept, Start(displacement=None))
         return Start(displacement=None)
@@ -162,7 +171,36 @@ class Schedule:
     def _following(self, kept: Mapping[str, Any], start: Start) -> Start:
         """Where a frame starts that follows one that started from `start` and of which this is kept."""
         measured = kept["node_status"] == NodeStatus.MEASURED
-        return start.after(self._plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
+        if not measured.any():
+            return start
+        after = start.after(self._plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
+        return replace(after, renewals=tuple(kept["renewals"].tolist()), best_match=float(kept["best_match"]))
+
+    def _renewed(self, renewals: tuple[int, ...]) -> Renewed:
+        """Index and solution of the last two frames that became the reference."""
+        if not renewals:
+            return ()
+        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
+        last = renewals[-2:]
+        solutions = (_solution(mesh, lights, kept) for kept in self._store.table().each(_MEASURED, last))
+        return list(zip(map(self._index, last), solutions, strict=True))
+
+
+def _solution(mesh: Tri3Mesh, lights: int, kept: Mapping[str, Any]) -> Solution:
+    """What a result keeps of a measured frame, as the solution that makes it a reference."""
+
+    def columns(*names: str) -> FloatArray:
+        return np.stack([kept[name].astype(np.float64) for name in names], axis=1)
+
+    return replace(
+        Solution.failed(mesh, lights, "", np.zeros(0)),
+        displacement=columns("u", "v"),
+        displacement_std=columns("u_std", "v_std"),
+        strain=columns("exx", "eyy", "exy"),
+        strain_std=columns("exx_std", "eyy_std", "exy_std"),
+        node_status=kept["node_status"],
+        rigid=kept["rigid"].astype(np.float64),
+    )
 
 
 def _error(future: Future[Measured]) -> BaseException | None:

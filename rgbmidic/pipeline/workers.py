@@ -10,7 +10,7 @@ import pickle
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from typing import Any, Self
 import cv2
 
 from rgbmidic._kernels.threads import set_threads
-from rgbmidic.correlation import Start
+from rgbmidic.correlation import Solution, Start
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan
@@ -29,6 +29,9 @@ __all__ = ["Measured", "Workers", "available_cores", "open_workers"]
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RGBMIDIC_THREADS")
 """What libraries read, when they start, for the number of their threads."""
+
+Renewed = Sequence[tuple[int, Solution]]
+"""Index and solution of frames that became the reference, see `measure_frame`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +48,7 @@ class Workers(ABC):
     slots: int
 
     @abstractmethod
-    def submit(self, index: int, start: Start) -> Future[Measured]:
+    def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
         """Have one frame measured."""
 
     def restart(self) -> None:  # noqa: B027 most have nothing to do
@@ -69,10 +72,10 @@ class Here(Workers):
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
 
-    def submit(self, index: int, start: Start) -> Future[Measured]:
+    def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
         """Measure the frame at once."""
         done: Future[Measured] = Future()
-        done.set_result(Measured(record=measure_frame(self._plan, index, start), messages=()))
+        done.set_result(Measured(record=measure_frame(self._plan, index, start, renewed), messages=()))
         return done
 
 
@@ -99,10 +102,10 @@ class Processes(Workers):
                 raise ConfigurationError(f"worker processes cannot be started: {error}") from None
         return pool
 
-    def submit(self, index: int, start: Start) -> Future[Measured]:
+    def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
         """Have one frame measured by the next free process."""
         try:
-            return self._executor.submit(_measure_given, index, start)
+            return self._executor.submit(_measure_given, index, start, renewed)
         except BrokenExecutor as error:
             broken: Future[Measured] = Future()
             broken.set_exception(error)
@@ -141,9 +144,9 @@ class Cluster(Workers):
         """Threads of all workers there are now."""
         return max(sum(map(int, self._client.nthreads().values())), 1)
 
-    def submit(self, index: int, start: Start) -> Future[Measured]:
+    def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
         """Have one frame measured by some worker."""
-        future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, 1)
+        future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, renewed, 1)
         return future
 
     def close(self) -> None:
@@ -176,13 +179,13 @@ class _Messages(logging.Handler):
             self.kept.append((record.levelno, self.format(record)))
 
 
-def _measure_elsewhere(plan: Plan, index: int, start: Start, threads: int) -> Measured:
+def _measure_elsewhere(plan: Plan, index: int, start: Start, renewed: Renewed, threads: int) -> Measured:
     """Measure a frame in another process, whose log nobody reads."""
     _use_threads(threads)
     logger, handler = logging.getLogger("rgbmidic"), _Messages()
     logger.addHandler(handler)
     try:
-        return Measured(record=measure_frame(plan, index, start), messages=tuple(handler.kept))
+        return Measured(record=measure_frame(plan, index, start, renewed), messages=tuple(handler.kept))
     finally:
         logger.removeHandler(handler)
 
@@ -206,10 +209,10 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _measure_given(index: int, start: Start) -> Measured:
+def _measure_given(index: int, start: Start, renewed: Renewed) -> Measured:
     assert _given is not None
     plan, threads = _given
-    return _measure_elsewhere(plan, index, start, threads)
+    return _measure_elsewhere(plan, index, start, renewed, threads)
 
 
 def _use_threads(threads: int) -> None:

@@ -98,6 +98,12 @@ _BRIGHTNESS = (
     "gain and offset (DN) of each light against the reference, from the speckle's contrast and mean, medians over the "
     "elements; told, not used"
 )
+_MATCH = "median correlation coefficient of the elements with their reference, of the light that matches best"
+_BEST = "largest `match` of the frames compared with the same reference, up to this one"
+_RENEWALS = (
+    "places in the result of the frames that became the reference in turn, up to this one: it was itself compared with "
+    "the last before it, or with the test's reference"
+)
 _RIGID = "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad)"
 _REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not tell it"
 _ENDS = ("converged", "not converged", "failed")
@@ -124,6 +130,9 @@ _TABLE = (
     Quantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx, curvature included"),
     Quantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy, curvature included"),
     Quantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy, curvature included"),
+    Quantity("match", (), "", "", _MATCH),
+    Quantity("best_match", (), "", "", _BEST, blank=0),
+    Quantity("renewals", ("renewal",), "", "", _RENEWALS, dtype=np.int64, blank=0),
     Quantity("misfit", _NODE, "", "misfit", _MISFIT),
     Quantity(
         "light_share", ("node", "light"), "", "light_share", "share of each light in what determines a node", blank=0

@@ -53,9 +53,7 @@ class FrameRecord:
         return cls(values=blank | given, sizes=sizes)
 
     @classmethod
-    def from_solution(
-        cls, solution: Solution, *, inputs: Mapping[str, str] | None = None, **given: AnyArray | int | None
-    ) -> FrameRecord:
+    def from_solution(cls, solution: Solution, *, inputs: Mapping[str, str] | None = None, **given: Any) -> FrameRecord:
         """The record of a solved frame.
 
         Parameters
