@@ -71,8 +71,9 @@ class FrameSettings:
         Number of lights that fire in turn before a monochrome camera which records one series: frame i shows light
         i mod `lights`, and so many frames make one state, which is what the other keys count.
     renew
-        Whether a later frame becomes the reference, with the uncertainty that adds up, where the match with the one
-        before no longer serves (`rgbmidic.correlation.renewal`).
+        Whether a later frame becomes the reference where the match with the one before no longer serves, for paint that
+        changes and rotations beyond 20 degrees. Uncertainties add up (`rgbmidic.correlation.renewal`), and a node that
+        is lost in such a frame is lost for good.
     shape, dtype
         Rows and columns, and sample type, of headerless files.
     crop_origin
@@ -90,7 +91,7 @@ class FrameSettings:
     last: int | None = _bounded(None, at_least=0)
     step: int = _bounded(1, at_least=1)
     lights: int = _bounded(1, at_least=1)
-    renew: bool = True
+    renew: bool = False
     shape: tuple[int, int] | None = _bounded(None, at_least=1)
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
     crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)

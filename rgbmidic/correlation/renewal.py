@@ -17,7 +17,7 @@ from rgbmidic.correlation.images import usable_reach
 from rgbmidic.correlation.matching import correlation
 from rgbmidic.correlation.reference import Deformed, Reference, drawn
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.correlation.solution import NodeStatus, Solution
+from rgbmidic.correlation.solution import Solution
 from rgbmidic.correlation.track import Start, track
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -32,7 +32,7 @@ of 4 px that changes by 5 % leaves a node of 25 px elements uncertain by 0.3 px,
 it is lost. Measured on paint that changes by 2 % a frame, nodes left after 24 frames: 78 % with 0.95, 47 with 0.9, 39
 with 0.8; without renewal all are lost from frame 12 on."""
 _POOR_SHARE = 0.1
-"""Share of the elements in the picture that must call for it."""
+"""Share of the measured elements that must call for it."""
 _STEEP = 0.3
 """Size of the displacement gradient from which the reference's grey-level gradient is too different from the deformed
 one's: an iteration leaves about this share of the error. A rotation of 17 degrees has it. Measured in steps of 3
@@ -123,8 +123,9 @@ class Renewal:
     def is_due(self, solution: Solution, match: FloatArray, best: float) -> bool:
         """Whether a frame with a `solution` on the first one should become the next reference.
 
-        So it is where a tenth of the elements in the picture match poorly or not at all, and where rotation or strain
-        since the reference slow the iteration down. A frame in which nothing is measured cannot.
+        So it is where a tenth of the measured elements match poorly, and where rotation or strain since the reference
+        slow the iteration down. What is lost calls for none: it would be lost for good, where a glare passes and a
+        crack closes.
 
         Parameters
         ----------
@@ -135,12 +136,10 @@ class Renewal:
         best
             Largest median of `match` of the frames on this reference: camera noise alone keeps it below 1.
         """
-        lost = (solution.node_status == NodeStatus.DECORRELATED)[solution.elements].any(axis=1)
         known = np.isfinite(match)
-        called = lost | (match < _POOR * best)
         if not known.any():
             return False
-        if called.sum() > _POOR_SHARE * (lost | known).sum():
+        if (match[known] < _POOR * best).mean() > _POOR_SHARE:
             return True
         slopes = self.reference.mesh.element_gradient(solution.displacement - self.displacement)[known]
         return bool(np.median(np.linalg.norm(slopes, ord=2, axis=(1, 2))) > _STEEP)

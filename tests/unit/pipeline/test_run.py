@@ -93,9 +93,9 @@ def test_a_frame_that_kills_every_worker_fails_and_the_rest_goes_on(
     movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Dying(workers.Here):
-        def submit(self, index: int, start: Start) -> Future[workers.Measured]:
+        def submit(self, index: int, start: Start, renewed: Any = ()) -> Future[workers.Measured]:
             if index != 5:
-                return super().submit(index, start)
+                return super().submit(index, start, renewed)
             dead: Future[workers.Measured] = Future()
             dead.set_exception(BrokenExecutor("killed"))
             return dead
@@ -155,10 +155,10 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
 ) -> None:
     starts: list[tuple[int, float]] = []
 
-    def watched(plan: Any, index: int, start: Start) -> Any:
+    def watched(plan: Any, index: int, start: Start, renewed: Any) -> Any:
         moved = np.inf if start.displacement is None else float(start.displacement[:, 1].mean())
         starts.append((index, moved))
-        record = measure_frame(plan, index, start)
+        record = measure_frame(plan, index, start, renewed)
         return schedule.failed_frame(plan, index, "lost") if index == 16 and len(starts) == 17 else record
 
     monkeypatch.setattr("rgbmidic.pipeline.workers.measure_frame", watched)
@@ -174,3 +174,31 @@ def test_a_dask_cluster_gives_the_same_bits(movie: Path, whole: Result, tmp_path
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
     ) as cluster:
         same(measure(settings(movie), tmp_path / "result", scheduler=cluster.scheduler_address), whole)
+
+
+def test_a_rotation_is_followed_by_renewed_references_to_the_same_bits(tmp_path: Path) -> None:
+    texture, rng = Texture.random(3, contrast=35.0), np.random.default_rng(1)
+    for index in range(20):
+        image = texture.image(SHAPE, Affine.strain_and_rotation(0.0, 3.0 * index))
+        values = np.clip(np.round(image + rng.normal(0, 1.0, SHAPE)), 0, 255).astype(np.uint8)
+        frame = ChannelFrame(values=values[None], black_level=0.0, white_level=255.0)
+        write_tiff(tmp_path / f"f{index:03d}.tif", frame)
+
+    def interrupt(done: int, total: int, line: str) -> None:
+        if done == 18:
+            raise KeyboardInterrupt
+
+    chosen = TestSettings.from_mapping(
+        {**settings(tmp_path, renew=True).to_mapping(), "region": {"rectangle": [22, 18, 58, 54]}}, tmp_path
+    )
+    renewing = measure(chosen, tmp_path / "renewing")
+    last = renewing.frame(19)
+    assert len(last.renewals) >= 1
+    assert (last.node_status == 0).all()
+    truth = Affine.strain_and_rotation(0.0, 57.0).displacement(renewing.nodes, SHAPE)
+    error = np.stack([last.u, last.v], axis=1) - truth
+    assert np.sqrt((error**2).mean()) < 0.1
+    assert 0.5 < np.sqrt(((error / np.stack([last.u_std, last.v_std], axis=1)) ** 2).mean()) < 2
+    with pytest.raises(KeyboardInterrupt):
+        measure(chosen, tmp_path / "resumed", progress=interrupt)
+    same(measure(chosen, tmp_path / "resumed", resume=True), renewing)
