@@ -23,7 +23,7 @@ def fill_unknown(padded, share, red_row, red_column, pad, out, unknown):
     """Replace samples that are NaN by what the known ones around tell of the common texture.
 
     `padded` as written by `scaled_contrast`; `share` (3, h, w) is the share of the common texture in each tile. `out`,
-    a copy of `padded`, receives the texture; where too little is known within one pixel it receives 0
+    a copy of `padded`, receives ``sqrt(share) * texture``; where too little is known within one pixel it receives 0
     and `unknown` (like `padded`) is set.
     """
     height, width = padded.shape
@@ -40,10 +40,11 @@ def fill_unknown(padded, share, red_row, red_column, pad, out, unknown):
                         s = share[_channel(a - pad, b - pad, red_row, red_column), ti, tj]
                         distance = (a - i) ** 2 + (b - j) ** 2
                         w = np.exp(-0.8 * distance)
-                        total += w * s * padded[a, b]
+                        total += w * np.sqrt(s) * padded[a, b]
                         weight += w * s
                         near += s if distance <= 2 else 0.0
-            out[i, j] = total / weight if near > 0.5 else 0.0
+            own = share[_channel(i - pad, j - pad, red_row, red_column), ti, tj]
+            out[i, j] = np.sqrt(own) * total / weight if near > 0.5 else 0.0
             unknown[i, j] = near <= 0.5
 
 

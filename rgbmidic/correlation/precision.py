@@ -90,7 +90,7 @@ def _together(residual: Residual, variance: FloatImage, trusted: FloatImage) -> 
         shared = window_means(residual.reference.pixels, product, both)[0]
         shared = (1 - _OWN) * shared / np.sqrt(variance[a] * variance[b])
         correlation[..., a, b] = correlation[..., b, a] = np.clip(shared, _OWN - 1, 1 - _OWN)
-    inverse = np.linalg.inv(correlation)
+    inverse = np.linalg.inv(correlation).astype(np.float32)
     return np.stack(
         [
             (spread(residual.reference.pixels, inverse[..., light].transpose(2, 0, 1)) * trusted).sum(axis=0)

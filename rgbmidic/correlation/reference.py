@@ -216,5 +216,5 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
     mean = (gradient * used).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
     square = window_means(pixels, (mean**2).sum(axis=0)[None], used.max(axis=0)[None])
     along = window_means(pixels, (mean[:, None] * gradient).sum(axis=0), used)
-    contrast = np.maximum(along / np.maximum(square, np.float32(1e-12)), 0)
-    return mean[:, None] * spread(pixels, contrast)
+    contrast = np.divide(along, square, out=np.zeros_like(along), where=square > 0)
+    return np.asarray(mean[:, None] * spread(pixels, np.maximum(contrast, 0)))

@@ -22,7 +22,6 @@ from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = [
     "BLOCK",
-    "LEAST",
     "MEAN_BLOCK",
     "ColourFactors",
     "Moments",
@@ -97,6 +96,11 @@ class ColourFactors:
     slope: FloatArray
     private: FloatArray
     noise: FloatArray
+
+    @property
+    def spread(self) -> FloatArray:
+        """Standard deviation (3, h, w) of each channel's contrast without camera noise, DN."""
+        return np.asarray(self.slope * np.sqrt(1 + self.private))
 
     @property
     def share(self) -> FloatArray:

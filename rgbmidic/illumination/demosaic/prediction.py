@@ -1,11 +1,10 @@
 """Linear prediction of every channel at every pixel from the samples around it (simple kriging).
 
-The contrast of channel c, divided by its slope on the common texture, is ``a + sum_j B_cj e_j + n_c``: common texture a
-of autocorrelation C and variance 1, what light j shows of its own, and camera noise, with B the share of the lights in
-the channel. The best linear prediction of a channel at a pixel from the N x N samples around it has the filter
-``(K + V)^-1 k``, with K the covariance of the samples, V their noise and k their covariance with what is wanted.
-Unmixing is linear, so what the predicted channels give is the best prediction of each light. The filter depends on the
-pixel's phase in the 2x2 cell and on the variances of the e_j alone, so the filters of a frame are a small table.
+The contrast of channel c, divided by its own spread, is ``sqrt(s_c) a + sqrt(1 - s_c) e_c + n_c``: common texture a of
+autocorrelation C, what is private to the channel, and camera noise, with s_c the share of the common texture. The best
+linear prediction of a channel at a pixel from the N x N samples around it has the filter ``(K + V)^-1 k``, with K the
+covariance of the samples, V their noise and k their covariance with what is wanted. It depends on the pixel's phase in
+the 2x2 cell and on the three shares alone, so the filters of a frame are a small table.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ __all__ = ["SIZE", "WIDE", "FilterTable", "prediction_filters"]
 SIZE, WIDE = 5, 7
 """Side of the square of samples that a value is predicted from, and where the colours have nothing in common."""
 LEVELS_PER_OCTAVE = 1
-"""Fineness in which a light's private variance is rounded; twice as fine measures the same."""
+"""Fineness in which a channel's private variance is rounded; twice as fine measures the same."""
 LARGEST, SMALLEST = 10, -10
 """Range (powers of two) of the private variance relative to the common one."""
 OFFSET_VARIANCE = 10.0
@@ -56,18 +55,16 @@ class FilterTable:
 
 
 def prediction_filters(
-    private: FloatArray, coupling: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, *, size: int = SIZE
+    private: FloatArray, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
 ) -> FilterTable:
-    """The table of filters for tiles whose lights have some private variance.
+    """The table of filters for tiles whose channels have some private variance.
 
     Parameters
     ----------
-    private : (k, h, w)
-        Variance private to each light in each tile, relative to the common one.
-    coupling : (3, k)
-        Share of each light in each channel's contrast; rows sum to one.
+    private : (3, h, w)
+        Variance private to each channel in each tile, relative to the common one.
     noise : (3,)
-        Variance of the camera noise of each channel relative to the common one.
+        Variance of the camera noise of each channel relative to the channel's own variance.
     texture
         Autocorrelation of the common texture, and of what is private.
     cfa
@@ -78,11 +75,13 @@ def prediction_filters(
     Returns
     -------
     FilterTable
-        With one output for each channel, to be applied to samples divided by their channel's slope.
+        With one output for each channel.
     """
     level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(private, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
-    levels, index = np.unique(level.reshape(len(level), -1), axis=1, return_inverse=True)
-    taps = _solved(2.0 ** (levels.T / LEVELS_PER_OCTAVE), coupling, noise, texture, cfa, size)
+    code = (level[0] * 1000 + level[1]) * 1000 + level[2]
+    _, first, index = np.unique(code, return_index=True, return_inverse=True)
+    share = 1 / (1 + 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE))
+    taps = _solved(share, np.asarray(noise, dtype=np.float64), texture, cfa, size)
     lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
     return FilterTable(
         index=index.reshape(level.shape[1:]).astype(np.int32),
@@ -91,21 +90,23 @@ def prediction_filters(
     )
 
 
-def _solved(
-    variance: FloatArray, coupling: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int
-) -> FloatArray:
-    """Filters (T, 4, 3, size²) for private variances (T, k) of the lights."""
+def _solved(share: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int) -> FloatArray:
+    """Filters (T, 4, 3, size²) for shares (T, 3) of the common texture."""
     common, fine = _covariances(texture, size)
     # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
     private = texture.private * common + (1 - texture.private) * fine
-    shared = np.einsum("cj,tj,dj->tcd", coupling, variance, coupling)
-    centre, count = size * size // 2, len(variance)
+    centre, count = size * size // 2, len(share)
     taps = np.empty((count, 4, 3, size * size))
     for phase, channel in enumerate(_channels_around(cfa, size)):
-        samples = common + shared[:, channel[:, None], channel[None]] * private
+        root, own = np.sqrt(share[:, channel]), np.sqrt(1 - share[:, channel])
+        same = channel[:, None] == channel[None]
+        samples = root[:, :, None] * root[:, None] * common + own[:, :, None] * own[:, None] * (same * private)
         samples[:, np.arange(size * size), np.arange(size * size)] += np.maximum(noise, 1e-8)[channel]
-        wanted = common[:, centre, None] + shared[:, channel] * private[:, centre, None]
-        taps[:, phase] = np.linalg.solve(samples, wanted).transpose(0, 2, 1)
+        mine = channel[:, None] == np.arange(3)
+        wanted = root[:, :, None] * np.sqrt(share)[:, None] * common[:, centre, None]
+        wanted += (1 - share)[:, None] * (mine * private[:, centre, None])
+        solution = np.linalg.solve(samples, wanted)
+        taps[:, phase] = solution.transpose(0, 2, 1)
     return taps
 
 

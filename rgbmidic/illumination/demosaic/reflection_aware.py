@@ -20,7 +20,6 @@ from rgbmidic.errors import InputError
 from rgbmidic.frames.data import sampled_channels
 from rgbmidic.illumination.colour_factors import (
     BLOCK,
-    LEAST,
     MEAN_BLOCK,
     ColourFactors,
     Moments,
@@ -39,8 +38,6 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 __all__ = ["SMALLEST_FRAME", "Reconstruction", "ReflectionAwareDemosaicer"]
 
 
-FAINT = 0.01
-"""Least contrast of a light beside the strongest one's: one that is switched off has none."""
 SMALLEST_FRAME = 64
 """Rows and columns under which a frame holds too few speckles for statistics."""
 
@@ -109,28 +106,18 @@ class ReflectionAwareDemosaicer:
         texture = learn_texture(moments) if self.texture is None else self.texture
         matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
         factors = colour_factors(moments, texture.band, matrix, coloured=texture.private)
-        table = _filters(factors, texture, matrix, mosaic.cfa)
+        table = _filters(factors, texture, mosaic.cfa)
         out, unknown = _predict(moments, factors, table, damaged=damaged)
         valid = _validity(saturated, unknown, mosaic.cfa) if damaged else np.ones(out.shape, dtype=bool)
         channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
         return Reconstruction(channels=channels, texture=texture, factors=factors, mean=moments.mean)
 
 
-def _filters(factors: ColourFactors, texture: TextureModel, crosstalk: FloatArray, cfa: str) -> FilterTable:
-    coupling = _coupling(factors.slope, crosstalk)
-    # one light's sparkle reaches several channels; the fit of their variances may ask for less than nothing
-    private = np.maximum(np.tensordot(np.linalg.pinv(coupling**2), factors.private, axes=1), LEAST)
-    noise = np.median(factors.noise, axis=(1, 2))
+def _filters(factors: ColourFactors, texture: TextureModel, cfa: str) -> FilterTable:
+    noise = np.median(factors.noise / (1 + factors.private), axis=(1, 2))
     # a colour left to itself has only every other sample, so it needs to look farther
     size = SIZE if texture.private < 0.5 else WIDE
-    return prediction_filters(_per_tile(private), coupling, noise, texture, cfa, size=size)
-
-
-def _coupling(slope: FloatArray, crosstalk: FloatArray) -> FloatArray:
-    """Share (3, k) of each light in each channel's contrast, typical of the frame."""
-    light = np.median(np.tensordot(np.linalg.pinv(crosstalk), slope, axes=1), axis=(1, 2))
-    share = crosstalk * np.maximum(light, FAINT * light.max())
-    return np.asarray(share / share.sum(axis=1, keepdims=True))
+    return prediction_filters(_per_tile(factors.private), noise, texture, cfa, size=size)
 
 
 def _per_tile(grid: FloatArray) -> FloatArray:
@@ -145,15 +132,15 @@ def _predict(
     moments: Moments, factors: ColourFactors, table: FilterTable, *, damaged: bool
 ) -> tuple[FloatImage, BoolArray]:
     """Channels (3, H, W) and where samples stayed unknown (H, W)."""
-    slope, pad = factors.slope.astype(np.float32), table.size // 2
-    padded = scaled(moments, np.float32(1) / slope, pad=pad, width=table.index.shape[1] * TILE)
+    spread, pad = factors.spread.astype(np.float32), table.size // 2
+    padded = scaled(moments, np.float32(1) / spread, pad=pad, width=table.index.shape[1] * TILE)
     rows, columns = moments.contrast.shape
     unknown = np.zeros(padded.shape, dtype=bool)
     if damaged:
         source = padded.copy()
         fill_unknown(source, _per_tile(factors.share), *moments.red, pad, padded, unknown)
     out = np.empty((3, rows, columns), dtype=np.float32)
-    predict(padded, table.index, table.taps, table.size, slope, BLOCK, moments.mean, MEAN_BLOCK, out)
+    predict(padded, table.index, table.taps, table.size, spread, BLOCK, moments.mean, MEAN_BLOCK, out)
     return out, unknown[pad : pad + rows, pad : pad + columns]
 
 
