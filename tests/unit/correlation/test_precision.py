@@ -45,7 +45,7 @@ def test_a_light_that_errs_alone_counts_little():
     once = [a + n for n in noise[:3]]
     then = [a + noise[3], a + noise[4] + white(9, 150), a + noise[5]]
     share = measured(once, then).weight_share
-    assert share[1] < 0.05
+    assert share[1] < 0.1
     assert share[0] == pytest.approx(share[2], rel=0.15)
 
 
