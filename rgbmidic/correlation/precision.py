@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -52,62 +52,60 @@ def learn_precision(residual: Residual) -> Precision:
     """Weights of the lights' best mean around each pixel, from their residuals.
 
     Lights separated from one mosaic err together, for each is predicted from all the samples around; what one misses
-    of a reflection's sparkle the others have too much. So the weights are ``C^-1 1`` of the residuals' covariance C
-    between the lights (generalised least squares), not the inverse of each light's own variance, none below 0. That
-    variance is the residual's, times the part of it that displaces: brightness and contrast that change slowly leave a
-    residual which the gradient of the speckle averages out, blurred noise one that it does not. C holds whatever
-    spoils a light there: camera noise, demosaicing, the erratic part of a reflection. Its unit is the median variance
-    over all lights. The pixel's own factor is that of a Student distribution of the mean's residual, so that dust or a
-    fragment does not spoil a node.
+    of a reflection's sparkle the others have too much. So the lights share a weight as ``C^-1 1`` of the residuals'
+    covariance C between them (generalised least squares), none below 0. The weight is the inverse variance of that
+    mean's residual, times the part of it that displaces: brightness and contrast that change slowly leave a residual
+    which the gradient of the speckle averages out, blurred noise one that it does not. It holds whatever spoils the
+    mean there: camera noise, demosaicing, the erratic part of a reflection. Its unit is the median over the region.
+    The pixel's own factor is that of a Student distribution, so that dust or a fragment does not spoil a node.
     """
     pixels, weighted = residual.reference.pixels, residual.weights > 0
-    means = window_means(pixels, residual.difference**2, residual.weights)
-    variance = spread(pixels, means)
-    typical = _typical(variance, weighted)
+    variance = window_means(pixels, residual.difference**2, residual.weights)
+    typical = _typical(spread(pixels, variance), weighted)
     if typical <= 0:
         return Precision(factor=np.ones_like(residual.weights), bend=np.ones_like(residual.weights[0]))
     contrast = float(np.var(residual.values[weighted], dtype=np.float64))
     floor = np.float32(max(0.1 * typical, 1e-6 * contrast))
-    variance = np.maximum(variance, floor)
-    variance *= displacing_share(residual, variance)
-    trusted = (_typical(variance, weighted) / variance) ** (_TRUST / 2) * weighted
-    together = _together(residual, np.maximum(means, floor), trusted)
-    factor = np.maximum(trusted * together, 0)
-    robust, bend = _student(residual, factor, floor)
-    return Precision(factor=np.asarray(factor * robust, dtype=np.float32), bend=bend)
+    share = _best_mean(residual, np.maximum(variance, floor), weighted)
+    whole = _of_mean(residual, share)
+    used, square = share.max(axis=0) > 0, whole.difference[:1] ** 2
+    around = spread(pixels, window_means(pixels, square, used[None].astype(np.float32)))[0]
+    around = np.maximum(around, floor / len(share))
+    ratio = square[0] / around
+    displacing = around * displacing_share(whole, np.broadcast_to(around, share.shape)).max(axis=0)
+    trusted = (_typical(displacing, used) / displacing) ** _TRUST
+    factor = share * (trusted * (_FREEDOM + 1) / (_FREEDOM + ratio))
+    bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
+    return Precision(factor=np.asarray(factor, dtype=np.float32), bend=np.asarray(bend, dtype=np.float32))
 
 
-def _together(residual: Residual, variance: FloatImage, trusted: FloatImage) -> FloatImage:
-    """Sums (k, P) over the lights of the inverse of their residuals' correlation times `trusted` (k, P).
+def _of_mean(residual: Residual, share: FloatImage) -> Residual:
+    """The same with the lights' mean residual in place of each light's own, for their `share` (k, P) in it."""
+    mean = (share * residual.difference).sum(axis=0)
+    everywhere = np.repeat(mean[None], len(share), axis=0)
+    return replace(residual, values=everywhere, warped=np.zeros_like(everywhere), weights=share)
+
+
+def _best_mean(residual: Residual, variance: FloatImage, weighted: BoolArray) -> FloatImage:
+    """Share (k, P) of each light in the mean of least variance; 0 where not `weighted` (k, P).
 
     `variance` (k, h, w) is the residuals' on the grid of `window_means`.
     """
-    lights = len(trusted)
-    correlation = np.ones((*variance.shape[1:], lights, lights))
+    lights = len(variance)
+    covariance = np.zeros((*variance.shape[1:], lights, lights))
+    covariance[..., range(lights), range(lights)] = np.moveaxis(variance, 0, -1)
     for a, b in combinations(range(lights), 2):
         both = np.sqrt(residual.weights[a] * residual.weights[b])[None]
         product = (residual.difference[a] * residual.difference[b])[None]
         shared = window_means(residual.reference.pixels, product, both)[0]
-        shared = (1 - _OWN) * shared / np.sqrt(variance[a] * variance[b])
-        correlation[..., a, b] = correlation[..., b, a] = np.clip(shared, _OWN - 1, 1 - _OWN)
-    inverse = np.linalg.inv(correlation).astype(np.float32)
-    return np.stack(
-        [
-            (spread(residual.reference.pixels, inverse[..., light].transpose(2, 0, 1)) * trusted).sum(axis=0)
-            for light in range(lights)
-        ]
+        most = (1 - _OWN) * np.sqrt(variance[a] * variance[b])
+        covariance[..., a, b] = covariance[..., b, a] = np.clip((1 - _OWN) * shared, -most, most)
+    inverse = np.linalg.inv(covariance).sum(axis=-1)
+    weights = (
+        np.maximum(spread(residual.reference.pixels, np.moveaxis(inverse, -1, 0).astype(np.float32)), 0) * weighted
     )
-
-
-def _student(residual: Residual, factor: FloatImage, floor: np.float32) -> tuple[FloatImage, FloatImage]:
-    """Student's factor (P,) on a pixel's weight and the bend of the loss, from the lights' mean residual."""
-    total = factor.sum(axis=0)
-    used = np.asarray(total > 0, dtype=np.float32)
-    mean = (factor * residual.difference).sum(axis=0) / np.where(used, total, np.float32(1))
-    pixels = residual.reference.pixels
-    variance = spread(pixels, window_means(pixels, mean[None] ** 2, used[None]))[0]
-    ratio = mean**2 / np.maximum(variance, floor / len(factor))
-    return (_FREEDOM + 1) / (_FREEDOM + ratio), (_FREEDOM - ratio) / (_FREEDOM + ratio)
+    total = weights.sum(axis=0)
+    return np.asarray(weights / np.where(total > 0, total, np.float32(1)))
 
 
 def _typical(variance: FloatImage, weighted: BoolArray) -> float:
