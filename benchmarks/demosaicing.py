@@ -1,19 +1,20 @@
 """What each demosaicing method costs in displacement error, with and without reflections, on scenes with exact truth.
 
-    python benchmarks/demosaicing.py [--study main] [--seeds 11 12 13] [--paint smooth|sparkling] [--plates-only]
-    python benchmarks/demosaicing.py --study phases|blur|aberration|coloured
+    python benchmarks/demosaicing.py [--study main] [--seeds 11 12 13] [--wrinkles 0.025] [--plates-only]
+    python benchmarks/demosaicing.py --study shifts|phases|blur|aberration|coloured
     python benchmarks/demosaicing.py --speckles 3 4.2 6 8 --plates-only --figure docs/figures/demosaicing.png
     python benchmarks/demosaicing.py --study speed
 
 Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, crosstalk 10 to 16 % between neighbours,
 specular peak 1.5 times an ideal white. Three lights are solved together with the true crosstalk, TRI3 of 25 px started
-within half a pixel of the truth; errors over the field without its border element. "sparkling" paint has facets twice
-as large, traced with 3 x 3 rays per pixel, so that a reflection changes erratically from state to state.
+within half a pixel of the truth; errors over the field without its border element. The paint's wrinkles are 25 um
+apart; 50 or 100 um make its reflection sparkle at the scale of the pixel. Each is traced with as many rays as its
+reflection needs.
 
 The 3-CCD camera is the ideal: all three colours at every pixel, the same solve. One sample instead of three costs a
 factor of sqrt(3) in noise; what is above that is the demosaicing's doing. The studies vary one thing at a time: the
-Bayer phase, the lens blur, the lens's lateral colour aberration (calibrated, and undone after the separation), and a
-specimen whose colours show partly or wholly different textures.
+shift, the Bayer phase, the lens blur, the lens's lateral colour aberration (calibrated, and undone after the
+separation), and a specimen whose colours show partly or wholly different textures.
 """
 
 from __future__ import annotations
@@ -34,13 +35,14 @@ from rgbmidic.correlation import correlate
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
+from rgbmidic.illumination.normalise import normalise
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.illumination.separate import DEMOSAICERS, separate
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.camera import PIXEL
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import threshold_weights
 
 TILT = (float(-np.degrees(0.15)), 0.0)
@@ -80,7 +82,15 @@ GLARING = Case("plate in green's reflection", _glaring, strained_plate(), 512)
 MAT = Case("plate without reflection", _mat, strained_plate(), 512)
 SPHERES = [Case(f"sphere {a:g}°", sphere_scene, turned(a), 640, is_plate=False) for a in (0.33, 1, 2, 4, 8)]
 BASE = [GLARING, SPHERES[1], SPHERES[3], MAT]
+SHIFTS = [
+    replace(
+        case, name=f"{case.name}, shift {n / 8:g} px", state=strained_plate(shift_px=(n / 8, 0.3 * n / 8), strain=0)
+    )
+    for case in (GLARING, MAT)
+    for n in range(9)
+]
 STUDIES = {
+    "shifts": SHIFTS,
     "main": [GLARING, *SPHERES, MAT],
     "phases": [case.called(cfa, cfa=cfa) for case in BASE for cfa in ("RGGB", "BGGR", "GRBG", "GBRG")],
     "blur": [case.called(f"blur {blur:g}", lens_blur=blur) for case in BASE for blur in (0.3, 0.45, 0.6, 0.8)],
@@ -100,6 +110,7 @@ class Contender:
     prefilter: str = "binomial"
     normalise: float | None = 10.0
     masks: bool = False
+    one_image: bool = False
 
     def lights(self, frame: Any, scene: Scene) -> IlluminationImages:
         """Illumination images of a recorded frame."""
@@ -124,6 +135,7 @@ CONTENDERS = [
     Contender("Malvar", "malvar"),
     Contender("Menon", "Menon2007"),
     Contender("normalised mosaic", "normalised"),
+    Contender("mean of the lights, as one image", "reflection-aware", normalise=None, one_image=True),
     Contender("reflection-aware (default)", "reflection-aware"),
     Contender("ideal 3-CCD", "3-CCD"),
 ]
@@ -157,14 +169,10 @@ class Error:
         return f"{self.rms:.4f}{flag}"
 
 
-def painted(scene: Scene, paint: str) -> Scene:
-    """The scene with smooth or sparkling paint."""
-    if paint == "smooth":
-        return scene
-    white, black = (replace(finish, spacing=0.05) for finish in (scene.surface.white, scene.surface.black))
-    return replace(
-        scene, surface=replace(scene.surface, white=white, black=black), camera=replace(scene.camera, samples=3)
-    )
+def painted(scene: Scene, wrinkles: float) -> Scene:
+    """The scene with paint whose wrinkles have this spacing in mm."""
+    white, black = (replace(finish, spacing=wrinkles) for finish in (scene.surface.white, scene.surface.black))
+    return replace(scene, surface=replace(scene.surface, white=white, black=black))
 
 
 def coloured_images(scene: Scene, state: State | None, share: float) -> Any:
@@ -181,10 +189,10 @@ def coloured_images(scene: Scene, state: State | None, share: float) -> Any:
 
 
 @cache
-def rendered(study: str, index: int, paint: str, seed: int, speckle: float) -> tuple[Scene, Any, Any, FloatArray]:
+def rendered(study: str, index: int, wrinkles: float, seed: int, speckle: float) -> tuple[Scene, Any, Any, FloatArray]:
     """Scene, lights in both states without noise, and truth (2, H, W); rendered once for all contenders."""
     case = STUDIES[study][index]
-    scene = painted(case.scene(size=case.size, seed=seed, droplet=speckle * PIXEL, **case.options), paint)
+    scene = painted(case.scene(size=case.size, seed=seed, droplet=speckle * PIXEL, **case.options), wrinkles)
     images = [coloured_images(scene, state, case.coloured) for state in (None, case.state)]
     # the first light's pixels are the frame of reference
     zoom = 1 + scene.lights[0].magnification
@@ -202,15 +210,21 @@ def registered(images: IlluminationImages, scene: Scene) -> IlluminationImages:
     return align(images, replace(identity, parameters=parameters))
 
 
-def measured(study: str, index: int, contender: Contender, *, paint: str, seed: int, speckle: float) -> Error:
+def together(images: IlluminationImages) -> FloatImage:
+    """The mean (1, H, W) of the lights, each divided by its local mean."""
+    return np.asarray(normalise(images.values, 10.0, images.full_scale).mean(axis=0, keepdims=True))
+
+
+def measured(study: str, index: int, contender: Contender, *, wrinkles: float, seed: int, speckle: float) -> Error:
     """Error of one contender on one case."""
-    scene, first, second, exact = rendered(study, index, paint, seed, speckle)
+    scene, first, second, exact = rendered(study, index, wrinkles, seed, speckle)
     camera = replace(scene.camera, kind="rgb" if contender.method == "3-CCD" else "bayer")
     recorded = replace(scene, camera=camera)
     frames = [record(i, camera, recorded.lights, seed=1000 * seed + n) for n, i in enumerate((first, second))]
     separated = [contender.lights(frame, recorded) for frame in frames]
     image = (separated[0].values - first)[:, 16:-16, 16:-16] / first.mean(axis=(1, 2), keepdims=True)
     reference, deformed = (registered(images, scene) for images in separated)
+    f, g = (together(images) if contender.one_image else images.values for images in (reference, deformed))
     size = STUDIES[study][index].size
     margin = (size - 1 - (size - 17) // 25 * 25) // 2
     far = margin + (size - 17) // 25 * 25
@@ -219,8 +233,8 @@ def measured(study: str, index: int, contender: Contender, *, paint: str, seed: 
     start = np.stack([map_coordinates(one, nodes[:, ::-1].T, order=1) for one in exact], axis=1) + 0.2
     weights = [threshold_weights(i, threshold=MASKED_ABOVE) if contender.masks else None for i in (reference, deformed)]
     solution = correlate(
-        reference.values,
-        deformed.values,
+        f,
+        g,
         region=region,
         initial=start,
         weights=weights[0],
@@ -252,15 +266,17 @@ def field_error(
     return Error((float(bias[0]), float(bias[1])), float(scatter), float(rms), missing, 0.0)
 
 
-def table(study: str, paint: str, seeds: list[int], speckle: float, contenders: list[Contender]) -> list[list[Error]]:
+def table(
+    study: str, wrinkles: float, seeds: list[int], speckle: float, contenders: list[Contender]
+) -> list[list[Error]]:
     """Print the table of one study, paint and speckle; errors by case and contender."""
-    print(f"\n{study}: {paint} paint, speckle {speckle:g} px, seeds {seeds}\n")
+    print(f"\n{study}: wrinkles {1000 * wrinkles:g} um, speckle {speckle:g} px, seeds {seeds}\n")
     print("| scene | " + " | ".join(c.name for c in contenders) + " | 3-CCD × √3 |")
     print("|---" * (len(contenders) + 2) + "|")
     rows = []
     for index, case in enumerate(STUDIES[study]):
         row = [
-            Error.mean([measured(study, index, c, paint=paint, seed=seed, speckle=speckle) for seed in seeds])
+            Error.mean([measured(study, index, c, wrinkles=wrinkles, seed=seed, speckle=speckle) for seed in seeds])
             for c in contenders
         ]
         ideal = row[-1].scatter if case.is_plate else row[-1].rms
@@ -338,7 +354,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--study", choices=(*STUDIES, "speed"), default="main")
     parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12, 13])
-    parser.add_argument("--paint", choices=("smooth", "sparkling"), default="smooth")
+    parser.add_argument("--wrinkles", type=float, default=0.025, help="their spacing in mm")
     parser.add_argument("--speckles", type=float, nargs="+", default=[4.2])
     parser.add_argument("--plates-only", action="store_true", help="leave the spheres out")
     parser.add_argument("--methods", nargs="+", help="of CONTENDERS; the ideal 3-CCD is always there")
@@ -351,7 +367,7 @@ def main() -> None:
         STUDIES[arguments.study] = [case for case in STUDIES[arguments.study] if case.is_plate]
     chosen = [c for c in CONTENDERS if not arguments.methods or c.method in (*arguments.methods, "3-CCD")]
     results = {
-        size: table(arguments.study, arguments.paint, arguments.seeds, size, chosen) for size in arguments.speckles
+        size: table(arguments.study, arguments.wrinkles, arguments.seeds, size, chosen) for size in arguments.speckles
     }
     if arguments.figure:
         figure(arguments.figure, results, chosen)

@@ -1,26 +1,24 @@
-"""How precise each light is around each pixel, learnt from its own residual: what weights the lights by statistics."""
+"""How precise the lights are together around each pixel, learnt from their residuals: the weights by statistics."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
-import cv2
 import numpy as np
 
-from rgbmidic._kernels.grid import block_sums
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.scores import displacing_share
+from rgbmidic.correlation.windows import spread, window_means
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["Precision", "learn_precision"]
 
 _FREEDOM = 4.0
 """Degrees of freedom of the Student distribution taken for the residual."""
-_RANGE = 8.0
-"""Standard deviation (px) of the window in which the variance of the residual is estimated."""
-_COARSE = 4
-"""Reduction of the grid on which that window is applied."""
+_OWN = 0.1
+"""Share of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same."""
 _LEAST_BEND = 0.1
 """Least bend of the loss around a node, over that of its weights."""
 _TRUST = 0.75
@@ -34,8 +32,9 @@ class Precision:
     Attributes
     ----------
     factor : ndarray, shape (k, P), float32
-        Factor on the weights: inverse variance of the light around the pixel, and robust at the pixel.
-    bend : ndarray, shape (k, P), float32
+        Factor on the weights: what each light adds to the best mean of the lights' residuals, times the inverse
+        variance of that mean around the pixel, robust at the pixel.
+    bend : ndarray, shape (P,), float32
         Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
     """
 
@@ -50,44 +49,63 @@ class Precision:
 
 
 def learn_precision(residual: Residual) -> Precision:
-    """Inverse variance of every light around each pixel, from the residual.
+    """Weights of the lights' best mean around each pixel, from their residuals.
 
-    The variance is that of the residual, times the part of it that displaces: brightness and contrast that change
-    slowly leave a residual which the gradient of the speckle averages out, blurred noise one that it does not. It
-    holds whatever spoils a light there: camera noise, demosaicing, the erratic part of a reflection. Its unit is
-    the median over all lights. The pixel's own factor is that of a Student distribution, so that dust or a
-    fragment does not spoil a node.
+    Lights separated from one mosaic err together, for each is predicted from all the samples around; what one misses
+    of a reflection's sparkle the others have too much. So the lights share a weight as ``C^-1 1`` of the residuals'
+    covariance C between them (generalised least squares), none below 0. The weight is the inverse variance of that
+    mean's residual, times the part of it that displaces: brightness and contrast that change slowly leave a residual
+    which the gradient of the speckle averages out, blurred noise one that it does not. It holds whatever spoils the
+    mean there: camera noise, demosaicing, the erratic part of a reflection. Its unit is the median over the region.
+    The pixel's own factor is that of a Student distribution, so that dust or a fragment does not spoil a node.
     """
-    variance = _local_variance(residual)
-    weighted = residual.weights > 0
-    typical = _typical(variance, weighted)
+    pixels, weighted = residual.reference.pixels, residual.weights > 0
+    variance = window_means(pixels, residual.difference**2, residual.weights)
+    typical = _typical(spread(pixels, variance), weighted)
     if typical <= 0:
-        return Precision(factor=np.ones_like(residual.weights), bend=np.ones_like(residual.weights))
+        return Precision(factor=np.ones_like(residual.weights), bend=np.ones_like(residual.weights[0]))
     contrast = float(np.var(residual.values[weighted], dtype=np.float64))
-    variance = np.maximum(variance, np.float32(max(0.1 * typical, 1e-6 * contrast)))
-    ratio = residual.difference**2 / variance
-    robust = (_FREEDOM + 1) / (_FREEDOM + ratio)
+    floor = np.float32(max(0.1 * typical, 1e-6 * contrast))
+    share = _best_mean(residual, np.maximum(variance, floor), weighted)
+    whole = _of_mean(residual, share)
+    used, square = share.max(axis=0) > 0, whole.difference[:1] ** 2
+    around = spread(pixels, window_means(pixels, square, used[None].astype(np.float32)))[0]
+    around = np.maximum(around, floor / len(share))
+    ratio = square[0] / around
+    displacing = around * displacing_share(whole, np.broadcast_to(around, share.shape)).max(axis=0)
+    trusted = (_typical(displacing, used) / displacing) ** _TRUST
+    factor = share * (trusted * (_FREEDOM + 1) / (_FREEDOM + ratio))
     bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
-    variance *= displacing_share(residual, variance)
-    factor = (_typical(variance, weighted) / variance) ** _TRUST * robust
     return Precision(factor=np.asarray(factor, dtype=np.float32), bend=np.asarray(bend, dtype=np.float32))
 
 
-def _local_variance(residual: Residual) -> FloatImage:
-    """Weighted Gaussian mean (k, P) of the squared residual around each pixel, found on a coarser grid."""
-    pixels, weights = residual.reference.pixels, residual.weights
-    index, shape = pixels.blocks(_COARSE)
-    sums = np.zeros((2, len(weights), shape[0] * shape[1]), dtype=np.float32)
-    for total, field in zip(sums, (residual.difference**2 * weights, weights), strict=True):
-        block_sums(field, index, total)
-    total, share = (np.stack([_blur(grid.reshape(shape)) for grid in lights]) for lights in sums)
-    mean = total / np.maximum(share, np.float32(1e-6))
-    return np.stack([pixels.from_blocks(grid, _COARSE) for grid in mean])
+def _of_mean(residual: Residual, share: FloatImage) -> Residual:
+    """The same with the lights' mean residual in place of each light's own, for their `share` (k, P) in it."""
+    mean = (share * residual.difference).sum(axis=0)
+    everywhere = np.repeat(mean[None], len(share), axis=0)
+    return replace(residual, values=everywhere, warped=np.zeros_like(everywhere), weights=share)
 
 
-def _blur(grid: FloatImage) -> FloatImage:
-    sigma = _RANGE / _COARSE
-    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT), dtype=np.float32)
+def _best_mean(residual: Residual, variance: FloatImage, weighted: BoolArray) -> FloatImage:
+    """Share (k, P) of each light in the mean of least variance; 0 where not `weighted` (k, P).
+
+    `variance` (k, h, w) is the residuals' on the grid of `window_means`.
+    """
+    lights = len(variance)
+    covariance = np.zeros((*variance.shape[1:], lights, lights))
+    covariance[..., range(lights), range(lights)] = np.moveaxis(variance, 0, -1)
+    for a, b in combinations(range(lights), 2):
+        both = np.sqrt(residual.weights[a] * residual.weights[b])[None]
+        product = (residual.difference[a] * residual.difference[b])[None]
+        shared = window_means(residual.reference.pixels, product, both)[0]
+        most = (1 - _OWN) * np.sqrt(variance[a] * variance[b])
+        covariance[..., a, b] = covariance[..., b, a] = np.clip((1 - _OWN) * shared, -most, most)
+    inverse = np.linalg.inv(covariance).sum(axis=-1)
+    weights = (
+        np.maximum(spread(residual.reference.pixels, np.moveaxis(inverse, -1, 0).astype(np.float32)), 0) * weighted
+    )
+    total = weights.sum(axis=0)
+    return np.asarray(weights / np.where(total > 0, total, np.float32(1)))
 
 
 def _typical(variance: FloatImage, weighted: BoolArray) -> float:

@@ -18,6 +18,7 @@ from rgbmidic.correlation.uncertainty.propagation import (
     displacement_functionals,
     strain_functionals,
 )
+from rgbmidic.correlation.windows import spread, window_means
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
@@ -65,7 +66,7 @@ class Reference:
     unfitted : float
         Share of the variance of a block's score that the fit leaves in the residual (`unfitted_share`).
     values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
-        The same at the owned pixels, with the gradient in grey levels per px.
+        The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
     prefilter : str
     """
 
@@ -110,6 +111,7 @@ class Reference:
         pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
         samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
         weighted = pixels.gather(usable)
+        samples[1:] = _common_gradient(samples[1:], weighted, pixels)
         used = np.sqrt(weighted)
         return cls(
             mesh=mesh,
@@ -213,3 +215,17 @@ def _values_and_gradient(image: FloatImage, pixels: PixelMap) -> FloatImage:
     x, y = pixels.columns.astype(np.float64), pixels.rows.astype(np.float64)
     sample_with_gradient(coefficients, x, y, out[0], out[1], out[2])
     return out
+
+
+def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap) -> FloatImage:
+    """Gradient (2, k, P) of the texture that the lights have in common, times each light's contrast in it.
+
+    The mean over the lights of their `gradient`. A light's own gradient meets its own residual: what the lattice of
+    one camera colour makes of a reflection's sparkle, the same in both, then pulls to whole pixels.
+    """
+    used = np.asarray(weights > 0, dtype=np.float32)
+    mean = (gradient * used).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
+    square = window_means(pixels, (mean**2).sum(axis=0)[None], used.max(axis=0)[None])
+    along = window_means(pixels, (mean[:, None] * gradient).sum(axis=0), used)
+    contrast = np.divide(along, square, out=np.zeros_like(along), where=square > 0)
+    return np.asarray(mean[:, None] * spread(pixels, np.maximum(contrast, 0)))

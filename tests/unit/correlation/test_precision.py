@@ -1,0 +1,75 @@
+"""Weights by statistics: lights that err together count as one, errors that cancel in the mean cost nothing."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from rgbmidic import Tri3Mesh, correlate
+from rgbmidic.correlation.reference import Reference
+from rgbmidic.mesh import Region
+
+SIDE = 160
+REGION = (15, 15, SIDE - 16, SIDE - 16)
+
+
+def speckle(seed):
+    field = gaussian_filter(np.random.default_rng(seed).normal(size=(SIDE, SIDE)), 1.5)
+    return 1000 + 250 * field / field.std()
+
+
+def white(seed, sigma):
+    return np.random.default_rng(seed).normal(0, sigma, (SIDE, SIDE))
+
+
+def measured(first, second):
+    return correlate(np.stack(first), np.stack(second), region=REGION, initial=(0, 0), prefilter="binomial")
+
+
+def test_two_copies_of_a_light_count_nearly_as_one():
+    a, noise = speckle(1), [white(n, 30) for n in range(4)]
+    once = [a + noise[0], a + noise[0], a + noise[1]]
+    then = [a + noise[2], a + noise[2], a + noise[3]]
+    share = measured(once, then).weight_share
+    np.testing.assert_allclose(share, [0.25, 0.25, 0.5], atol=0.03)
+
+
+def test_errors_that_cancel_in_the_mean_of_the_lights_cost_nothing():
+    a, noise, error = speckle(1), [white(n, 5) for n in range(4)], white(9, 100)
+    clean = measured([a + noise[0], a + noise[1]], [a + noise[2], a + noise[3]])
+    opposed = measured([a + noise[0], a + noise[1]], [a + noise[2] + error, a + noise[3] - error])
+    assert opposed.displacement.std() < 1.3 * clean.displacement.std()
+
+
+def test_a_light_that_errs_alone_counts_little():
+    a, noise = speckle(1), [white(n, 10) for n in range(6)]
+    once = [a + n for n in noise[:3]]
+    then = [a + noise[3], a + noise[4] + white(9, 150), a + noise[5]]
+    share = measured(once, then).weight_share
+    assert share[1] < 0.1
+    assert share[0] == pytest.approx(share[2], rel=0.15)
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    def prepare(*lights):
+        region = Region.from_rectangle(REGION, (SIDE, SIDE))
+        images = np.stack(lights).astype(np.float32)
+        return Reference.prepare(images, region, mesh=Tri3Mesh.from_region(region, 25))
+
+    return prepare
+
+
+def test_the_gradient_of_one_light_is_its_own(prepared):
+    reference = prepared(speckle(1))
+    rows, columns = reference.pixels.rows, reference.pixels.columns
+    slope = (np.roll(reference.images[0], -1, axis=1) - np.roll(reference.images[0], 1, axis=1)) / 2
+    assert np.corrcoef(reference.gradient_x[0], slope[rows, columns])[0, 1] > 0.99
+    assert reference.gradient_x[0].std() == pytest.approx(slope.std(), rel=0.15)
+
+
+def test_lights_share_a_gradient_in_proportion_to_their_contrast(prepared):
+    a = speckle(1)
+    reference = prepared(a + white(1, 20), 500 + 0.5 * a + white(2, 20))
+    x = reference.gradient_x
+    assert np.corrcoef(x[0], x[1])[0, 1] > 0.999
+    assert x[1].std() / x[0].std() == pytest.approx(0.5, rel=0.1)
