@@ -32,6 +32,9 @@ _REFINED = {"none": 1, "global": 1, "local": 4}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _STARTED = 0.25
 """Correlation coefficient at the start under which an element waits until its neighbours have brought it nearer."""
+_RETURNS = 4
+"""Passes that may bring elements back. At a fragment's edge some come and go with every pass: without a limit frames
+took 40 to 50 iterations over the most passes, and a third of them did not converge (benchmarks/fast_event.py)."""
 _SETTLED = 1e-3
 """Share of the weight that may still change for the passes to end."""
 
@@ -92,6 +95,8 @@ def next_weighting(
         std = standard_uncertainty(residual, equations, last.precision, 2)
         one_sided = one_sided_texture(equations, residual)
         matched &= ~lost_elements(problem.reference.mesh, std, motion, one_sided)
+    if number >= _RETURNS:
+        matched &= last.matched
     # where elements have come back, what was learnt from their wrong match must be learnt anew, and once more: in
     # the pass that brings them back the residual is still that of a wrong match
     returned = number + 1 if (matched & ~last.matched).any() else last.returned
