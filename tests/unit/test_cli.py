@@ -119,7 +119,9 @@ def test_run_passes_everything_on_and_tells_what_came_out(
     monkeypatch.setattr("rgbmidic.report.gallery.save_figure", lambda _, path: path.touch())
     calls: list[dict[str, Any]] = []
 
-    def measure(settings: Any, out: Path, *, overwrite: bool, progress: Callable[[int, int, str], None]) -> Result:
+    def measure(
+        settings: Any, out: Path, *, overwrite: bool, progress: Callable[[int, int, str], None], **_: Any
+    ) -> Result:
         calls.append({"path": settings.frames.path, "overwrite": overwrite})
         progress(1, 2, "f1.tif: [converged]")
         return make_result(out, frames=2, overwrite=overwrite)

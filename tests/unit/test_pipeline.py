@@ -14,7 +14,7 @@ import tifffile
 from small_tests import REGION, SHAPE, colour_test, grey_frame, toml
 
 from rgbmidic import Calibration, NodeStatus, Result, Status, measure, read_frame, read_test
-from rgbmidic.correlation import Start
+from rgbmidic.correlation import Start, renewal
 from rgbmidic.errors import (
     CalibrationError,
     ConfigurationError,
@@ -27,7 +27,7 @@ from rgbmidic.errors import (
 from rgbmidic.frames import FrameSeries, file_hash
 from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.demosaic import reflection_aware
-from rgbmidic.pipeline import Plan, frame, measure_frame, separation
+from rgbmidic.pipeline import Plan, measure_frame, separation
 
 BAYER_RMS = 0.015
 """px: Malvar demosaicing and the noise of a 12-bit camera on a plate without reflections."""
@@ -399,7 +399,7 @@ def test_the_reference_is_read_linearised_and_modelled_once(bayer, monkeypatch):
 
 
 def test_an_unexpected_error_in_one_frame_is_recorded_and_the_rest_goes_on(bayer, tmp_path, monkeypatch, caplog):
-    original = frame.track
+    original = renewal.track
 
     def faulty(reference, deformed, start, *arguments, **options):
         if faulty.calls.pop():
@@ -407,7 +407,7 @@ def test_an_unexpected_error_in_one_frame_is_recorded_and_the_rest_goes_on(bayer
         return original(reference, deformed, start, *arguments, **options)
 
     faulty.calls = [False, True, False]
-    monkeypatch.setattr(frame, "track", faulty)
+    monkeypatch.setattr(renewal, "track", faulty)
     with caplog.at_level(logging.ERROR, logger="rgbmidic.pipeline"):
         result = measure(bayer.settings(), tmp_path / "result")
     assert result.status.tolist() == [Status.CONVERGED, Status.FAILED, Status.CONVERGED]
@@ -422,7 +422,7 @@ def test_an_interruption_ends_the_run(bayer, tmp_path, monkeypatch):
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(frame, "track", interrupted)
+    monkeypatch.setattr(renewal, "track", interrupted)
     with pytest.raises(KeyboardInterrupt):
         measure(bayer.settings(), tmp_path / "result")
 

