@@ -198,7 +198,7 @@ def _saturated(lights: np.ndarray) -> None:
 
 _KNOWN = pytest.mark.xfail(
     strict=True,
-    reason="7 nodes of the left edge, seen by the reflecting red light alone, are lost: weights by covariance",
+    reason="7 nodes at the left edge that only the reflecting red light sees are lost",
 )
 
 
