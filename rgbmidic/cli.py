@@ -132,13 +132,15 @@ def _conclude(result: Result, started: float, *, draw: bool) -> None:
 @contextmanager
 def _telling_how_to_go_on(test: Path, out: Path, frames: str) -> Iterator[None]:
     """An interruption, by Ctrl-C or by whoever runs the machine, says how to go on."""
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    before = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         yield
     except KeyboardInterrupt:
         part = f"--frames {frames}" if frames else "--resume"
         _messages.print(f"go on with: rgbmidic run {test} --out {out} {part}", soft_wrap=True, markup=False)
         raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @app.command()

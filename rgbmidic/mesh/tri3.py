@@ -126,6 +126,8 @@ class Tri3Mesh:
 
         The way is not across a crack or a hole; a part without any takes the nearest of another, infinitely far.
         """
+        if chosen.all():
+            return np.zeros(len(self.nodes)), np.arange(len(self.nodes))
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import dijkstra
         from scipy.spatial import cKDTree
