@@ -441,6 +441,9 @@ def _print_summary(result: Result, seconds: float) -> None:
     rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}
     if measured:
         rows["nodes"] += f", {sum(measured) / len(measured):.1%} measured"
+    if (count := len(result.setting("frames", "reference", [0]))) > 1:
+        gain = ((1 + 1 / count) / 2) ** 0.5
+        rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
     for light, share in zip(result.lights, result.mean_share[deformed].T, strict=True):
         known = share[share == share]
         rows[light] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
