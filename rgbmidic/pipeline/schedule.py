@@ -85,7 +85,9 @@ class Schedule:
         while not self.done and count != most:
             while self._ready and len(self._running) < (workers.slots if most is None else 1):
                 position, start = heappop(self._ready)
-                future = workers.submit(self._index(position), start, self._renewed(start.renewals))
+                # a key frame looks for what has been lost; those between follow what there is
+                given = replace(start, unmeasured=0.0) if is_key(position) else start
+                future = workers.submit(self._index(position), given, self._renewed(start.renewals))
                 self._running[future] = position, start
             ended = wait(self._running, return_when=FIRST_COMPLETED).done
             if any(isinstance(_error(future), BrokenExecutor) for future in ended):
