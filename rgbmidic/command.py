@@ -25,9 +25,13 @@ def main(app: typer.Typer) -> None:
 
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)
-    for name in ("rgbmidic", "rgbmidic_calibration"):  # not the root: other libraries talk to programmers
-        logging.getLogger(name).addHandler(handler)
-    sys.exit(execute(app, arguments, debug=len(arguments) < len(sys.argv) - 1))
+    loggers = [logging.getLogger(name) for name in ("rgbmidic", "rgbmidic_calibration")]
+    for logger in loggers:  # not the root: other libraries talk to programmers
+        logger.addHandler(handler)
+    status = execute(app, arguments, debug=len(arguments) < len(sys.argv) - 1)
+    for logger in loggers:
+        logger.removeHandler(handler)
+    sys.exit(status)
 
 
 def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> int:

@@ -79,7 +79,7 @@ def test_many_threads_may_call_at_once():
 def test_other_processes_make_their_own_pool(way):
     assert blocks(0)
     with multiprocessing.get_context(way).Pool(2) as pool:
-        assert all(pool.map_async(blocks, range(4)).get(timeout=120))
+        assert all(pool.map_async(blocks, range(4)).get(timeout=300))
 
 
 def test_a_shared_kernel_can_be_sent_to_another_process():
