@@ -24,7 +24,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Renewal", "match_of"]
+__all__ = ["Renewal"]
 
 _POOR = 0.95
 """Correlation coefficient, over the best median, under which an element calls for another reference. Paint of speckles
@@ -117,8 +117,19 @@ class Renewal:
         )
 
     def match(self, deformed: Deformed, solution: Solution) -> FloatArray:
-        """Correlation coefficient (E,) of the elements with this reference; see `match_of`."""
-        return match_of(self.reference, deformed, solution.displacement - self.displacement)
+        """Correlation coefficient (E,) of the elements with this reference, of the light that matches best.
+
+        NaN where a node has no displacement, and where no light sees the element in both images.
+        """
+        residual, known = _residual(self.reference, deformed, solution.displacement - self.displacement)
+        best, moments = np.full(known.size, -np.inf), np.zeros((known.size, 6))
+        for value, warped, weight in zip(residual.values, residual.warped, residual.weights, strict=True):
+            element_moments(value, warped, weight, self.reference.pixels.offsets, moments)
+            total, f, g, f2, product, g2 = moments.T
+            some = np.maximum(total, 1e-30)
+            own = correlation(product - f * g / some, f2 - f * f / some, g2 - g * g / some)
+            best = np.where(total > 0, np.maximum(best, own), best)
+        return np.where(known & (best > -np.inf), best, np.nan)
 
     def is_due(self, solution: Solution, match: FloatArray, best: float) -> bool:
         """Whether a frame with a `solution` on the first one should become the next reference.
@@ -217,8 +228,7 @@ def _covered(mesh: Tri3Mesh, chosen: BoolArray, shape: tuple[int, ...]) -> BoolA
 def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray) -> FloatArray:
     """Sums (E, 2) over each element of the weighted residual at a displacement times the gradient; NaN where a node has
     no displacement."""
-    motion = [np.nan_to_num(displacement)] * len(reference.values)
-    residual = Residual.at(reference, deformed, reference.values, motion)
+    residual, known = _residual(reference, deformed, displacement)
     pixels = reference.pixels
     total, parts = np.zeros((len(pixels.origin), 2)), np.zeros((len(pixels.origin), 3, 2))
     gradients = zip(residual.weights * residual.difference, reference.gradient_x, reference.gradient_y, strict=True)
@@ -227,25 +237,13 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray) 
             weighted * gx, weighted * gy, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, parts
         )
         total += parts.sum(axis=1)
-    missing = np.asarray(np.isnan(displacement).any(axis=1))
-    total[missing[reference.mesh.elements].any(axis=1)] = np.nan
+    total[~known] = np.nan
     return total
 
 
-def match_of(reference: Reference, deformed: Deformed, displacement: FloatArray) -> FloatArray:
-    """Correlation coefficient (E,) of the elements' images at a displacement (N, 2), of the light that matches best.
-
-    NaN where a node has no displacement, and where no light sees the element in both images.
-    """
+def _residual(reference: Reference, deformed: Deformed, displacement: FloatArray) -> tuple[Residual, BoolArray]:
+    """The residual at a displacement (N, 2) with gaps, and the elements (E,) all of whose nodes have one."""
     found = np.asarray(np.isfinite(displacement).all(axis=1))
-    known = found[reference.mesh.elements].all(axis=1)
     motion = [np.nan_to_num(displacement)] * len(reference.values)
-    residual = Residual.at(reference, deformed, reference.values, motion)
-    best, moments = np.full(known.size, -np.inf), np.zeros((known.size, 6))
-    for value, warped, weight in zip(residual.values, residual.warped, residual.weights, strict=True):
-        element_moments(value, warped, weight, reference.pixels.offsets, moments)
-        total, f, g, f2, product, g2 = moments.T
-        some = np.maximum(total, 1e-30)
-        own = correlation(product - f * g / some, f2 - f * f / some, g2 - g * g / some)
-        best = np.where(total > 0, np.maximum(best, own), best)
-    return np.where(known & (best > -np.inf), best, np.nan)
+    known = np.asarray(found[reference.mesh.elements].all(axis=1))
+    return Residual.at(reference, deformed, reference.values, motion), known

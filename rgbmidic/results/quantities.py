@@ -98,7 +98,10 @@ _BRIGHTNESS = (
     "gain and offset (DN) of each light against the reference, from the speckle's contrast and mean, medians over the "
     "elements; told, not used"
 )
-_MATCH = "median correlation coefficient of the elements with their reference, of the light that matches best"
+_MATCH = (
+    "median correlation coefficient of the elements with their reference, of the light that matches best; NaN unless "
+    "`frames.renew` looks at it"
+)
 _BEST = "largest `match` of the frames compared with the same reference, up to this one"
 _RENEWALS = (
     "places in the result of the frames that became the reference in turn, up to this one: it was itself compared with "
