@@ -5,10 +5,11 @@ import os
 import pickle
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from block_numbers import blocks
 
 from rgbmidic._kernels.grid import block_index
 from rgbmidic._kernels.threads import over_ranges, set_threads, threads
@@ -61,15 +62,6 @@ def test_a_failure_in_any_thread_is_told():
         over_ranges("items")(Failing())(None, np.zeros(9))
 
 
-def blocks(seed):
-    """A kernel's result and what it should be."""
-    set_threads(2)
-    rows, columns = np.random.default_rng(seed).integers(0, 500, (2, 200_000), dtype=np.int32)
-    out = np.empty(rows.size, dtype=np.int32)
-    block_index(rows, columns, 0, 0, 7, 80, out)
-    return bool((out == rows // 7 * 80 + columns // 7).all())
-
-
 def test_many_threads_may_call_at_once():
     with ThreadPoolExecutor(8) as callers:
         assert all(callers.map(blocks, range(40)))
@@ -78,8 +70,8 @@ def test_many_threads_may_call_at_once():
 @pytest.mark.parametrize("way", sorted({"fork", "spawn"} & set(multiprocessing.get_all_start_methods())))
 def test_other_processes_make_their_own_pool(way):
     assert blocks(0)
-    with multiprocessing.get_context(way).Pool(2) as pool:
-        assert all(pool.map_async(blocks, range(4)).get(timeout=300))
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(way)) as pool:
+        assert all(pool.map(blocks, range(4), timeout=300))
 
 
 def test_a_shared_kernel_can_be_sent_to_another_process():
