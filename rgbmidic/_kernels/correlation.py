@@ -359,8 +359,8 @@ def interpolate_nodal(values, elements, local_x, local_y, offsets, barycentric, 
 def curvature_deviation(nodes, elements, curvature, local_x, local_y, offsets, barycentric, out):
     """Deviation of a curved field from its linear interpolant, ``out`` (2, P) float32.
 
-    `curvature` (E, 2, 3) float64 holds the second derivatives (xx, xy, yy) of both components, constant per element:
-    ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H (x_a - x_b)``.
+    `curvature` (N, 2, 3) float64 holds the second derivatives (xx, xy, yy) of both components at the nodes; along an
+    edge that is the mean of its ends: ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H_ab (x_a - x_b)``, continuous.
     """
     for e in prange(elements.shape[0]):
         for c in range(2):
@@ -370,8 +370,8 @@ def curvature_deviation(nodes, elements, curvature, local_x, local_y, offsets, b
                 b = elements[e, (edge + 1) % 3]
                 dx = nodes[a, 0] - nodes[b, 0]
                 dy = nodes[a, 1] - nodes[b, 1]
-                h = curvature[e, c]
-                half[edge] = -0.5 * (h[0] * dx * dx + 2.0 * h[1] * dx * dy + h[2] * dy * dy)
+                h = curvature[a, c] + curvature[b, c]
+                half[edge] = -0.25 * (h[0] * dx * dx + 2.0 * h[1] * dx * dy + h[2] * dy * dy)
             for i in range(offsets[e], offsets[e + 1]):
                 l0 = barycentric[e, 0, 0] + barycentric[e, 0, 1] * local_x[i] + barycentric[e, 0, 2] * local_y[i]
                 l1 = barycentric[e, 1, 0] + barycentric[e, 1, 1] * local_x[i] + barycentric[e, 1, 2] * local_y[i]

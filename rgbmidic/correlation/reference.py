@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
 from rgbmidic._kernels.interpolation import sample_with_gradient
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
+from rgbmidic.correlation.recovery import linear_fit_offset
 from rgbmidic.correlation.uncertainty.blocks import unfitted_share
-from rgbmidic.correlation.uncertainty.propagation import (
-    NodeColouring,
-    displacement_functionals,
-    strain_functionals,
-)
+from rgbmidic.correlation.uncertainty.propagation import NodeColouring
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
@@ -57,8 +53,8 @@ class Reference:
     ----------
     mesh, pixels, assembly, colouring
         TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
-    functionals : tuple of csr_matrix, shape (N, 2 N)
-        u, v, exx, eyy, exy at the nodes as linear functions of the unknowns.
+    linear_offset : ndarray, shape (N, 3)
+        What a linear fit makes of curved fields (`linear_fit_offset`).
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded.
     unfitted : float
@@ -72,7 +68,7 @@ class Reference:
     pixels: PixelMap
     assembly: Assembly
     colouring: NodeColouring
-    functionals: tuple[sp.csr_matrix, ...]
+    linear_offset: FloatArray
     unfitted: float
     images: FloatImage
     weights: FloatImage
@@ -113,7 +109,7 @@ class Reference:
             pixels=pixels,
             assembly=assembly,
             colouring=NodeColouring.from_mesh(mesh),
-            functionals=(*displacement_functionals(len(mesh.nodes)), *strain_functionals(mesh)),
+            linear_offset=linear_fit_offset(mesh),
             unfitted=unfitted_share(pixels, assembly, samples[1] * used, samples[2] * used),
             images=ready,
             weights=usable,
@@ -123,10 +119,6 @@ class Reference:
             pixel_weights=weighted,
             prefilter=prefilter,
         )
-
-    def strain(self, displacement: FloatArray) -> FloatArray:
-        """Strain (N, 3) exx, eyy, exy at the nodes for a nodal displacement (N, 2)."""
-        return np.stack([functional @ displacement.ravel() for functional in self.functionals[2:]], axis=1)
 
     def blocks(self, weight: FloatImage, gradient_x: FloatImage, gradient_y: FloatImage) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""
