@@ -57,8 +57,8 @@ def correlate(
     statistics
         Weight every light by the inverse variance of its own residual around each pixel, robustly.
     **options
-        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, search_radius, tolerance,
-        max_iterations.
+        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, search_radius,
+        tolerance, max_iterations.
 
     Returns
     -------

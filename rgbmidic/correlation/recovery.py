@@ -1,9 +1,10 @@
 """From the best linear fit to the field itself: displacement and strain at the nodes by a quadratic through them.
 
 A least-squares fit of linear elements passes above the crest of a wave and below its trough: its nodes are off by about
-``h^2/12`` times the second derivative, and a mean of element slopes at an edge is that of a point half an element inside.
-A quadratic polynomial is fitted to the nodes around each node, every second-order term with what the linear fit makes of
-it; the polynomial's value and slopes at the node are right to third order, at edges too, and carry a third less noise.
+``h^2/12`` times the second derivative, and the mean slope of the elements at an edge is that of a point half an element
+inside. A quadratic polynomial is fitted to the nodes around each node, every second-order term with what the linear fit
+makes of it: the polynomial's value and slopes at the node are right to third order, at edges too, and carry a third
+less noise.
 """
 
 from __future__ import annotations
@@ -66,7 +67,9 @@ class Recovery:
 
     def deviation(self, mesh: Tri3Mesh, pixels: PixelMap, fitted: FloatArray, offset: FloatArray) -> FloatImage:
         """What the curved field has over its own linear fit at the owned pixels, px; shape (2, P)."""
-        carried = sum(part[:, None] * (operator @ fitted) for part, operator in zip(offset.T, self.curvature, strict=True))
+        carried = sum(
+            part[:, None] * (operator @ fitted) for part, operator in zip(offset.T, self.curvature, strict=True)
+        )
         return curved(mesh, pixels, -np.asarray(carried), self.curvature, fitted)
 
 

@@ -11,7 +11,7 @@ from rgbmidic._kernels.interpolation import sample_with_gradient
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
 from rgbmidic.correlation.recovery import linear_fit_offset
-from rgbmidic.correlation.uncertainty.blocks import unfitted_share
+from rgbmidic.correlation.uncertainty.blocks import block_side, unfitted_share
 from rgbmidic.correlation.uncertainty.propagation import NodeColouring
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -110,7 +110,7 @@ class Reference:
             assembly=assembly,
             colouring=NodeColouring.from_mesh(mesh),
             linear_offset=linear_fit_offset(mesh),
-            unfitted=unfitted_share(pixels, assembly, samples[1] * used, samples[2] * used),
+            unfitted=unfitted_share(pixels, assembly, samples[1] * used, samples[2] * used, block_side(mesh.size)),
             images=ready,
             weights=usable,
             values=samples[0],

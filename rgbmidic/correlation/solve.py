@@ -160,7 +160,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
     node_status, misfits = _judged(estimate, equations, weighting, mismatched, std)
     measured = node_status == NodeStatus.MEASURED
-    inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used * 1.0) > 0)
+    inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.sqrt(estimate.squares[:, 0] / estimate.squares[:, 1])
     history = estimate.history(measured)

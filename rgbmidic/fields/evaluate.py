@@ -22,9 +22,9 @@ def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> Flo
         NaN outside the mesh and in elements with a NaN node.
     """
     pixels = PixelMap.from_mesh(mesh, Region.from_mask(np.ones(shape, dtype=bool)))
-    known = np.asarray(np.isfinite(values).all(axis=1))
-    curvature = quadratic_fit(mesh, known[mesh.elements].all(axis=1))[3:]
-    out = curved(mesh, pixels, values, curvature, np.where(known[:, None], values, 0))
+    used = np.asarray(np.isfinite(values)[mesh.elements].all(axis=(1, 2)))
+    curvature = quadratic_fit(mesh, used)[3:]
+    out = curved(mesh, pixels, values, curvature, np.nan_to_num(values))
     return np.stack([pixels.scatter(part, fill=np.nan) for part in out])
 
 

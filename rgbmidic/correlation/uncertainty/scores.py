@@ -12,7 +12,7 @@ import numpy as np
 from rgbmidic._kernels.grid import block_sums, score_sums
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.correlation.uncertainty.blocks import BLOCK
+from rgbmidic.correlation.uncertainty.blocks import BLOCK, block_side
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 __all__ = ["displacing_share", "score_covariance"]
@@ -25,15 +25,15 @@ _SCORE_RANGE = 30.0
 """Standard deviation (px) of the window over which block sums are averaged."""
 _LEAST_FREEDOM = 0.25
 """Least number of blocks, less one, that is taken: in a region of one block the uncertainty is hardly known."""
-_PRIOR = 0.1 * BLOCK**2
-"""Pixels for which the region's typical score counts in that window: beside a hole few blocks speak."""
+_PRIOR = 0.1
+"""Blocks for which the region's typical score counts in that window: beside a hole few blocks speak."""
 
 
 def displacing_share(residual: Residual, variance: FloatImage) -> FloatImage:
     """Variance of each light's scores over what white noise of that `variance` (k, P) would give, (k, P)."""
     pixels = residual.reference.pixels
-    sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32))
-    ratios = [_score_ratios(*light)[0] for light in sums]
+    sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32), BLOCK)
+    ratios = [_score_ratios(*light, side=BLOCK)[0] for light in sums]
     return np.stack([pixels.from_blocks(np.maximum(r[0] + r[2], _LEAST_RATIO), BLOCK) for r in ratios])
 
 
@@ -41,25 +41,26 @@ def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
     """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P)."""
     reference = residual.reference
     used = np.asarray(weights.any(axis=0), dtype=np.float32)
-    x, y, information, _ = _score_sums(residual, weights).sum(axis=0)
-    index, shape = reference.pixels.blocks(BLOCK)
+    side = block_side(reference.mesh.size)
+    x, y, information, _ = _score_sums(residual, weights, side).sum(axis=0)
+    index, shape = reference.pixels.blocks(side)
     count = np.zeros((1, information.size), dtype=np.float32)
     block_sums(used[None], index, count)
-    ratios, level = _score_ratios(x, y, information, count.reshape(shape).astype(np.float64))
-    return _per_element(reference, level * ratios / reference.unfitted, used)
+    ratios, level = _score_ratios(x, y, information, count.reshape(shape).astype(np.float64), side)
+    return _per_element(reference, level * ratios / reference.unfitted, used, side)
 
 
-def _score_sums(residual: Residual, weights: FloatImage) -> FloatArray:
+def _score_sums(residual: Residual, weights: FloatImage, side: int) -> FloatArray:
     """Sums (k, 4, rows, columns) over blocks of the lights' scores in x and y, their information, and pixels."""
     reference = residual.reference
-    index, shape = reference.pixels.blocks(BLOCK)
+    index, shape = reference.pixels.blocks(side)
     sums = np.zeros((len(weights), 4, shape[0] * shape[1]))
     score_sums(residual.difference, weights, reference.gradient_x, reference.gradient_y, index, sums)
     return sums.reshape(len(weights), 4, *shape)
 
 
 def _score_ratios(
-    x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray
+    x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray, side: int
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance (xx, xy, yy) of the scores of blocks over their information, and the information per pixel.
 
@@ -70,21 +71,22 @@ def _score_ratios(
     scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
     x, y = x * scale, y * scale
     typical = _typical_square(x, y, count)
-    around = _blur(count, _SCORE_RANGE / BLOCK)
+    around = _blur(count, _SCORE_RANGE / side)
+    prior = _PRIOR * side**2
     ratios = [
-        (_blur(product, _SCORE_RANGE / BLOCK) + _PRIOR * expected) / (around + _PRIOR)
+        (_blur(product, _SCORE_RANGE / side) + prior * expected) / (around + prior)
         for product, expected in ((x * x, typical), (x * y, 0.0), (y * y, typical))
     ]
-    return np.stack(ratios) * _few_blocks(around, count), level
+    return np.stack(ratios) * _few_blocks(around, count, side), level
 
 
-def _few_blocks(around: FloatArray, count: FloatArray) -> FloatArray:
+def _few_blocks(around: FloatArray, count: FloatArray, side: int) -> FloatArray:
     """Factor on a variance that few blocks tell, so that an error over its stated uncertainty has the variance 1.
 
     An estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large.
     """
-    window = 4 * np.pi * (_SCORE_RANGE / BLOCK) ** 2
-    number = np.minimum(window * around, count.sum()) / BLOCK**2
+    window = 4 * np.pi * (_SCORE_RANGE / side) ** 2
+    number = np.minimum(window * around, count.sum()) / side**2
     return np.asarray(number / np.maximum(number - 1, _LEAST_FREEDOM))
 
 
@@ -99,12 +101,12 @@ def _typical_square(x: FloatArray, y: FloatArray, count: FloatArray) -> float:
     return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
 
 
-def _per_element(reference: Reference, density: FloatArray, used: FloatImage) -> FloatArray:
+def _per_element(reference: Reference, density: FloatArray, used: FloatImage, side: int) -> FloatArray:
     """Element blocks of a score variance per pixel (xx, xy, yy) that is constant in each element."""
     mesh = reference.mesh
     top, left, _, _ = reference.pixels.bounds
     place = mesh.nodes[mesh.elements].mean(axis=1) - (left, top)
-    centre = np.round(place / BLOCK - 0.5).astype(int)
+    centre = np.round(place / side - 0.5).astype(int)
     column = np.clip(centre[:, 0], 0, density.shape[2] - 1)
     row = np.clip(centre[:, 1], 0, density.shape[1] - 1)
     # summed over the pixels in use: at an edge they do not cover the element evenly
