@@ -19,7 +19,7 @@ from rgbmidic.mesh import PixelMap, Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import curved, quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Recovery", "linear_fit_offset"]
+__all__ = ["Recovery", "linear_fit_offset", "mass_matrix"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,10 +90,14 @@ def linear_fit_offset(mesh: Tri3Mesh) -> FloatArray:
         np.bincount(mesh.elements.ravel(), weights=part.ravel(), minlength=len(mesh.nodes))
         for part in np.moveaxis(parts, -1, 0)
     ]
+    return np.asarray(factorise(mass_matrix(mesh))(np.stack(sums, axis=1)))
+
+
+def mass_matrix(mesh: Tri3Mesh) -> sp.csc_matrix:
+    """Integrals (N, N) of the products of two shape functions, square px: the consistent mass matrix."""
     mass = np.where(np.eye(3, dtype=bool), 2, 1) * mesh.areas[:, None, None] / 12
     rows, columns = np.repeat(mesh.elements, 3, axis=1).ravel(), np.tile(mesh.elements, 3).ravel()
-    matrix = sp.csc_matrix((mass.ravel(), (rows, columns)), shape=(len(mesh.nodes),) * 2)
-    return np.asarray(factorise(matrix)(np.stack(sums, axis=1)))
+    return sp.csc_matrix((mass.ravel(), (rows, columns)), shape=(len(mesh.nodes),) * 2)
 
 
 def _of_component(operator: sp.csr_matrix, component: int) -> sp.csr_matrix:

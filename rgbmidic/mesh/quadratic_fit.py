@@ -25,7 +25,7 @@ TERMS = ("value", "x", "y", "xx", "xy", "yy")
 _WIDTH = 0.55
 """Standard deviation of the weights, in sides of an element. Waves of 3, 4 and 6 elements along the mesh then have .99
 to 1.02 of their height at the nodes, with a third less noise than the linear fit; .45: 1.04, .65: .95 at 3 elements."""
-_RIDGE = np.array([1e-9, 1e-9, 1e-4, 1e-4, 1e-4])
+_RIDGE = np.array([1e-9, 1e-9, 1e-6, 1e-6, 1e-6])
 """Weight with which slopes and curvatures are held at 0, where too few nodes tell them."""
 
 

@@ -20,7 +20,7 @@ from rgbmidic.typing import BoolArray, FloatArray
 __all__ = ["NodeColouring", "displacement_functionals", "functional_std"]
 
 
-_RINGS = 4
+_RINGS = 5
 """Nodes of one colour are at least this many edges apart."""
 
 

@@ -33,7 +33,7 @@ def displacing_share(residual: Residual, variance: FloatImage) -> FloatImage:
     """Variance of each light's scores over what white noise of that `variance` (k, P) would give, (k, P)."""
     pixels = residual.reference.pixels
     sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32), BLOCK)
-    ratios = [_score_ratios(*light, side=BLOCK)[0] for light in sums]
+    ratios = [_score_ratios(x, y, part, count, BLOCK)[0] for x, y, part, count in sums]
     return np.stack([pixels.from_blocks(np.maximum(r[0] + r[2], _LEAST_RATIO), BLOCK) for r in ratios])
 
 
