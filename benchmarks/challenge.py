@@ -19,6 +19,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -158,7 +159,7 @@ def stated_over_true(pair: Pair, field: Field, size: float) -> Iterator[str]:
     """For each range of periods, and for all."""
     assert field.std is not None
     elements, error = period(field.x) / size, field.v - pair.star(field.x, field.y)
-    limits = [*zip(PERIODS[:-1], PERIODS[1:], strict=True), (PERIODS[0], PERIODS[-1])]
+    limits = [*pairwise(PERIODS), (PERIODS[0], PERIODS[-1])]
     for low, high in limits:
         here: BoolArray = (elements >= low) & (elements < high) & np.isfinite(error)
         ratio = np.sqrt(np.mean(field.std[here] ** 2) / np.mean(error[here] ** 2)) if here.sum() > 20 else np.nan
@@ -188,7 +189,7 @@ def main() -> None:
     if len(arguments.pair) not in (0, 2):
         sys.exit("give the reference and the deformed image, or none")
     pair = read_pair(*arguments.pair) if arguments.pair else own_pair()
-    ranges = [f"{low:g} to {high:g}" for low, high in zip(PERIODS[:-1], PERIODS[1:], strict=True)]
+    ranges = [f"{low:g} to {high:g}" for low, high in pairwise(PERIODS)]
     row("elements, px", "statistics", "at", "gain at 3", "4", "6", "SR, px", "noise, px", "MEI",
         *(f"stated / true, {one}" for one in ranges), "all")  # fmt: skip
     for size in arguments.sizes:

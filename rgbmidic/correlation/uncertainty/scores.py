@@ -19,6 +19,8 @@ __all__ = ["displacing_share", "score_covariance"]
 
 _LEAST_RATIO = 1e-2
 """Least share of a residual's variance that is taken to displace."""
+_LEAST_SHARE = 0.05
+"""Least share of a direction in the texture: less is not measured."""
 _EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken."""
 _SCORE_RANGE = 30.0
@@ -33,7 +35,7 @@ def displacing_share(residual: Residual, variance: FloatImage) -> FloatImage:
     """Variance of each light's scores over what white noise of that `variance` (k, P) would give, (k, P)."""
     pixels = residual.reference.pixels
     sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32), BLOCK)
-    ratios = [_score_ratios(x, y, part, count, BLOCK)[0] for x, y, part, count in sums]
+    ratios = [_score_ratios(x, y, part, count, BLOCK) for x, y, part, count in sums]
     return np.stack([pixels.from_blocks(np.maximum(r[0] + r[2], _LEAST_RATIO), BLOCK) for r in ratios])
 
 
@@ -46,8 +48,22 @@ def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
     index, shape = reference.pixels.blocks(side)
     count = np.zeros((1, information.size), dtype=np.float32)
     block_sums(used[None], index, count)
-    ratios, level = _score_ratios(x, y, information, count.reshape(shape).astype(np.float64), side)
-    return _per_element(reference, level * ratios / reference.unfitted, used, side)
+    ratios = _score_ratios(x, y, information, count.reshape(shape).astype(np.float64), side)
+    texture = np.sum([reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)], axis=0)
+    along_x, _, along_y = _per_element(reference, ratios, side) / reference.unfitted
+    share = _share_along_x(reference, texture)
+    along_x, along_y = along_x / share, along_y / (1 - share)
+    scale = np.stack([along_x, np.sqrt(along_x * along_y), along_y], axis=-1)
+    return np.asarray(texture * scale[:, None, None])
+
+
+def _share_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
+    """Share (E,) of the gradients along x in the `texture` (E, 3, 3, 3) around each element."""
+    mesh = reference.mesh
+    own = texture.sum(axis=(1, 2))
+    x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (own[:, 0], own[:, 2]))
+    share = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
+    return np.clip(share, _LEAST_SHARE, 1 - _LEAST_SHARE)
 
 
 def _score_sums(residual: Residual, weights: FloatImage, side: int) -> FloatArray:
@@ -59,10 +75,8 @@ def _score_sums(residual: Residual, weights: FloatImage, side: int) -> FloatArra
     return sums.reshape(len(weights), 4, *shape)
 
 
-def _score_ratios(
-    x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray, side: int
-) -> tuple[FloatArray, FloatArray]:
-    """Covariance (xx, xy, yy) of the scores of blocks over their information, and the information per pixel.
+def _score_ratios(x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray, side: int) -> FloatArray:
+    """Covariance (xx, xy, yy) of the scores of blocks over their information; shape (3, rows, columns).
 
     A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
     smooth, and averaged, is its ratio to the information; xx + yy is 1 for white noise and ideal weights.
@@ -77,7 +91,7 @@ def _score_ratios(
         (_blur(product, _SCORE_RANGE / side) + prior * expected) / (around + prior)
         for product, expected in ((x * x, typical), (x * y, 0.0), (y * y, typical))
     ]
-    return np.stack(ratios) * _few_blocks(around, count, side), level
+    return np.asarray(np.stack(ratios) * _few_blocks(around, count, side))
 
 
 def _few_blocks(around: FloatArray, count: FloatArray, side: int) -> FloatArray:
@@ -101,17 +115,15 @@ def _typical_square(x: FloatArray, y: FloatArray, count: FloatArray) -> float:
     return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
 
 
-def _per_element(reference: Reference, density: FloatArray, used: FloatImage, side: int) -> FloatArray:
-    """Element blocks of a score variance per pixel (xx, xy, yy) that is constant in each element."""
+def _per_element(reference: Reference, grid: FloatArray, side: int) -> FloatArray:
+    """Values (n, E) at the elements' centres of n grids of blocks."""
     mesh = reference.mesh
     top, left, _, _ = reference.pixels.bounds
     place = mesh.nodes[mesh.elements].mean(axis=1) - (left, top)
     centre = np.round(place / side - 0.5).astype(int)
-    column = np.clip(centre[:, 0], 0, density.shape[2] - 1)
-    row = np.clip(centre[:, 1], 0, density.shape[1] - 1)
-    # summed over the pixels in use: at an edge they do not cover the element evenly
-    mass = reference.blocks(used, np.ones_like(used), np.zeros_like(used))[..., :1]
-    return np.asarray(mass * density[:, row, column].T[:, None, None, :])
+    column = np.clip(centre[:, 0], 0, grid.shape[2] - 1)
+    row = np.clip(centre[:, 1], 0, grid.shape[1] - 1)
+    return np.asarray(grid[:, row, column])
 
 
 def _blur(image: AnyArray, sigma: float) -> AnyArray:
