@@ -2,9 +2,9 @@
 
     python benchmarks/challenge.py [REF DEF] [--sizes 8 10 13 16 20 25 32 40]
 
-The star of the DIC Challenge 2.0: v = 0.5 cos(2 pi (y - middle) / period) px, period 10 px at the left edge of the image
-and growing by 0.07 px per px (fitted to the Challenge's short pair; its long one has 0.0725). Without files, a pair of
-our own with white noise is made.
+The star of the DIC Challenge 2.0: v = 0.5 cos(2 pi (y - middle) / period) px, the period 10 px at the left edge of the
+image and growing by 0.07 px per px (fitted to the Challenge's short pair). Without files, a pair of our own with white
+noise is made.
 
 Gain: measured times true v over the square of the true one, over a band of 8 % about a period. SR: the longest period
 at which it is 10 % off. Noise: standard deviation of u and v between the reference and itself with as much noise as
@@ -197,7 +197,7 @@ def main() -> None:
     try:
         version = importlib.metadata.version("pyvale")
     except importlib.metadata.PackageNotFoundError:
-        print("pyvale is not installed: `pip install rgbmidic[bench]` to have its subsets beside")
+        print("pyvale is not installed: `pip install pyvale` has its subsets beside")
         return
     for function in ("AFFINE", "QUAD"):
         for subset in (15, 21, 31, 41):
