@@ -63,7 +63,7 @@ def _share_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
     own = texture.sum(axis=(1, 2))
     x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (own[:, 0], own[:, 2]))
     share = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
-    return np.clip(share, _LEAST_SHARE, 1 - _LEAST_SHARE)
+    return np.asarray(np.clip(share, _LEAST_SHARE, 1 - _LEAST_SHARE))
 
 
 def _score_sums(residual: Residual, weights: FloatImage, side: int) -> FloatArray:
