@@ -126,9 +126,11 @@ def pyvale_field(pair: Pair, subset: int, shape_function: str) -> Field:
         with tempfile.TemporaryDirectory() as folder:
             dic.calculate_2d(
                 first, image, mask, [first.shape[1] - 3 * MARGIN, first.shape[0] // 2], subset_size=subset,
-                subset_step=2, max_displacement=8, shape_func=shape_function, output_basepath=folder, print_level=0,
+                subset_step=2, max_displacement=8, shape_function=shape_function, output_basepath=folder, print_level=0,
             )  # fmt: skip
-            found.append(dic.import_2d(str(next(Path(folder).glob("*.csv"))), layout="column", binary=False))
+            found.append(
+                dic.import_2d(str(next(Path(folder).glob("*.csv"))), layout="column", binary=False, delimiter=",")
+            )
     x, y, v = (np.asarray(part, dtype=float).ravel() for part in (found[0].ss_x, found[0].ss_y, found[0].v_px))
     rest = np.stack([np.asarray(part, dtype=float).ravel() for part in (found[1].u_px, found[1].v_px)])
     return Field(x=x, y=y, v=v, rest=rest)
