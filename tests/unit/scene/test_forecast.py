@@ -44,7 +44,7 @@ def test_the_node_constant_is_the_scatter_of_nodes_recovered_from_fits_to_noise(
     mesh = Tri3Mesh.from_region(region, size)
     pixels = PixelMap.from_mesh(mesh, region)
     recovery = Recovery.over(mesh, mesh.areas > 0, np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
-    noise = np.random.default_rng(0).normal(size=(60, pixels.rows.size)).astype(np.float32)
+    noise = np.random.default_rng(0).normal(size=(400, pixels.rows.size)).astype(np.float32)
     parts, loads = np.zeros((len(mesh.elements), 3, 2)), []
     for first, second in noise.reshape(-1, 2, pixels.rows.size):
         geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
