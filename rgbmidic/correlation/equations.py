@@ -17,16 +17,14 @@ __all__ = ["SEEN", "Equations", "node_blocks", "rigid_functions"]
 
 _RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
 """Number of rigid functions of a light."""
-_SMOOTHNESS = 1e-5
-"""Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian: of a node that is
-just measured it has a hundredth."""
+_SMOOTHNESS = 1e-4
+"""Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
 _ROUNDING = 1e-4
 """Share of a node's texture under which what it sees in its worse direction may be rounding."""
 SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area..."""
-_INFORMED = 1e-3
-"""...and this share of the median information, its texture over the variance of the residual: 30 times the noise. With 1e-2
-nodes behind a saturated light were lost that erred by 0.01 px; what is uncertain by half a pixel is lost anyhow."""
+_INFORMED = 0.01
+"""...and this share of the median information, its texture over the variance of the residual: 10 times the noise."""
 
 
 def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
