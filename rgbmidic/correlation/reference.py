@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
+from rgbmidic._kernels.correlation import bring_back, element_hessian, element_right_side
 from rgbmidic._kernels.interpolation import sample_with_gradient
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
@@ -146,17 +146,13 @@ class Reference:
         """Element blocks of a light's Hessian with the pixel weights (P,)."""
         return self.blocks(weight, self.gradient_x[light], self.gradient_y[light])
 
-    def warp(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatImage:
-        """A light's deformed image brought back by a nodal displacement (N, 2): g(x + u) at the owned pixels (P,)."""
-        out = np.empty(self.pixels.rows.size, dtype=np.float32)
-        warp(deformed.coefficients[light], *self._geometry(), displacement, out)
-        return out
-
-    def pull_back(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatImage:
-        """A light's weight (P,): the reference's times the deformed image's at the displaced pixels."""
-        out = np.empty(self.pixels.rows.size, dtype=np.float32)
-        pull_back(deformed.weights[light], self.pixel_weights[light], *self._geometry(), displacement, out)
-        return out
+    def bring_back(
+        self, deformed: Deformed, light: int, displacement: FloatArray, out: FloatImage, weight: FloatImage
+    ) -> None:
+        """A light's deformed image brought back by a nodal displacement (N, 2), g(x + u) at the owned pixels, into
+        `out` (P,), and its weight, the reference's times the deformed image's there, into `weight` (P,)."""
+        images = deformed.coefficients[light], deformed.weights[light], self.pixel_weights[light]
+        bring_back(*images, *self._geometry(), displacement, out, weight)
 
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
@@ -178,12 +174,11 @@ class Reference:
         )
         return self.assembly.vector(parts), np.asarray(sums.sum(axis=0))
 
-    def _geometry(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray, AnyArray, AnyArray]:
+    def _geometry(self) -> tuple[AnyArray, ...]:
         pixels = self.pixels
         return (
-            pixels.local_x,
-            pixels.local_y,
-            pixels.offsets,
+            pixels.runs,
+            pixels.run_offsets,
             pixels.origin,
             self.mesh.elements,
             pixels.barycentric,

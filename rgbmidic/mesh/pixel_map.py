@@ -39,6 +39,10 @@ class PixelMap:
         Shape function a of element e at a local position: ``b[e, a, 0] + b[e, a, 1] x + b[e, a, 2] y``.
     shape : tuple of int
         Image size (H, W).
+    runs : ndarray, shape (R, 4), int32
+        First slot, number of pixels and local position (x, y) of the first, of every row of pixels of an element.
+    run_offsets : ndarray, shape (E + 1,), int64
+        Element e owns the runs ``run_offsets[e]:run_offsets[e + 1]``.
     bounds : tuple of int
         First row, first column, height and width of the smallest rectangle around the owned pixels.
     """
@@ -51,12 +55,19 @@ class PixelMap:
     local_y: FloatImage
     barycentric: FloatArray
     shape: tuple[int, int]
+    runs: npt.NDArray[np.int32] = field(init=False)
+    run_offsets: npt.NDArray[np.int64] = field(init=False)
     bounds: tuple[int, int, int, int] = field(init=False)
 
     def __post_init__(self) -> None:
         top, left = int(self.rows.min()), int(self.columns.min())
         size = int(self.rows.max()) - top + 1, int(self.columns.max()) - left + 1
         object.__setattr__(self, "bounds", (top, left, *size))
+        first = _run_starts(self.rows, self.columns, self.offsets)
+        length = np.diff(first, append=self.rows.size)
+        runs = np.stack([first, length, self.local_x[first], self.local_y[first]], axis=1).astype(np.int32)
+        object.__setattr__(self, "runs", runs)
+        object.__setattr__(self, "run_offsets", np.searchsorted(first, self.offsets).astype(np.int64))
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
@@ -131,6 +142,16 @@ class PixelMap:
         image = np.full(self.shape, fill, dtype=np.float32)
         image[self.rows, self.columns] = values
         return image
+
+
+def _run_starts(
+    rows: npt.NDArray[np.int32], columns: npt.NDArray[np.int32], offsets: npt.NDArray[np.int64]
+) -> npt.NDArray[np.intp]:
+    """Slots at which the pixel before is not the neighbour on the left, or belongs to another element."""
+    begins = np.ones(rows.size, dtype=bool)
+    begins[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1] + 1)
+    begins[offsets[:-1][np.diff(offsets) > 0]] = True
+    return np.flatnonzero(begins)
 
 
 def _claim_rim(owner: npt.NDArray[np.int32], counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
