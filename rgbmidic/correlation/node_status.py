@@ -139,10 +139,9 @@ def _noise_hessian(residual: Residual, weights: FloatImage) -> FloatArray:
     both images, differs by from pixel to pixel."""
     reference = residual.reference
     pixels = reference.pixels
-    top, left, _, _ = pixels.bounds
+    windows = pixels.window(residual.difference / np.float32(np.sqrt(2)))
     total = np.zeros((len(reference.mesh.elements), 3, 3, 3))
-    for weight, difference in zip(weights, residual.difference, strict=True):
-        window = pixels.window(difference) / np.float32(np.sqrt(2))
-        slopes = [np.diff(window, axis=axis, append=0)[pixels.rows - top, pixels.columns - left] for axis in (1, 0)]
-        total += reference.blocks(weight, *slopes)
+    for weight, window in zip(weights, windows, strict=True):
+        slopes = np.stack([np.diff(window, axis=axis, append=0) for axis in (1, 0)])
+        total += reference.blocks(weight, *pixels.from_window(slopes))
     return total

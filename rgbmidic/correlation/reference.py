@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import bring_back, element_hessian, element_right_side
-from rgbmidic._kernels.interpolation import sample_with_gradient
+from rgbmidic._kernels.interpolation import PAD
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
 from rgbmidic.correlation.uncertainty.blocks import unfitted_share
@@ -206,10 +206,11 @@ def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
 def _values_and_gradient(image: FloatImage, pixels: PixelMap) -> FloatImage:
     """Value and spline gradient (3, P) of an image at the owned pixels."""
     coefficients = spline_coefficients(image)
-    out = np.empty((3, pixels.rows.size), dtype=np.float32)
-    x, y = pixels.columns.astype(np.float64), pixels.rows.astype(np.float64)
-    sample_with_gradient(coefficients, x, y, out[0], out[1], out[2])
-    return out
+    slope, mean = np.array([-0.5, 0, 0.5], dtype=np.float32), np.array([1, 4, 1], dtype=np.float32) / 6
+    gradient = [cv2.sepFilter2D(coefficients, -1, *taps)[PAD:-PAD, PAD:-PAD] for taps in ((slope, mean), (mean, slope))]
+    top, left, height, width = pixels.bounds
+    part = slice(top, top + height), slice(left, left + width)
+    return pixels.from_window(np.stack([image[part], *(component[part] for component in gradient)]))
 
 
 def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap) -> FloatImage:

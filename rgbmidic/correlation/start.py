@@ -80,11 +80,15 @@ def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
 
 
 def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | None = None) -> Iterator[FoundStart]:
-    """Starts from ever finer pictures, each surer than the one before, until one is sure.
+    """Starts from ever finer pictures, each surer than the one before, until one is sure; rest alone, if that is.
 
     They are looked for within the region's longer side, but at least 128 px, of rest and of `last` (N, 2).
     """
     nodes, shape = reference.mesh.nodes, reference.images.shape[1:]
+    rest = np.zeros_like(nodes)
+    if last is None and (sure := confidence(reference, deformed, rest)) >= _SURE:
+        yield FoundStart(displacement=rest, confidence=sure)
+        return
     side = float(np.ptp(nodes, axis=0).max())
     here = Box.around(nodes, _CONTEXT, shape)
     known = nodes if last is None else np.concatenate([nodes, nodes + last])

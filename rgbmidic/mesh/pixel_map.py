@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.grid import block_index, grid_at_pixels
+from rgbmidic._kernels.grid import block_index, from_image, to_image
 from rgbmidic._kernels.mesh import claim_pixels, list_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
@@ -107,12 +107,15 @@ class PixelMap:
 
     def gather(self, image: FloatImage) -> FloatImage:
         """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
-        return np.ascontiguousarray(image[..., self.rows, self.columns])
+        place = self.rows.astype(np.int64) * self.shape[1] + self.columns
+        return np.take(image.reshape(*image.shape[:-2], -1), place, axis=-1)
 
     def by_element(self, values: FloatImage) -> FloatArray:
         """Sum of values (P,) over the pixels of each element, shape (E,)."""
-        owner = np.repeat(np.arange(len(self.origin)), np.diff(self.offsets))
-        return np.bincount(owner, weights=values, minlength=len(self.origin)).astype(np.float64)
+        sums = np.zeros(len(self.origin))
+        filled = self.offsets[:-1] < self.offsets[1:]
+        sums[filled] = np.add.reduceat(values, self.offsets[:-1][filled], dtype=np.float64)
+        return sums
 
     def blocks(self, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
         """Number of the block of `side` px in which each owned pixel lies (P,), and the grid of blocks (rows,
@@ -123,19 +126,32 @@ class PixelMap:
         block_index(self.rows, self.columns, top, left, side, grid[1], index)
         return index, grid
 
-    def from_blocks(self, grid: FloatImage, side: int) -> FloatImage:
-        """A grid of such blocks interpolated at the owned pixels (P,)."""
+    def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
+        """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
+        size = grids.shape[2] * side, grids.shape[1] * side
+        images = [cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR) for grid in grids.astype(np.float32)]
+        return self.from_window(np.stack(images))
+
+    def window(self, values: FloatImage, side: int = 1) -> FloatImage:
+        """`values` (n, P) as images of the rectangle `bounds`, grown to whole blocks of `side` px on the right and
+        below; 0 where no pixel is owned."""
+        top, left, height, width = self.bounds
+        images = np.zeros((len(values), -(-height // side) * side, -(-width // side) * side), dtype=np.float32)
+        to_image(self.runs, self.rows, self.columns, top, left, values, images)
+        return images
+
+    def from_window(self, images: FloatImage) -> FloatImage:
+        """Such images (n, h, w) at the owned pixels (n, P)."""
         top, left, _, _ = self.bounds
-        out = np.empty(self.rows.size, dtype=np.float32)
-        grid_at_pixels(np.ascontiguousarray(grid, dtype=np.float32), self.rows, self.columns, top, left, side, out)
+        out = np.empty((len(images), self.rows.size), dtype=np.float32)
+        from_image(self.runs, self.rows, self.columns, top, left, images, out)
         return out
 
-    def window(self, values: FloatImage) -> FloatImage:
-        """`values` (P,) as an image of the rectangle `bounds`, 0 where no pixel is owned."""
-        top, left, height, width = self.bounds
-        image = np.zeros((height, width), dtype=np.float32)
-        image[self.rows - top, self.columns - left] = values
-        return image
+    def block_means(self, values: FloatImage, side: int) -> FloatImage:
+        """Sums of `values` (n, P) over such blocks, over the pixels of a block, shape (n, rows, columns)."""
+        images = self.window(values, side)
+        size = images.shape[2] // side, images.shape[1] // side
+        return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
 
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
         """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""

@@ -178,9 +178,14 @@ class Tri3Mesh:
 
     def _boundary_edges(self) -> npt.NDArray[np.int32]:
         """Edges (B, 2) that belong to one element only."""
+        pairs, count = self._edges()
+        return pairs[count == 1]
+
+    def _edges(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.intp]]:
+        """Every edge once (M, 2), and the number of elements that share it (M,)."""
         edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
-        pairs, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-        return np.asarray(pairs[count == 1])
+        keys, count = np.unique(edge_keys(edges, len(self.nodes)), return_counts=True)
+        return np.stack(np.divmod(keys, len(self.nodes)), axis=1).astype(np.int32), count
 
     @property
     def crack_edges(self) -> npt.NDArray[np.int32]:
@@ -193,8 +198,7 @@ class Tri3Mesh:
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes joined by an edge, shape (M, 2), each pair once."""
-        edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
-        return np.unique(np.sort(edges, axis=1), axis=0)
+        return self._edges()[0]
 
 
 def _signed_area(nodes: FloatArray, elements: npt.NDArray[np.int32]) -> FloatArray:

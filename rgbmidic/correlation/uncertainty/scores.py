@@ -34,7 +34,7 @@ def displacing_share(residual: Residual, variance: FloatImage) -> FloatImage:
     pixels = residual.reference.pixels
     sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32))
     ratios = [_score_ratios(*light)[0] for light in sums]
-    return np.stack([pixels.from_blocks(np.maximum(r[0] + r[2], _LEAST_RATIO), BLOCK) for r in ratios])
+    return pixels.from_blocks(np.stack([np.maximum(r[0] + r[2], _LEAST_RATIO) for r in ratios]), BLOCK)
 
 
 def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:

@@ -56,7 +56,14 @@ def close(found, expected, scale=None):
 
 def moved(case):
     """The arguments that describe pixels moved by a displacement."""
-    return (case.pixels.runs, case.pixels.run_offsets, case.pixels.origin, case.mesh.elements, case.pixels.barycentric, case.displacement)
+    return (
+        case.pixels.runs,
+        case.pixels.run_offsets,
+        case.pixels.origin,
+        case.mesh.elements,
+        case.pixels.barycentric,
+        case.displacement,
+    )
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (9, 31), (64, 65), (130, 71), (3, 200)])
