@@ -92,20 +92,29 @@ def _best_mean(residual: Residual, variance: FloatImage, weighted: BoolArray) ->
     `variance` (k, h, w) is the residuals' on the grid of `window_means`.
     """
     lights = len(variance)
-    covariance = np.zeros((*variance.shape[1:], lights, lights))
-    covariance[..., range(lights), range(lights)] = np.moveaxis(variance, 0, -1)
+    covariance = np.zeros((lights, lights, *variance.shape[1:]))
+    covariance[range(lights), range(lights)] = variance
     for a, b in combinations(range(lights), 2):
         both = np.sqrt(residual.weights[a] * residual.weights[b])[None]
         product = (residual.difference[a] * residual.difference[b])[None]
         shared = window_means(residual.reference.pixels, product, both)[0]
         most = (1 - _OWN) * np.sqrt(variance[a] * variance[b])
-        covariance[..., a, b] = covariance[..., b, a] = np.clip((1 - _OWN) * shared, -most, most)
-    inverse = np.linalg.inv(covariance).sum(axis=-1)
-    weights = (
-        np.maximum(spread(residual.reference.pixels, np.moveaxis(inverse, -1, 0).astype(np.float32)), 0) * weighted
-    )
+        covariance[a, b] = covariance[b, a] = np.clip((1 - _OWN) * shared, -most, most)
+    weights = np.maximum(spread(residual.reference.pixels, _solved_for_ones(covariance)), 0) * weighted
     total = weights.sum(axis=0)
     return np.asarray(weights / np.where(total > 0, total, np.float32(1)))
+
+
+def _solved_for_ones(matrices: FloatArray) -> FloatImage:
+    """The x (k, h, w) of ``C x = 1`` for symmetric positive definite matrices (k, k, h, w), by elimination."""
+    left, right = matrices.copy(), np.ones_like(matrices[0])
+    for pivot in range(len(right)):
+        for row in range(len(right)):
+            if row != pivot:
+                factor = left[row, pivot] / left[pivot, pivot]
+                left[row, pivot:] -= factor * left[pivot, pivot:]
+                right[row] -= factor * right[pivot]
+    return np.asarray(right / left[range(len(right)), range(len(right))], dtype=np.float32)
 
 
 def _typical(variance: FloatImage, weighted: BoolArray) -> float:

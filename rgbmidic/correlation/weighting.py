@@ -66,6 +66,8 @@ class Weighting:
     @property
     def given(self) -> FloatImage:
         """Pixel weights (k, P) without the precision of the lights."""
+        if self.matched.all():
+            return self.residual.weights
         return self.residual.weights * np.repeat(self.matched, np.diff(self.residual.reference.pixels.offsets))
 
     @property
@@ -112,7 +114,8 @@ def next_weighting(
 
 def settled(weighting: Weighting, equations: Equations) -> bool:
     weights = weighting.weights
-    return bool(np.abs(weights - equations.weights).sum() <= _SETTLED * weights.sum()) and bool(weights.any())
+    total = float(weights.sum())
+    return total > 0 and float(np.abs(weights - equations.weights).sum()) <= _SETTLED * total
 
 
 def refining(problem: Problem, weighting: Weighting, number: int) -> bool:

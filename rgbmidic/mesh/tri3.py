@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -34,10 +34,13 @@ class Tri3Mesh:
         Positions (x, y) in px.
     elements : ndarray, shape (E, 3), int32
         Node indices, ordered so that ``(p1 - p0) x (p2 - p0) > 0`` in (x, y).
+    areas : ndarray, shape (E,), float64
+        Area of each element in square px.
     """
 
     nodes: FloatArray
     elements: npt.NDArray[np.int32]
+    areas: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         nodes = np.ascontiguousarray(self.nodes, dtype=np.float64)
@@ -54,6 +57,7 @@ class Tri3Mesh:
         elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
         object.__setattr__(self, "nodes", nodes)
         object.__setattr__(self, "elements", elements)
+        object.__setattr__(self, "areas", np.abs(area))
 
     @classmethod
     def from_region(cls, region: Region, element_size: float, cracks: Sequence[npt.ArrayLike] = ()) -> Tri3Mesh:
@@ -93,11 +97,6 @@ class Tri3Mesh:
             return cls(nodes=nodes, elements=elements)
         nodes, elements = outline_mesh(region.mask, element_size, cracks)
         return cls(nodes=nodes, elements=elements)
-
-    @property
-    def areas(self) -> FloatArray:
-        """Area of each element in square px, shape (E,)."""
-        return _signed_area(self.nodes, self.elements)
 
     @property
     def size(self) -> float:
