@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ _RIM = 3.0
 """Farthest (px) that a pixel of the region may lie from the element that owns it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PixelMap:
     """The P owned pixels, element after element.
 
@@ -120,11 +121,7 @@ class PixelMap:
     def blocks(self, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
         """Number of the block of `side` px in which each owned pixel lies (P,), and the grid of blocks (rows,
         columns) over `bounds`."""
-        top, left, height, width = self.bounds
-        grid = -(-height // side), -(-width // side)
-        index = np.empty(self.rows.size, dtype=np.int32)
-        block_index(self.rows, self.columns, top, left, side, grid[1], index)
-        return index, grid
+        return _blocks(self, side)
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
@@ -158,6 +155,16 @@ class PixelMap:
         image = np.full(self.shape, fill, dtype=np.float32)
         image[self.rows, self.columns] = values
         return image
+
+
+@lru_cache(maxsize=2)
+def _blocks(pixels: PixelMap, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
+    """Kept for the two sides that every frame of a test needs."""
+    top, left, height, width = pixels.bounds
+    grid = -(-height // side), -(-width // side)
+    index = np.empty(pixels.rows.size, dtype=np.int32)
+    block_index(pixels.rows, pixels.columns, top, left, side, grid[1], index)
+    return index, grid
 
 
 def _run_starts(
