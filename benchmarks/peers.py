@@ -8,9 +8,10 @@ else the machine does meets all of them, and the best time counts. Absolute time
 ratios. `--base` adds another checkout of rgbmidic as a contender. All get the same images, place their nodes or subset
 centres 25 px apart over the same region, and start from zero.
 
-``star``: v = 0.5 cos(2 pi y / period) px with a period that grows from 100 to 300 px along x, noise of 1 DN. ``affine``: 1 % strain and a turn of 2
-degrees, without noise and with noise of 2.55 DN (1 %); ``affine, 3 lights``: three noisy views of it together. ``raw``:
-the second frame of a raw Bayer series under three lights, from file to record, beside three pairs of each peer.
+``star``: v = 0.5 cos(2 pi y / period) px with a period that grows from 100 to 300 px along x, noise of 1 DN.
+``affine``: 1 % strain and a turn of 2 degrees, without noise and with noise of 2.55 DN (1 %); ``affine, 3 lights``:
+three noisy views of it together. ``raw``: the second frame of a raw Bayer series under three lights, from file to
+record, beside three pairs of each peer.
 Accuracy is over the points away from the edge; pyxel-dic has one thread only.
 """
 

@@ -15,6 +15,7 @@ from rgbmidic._kernels.interpolation import _FAST, PAD
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = [
+    "BLOCK",
     "bring_back",
     "curvature_deviation",
     "element_hessian",
@@ -30,6 +31,8 @@ _TWO_THIRDS = np.float32(2.0 / 3.0)
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
 _LEVEL = np.float32(1e-7)
+BLOCK = 8
+"""Side (px) of the blocks of which `bring_back` is told whether all their weights are 1."""
 _LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
@@ -242,54 +245,92 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
 @over_ranges("elements")
 @compiled(fastmath=_FAST)
 def bring_back(
-    start, stop, coefficients, deformed_weight, reference_weight, runs, run_offsets, origin, elements, barycentric,
-    displacement, out, weight,
+    start, stop, coefficients, deformed_weight, partial, reference_weight, runs, run_offsets, origin, elements,
+    barycentric, displacement, out, weight,
 ):  # fmt: skip
     """Deformed image and weights of one light brought back to the reference at the owned pixels.
 
     `out` (P,) float32 receives g(x + u), NaN outside the image; `weight` (P,) float32 the `reference_weight` (P,) times
-    the `deformed_weight` (H, W) at the displaced position (bilinear), 0 outside and beside excluded pixels.
+    the `deformed_weight` (H, W) at the displaced position (bilinear), 0 outside and beside excluded pixels. `partial`
+    (h + 1, w + 1) int32 tells where that is other than 1: how many such blocks of `BLOCK` px lie above and to the left.
     """
     height, width = deformed_weight.shape
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         low_x, low_y = np.float32(-base_x), np.float32(-base_y)
         high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
+        left_x = top_y = np.float32(np.inf)
+        right_x = bottom_y = -np.float32(np.inf)
         for run in range(run_offsets[e], run_offsets[e + 1]):
             slot, left = np.int64(runs[run, 0]), np.int64(runs[run, 1])
             x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
             while left > 0:
                 px = ux + fxx * x + fxy * y
                 py = uy + fyx * x + fyy * y
+                left_x, right_x = min(left_x, px), max(right_x, px)
+                top_y, bottom_y = min(top_y, py), max(bottom_y, py)
                 if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
-                    out[slot], weight[slot] = np.nan, _ZERO
+                    out[slot] = np.nan
                     slot, left, x = slot + 1, left - 1, x + _ONE
                     continue
                 cx, cy = np.floor(px), np.floor(py)
                 column, row = base_x + np.int64(cx), base_y + np.int64(cy)
                 tx, ty = px - cx, py - cy
                 n = _span(left, tx, ty, fxx, fyx, column, width)
-                filled = (n + _LANES - 1) // _LANES * _LANES
-                if slot + filled > out.size or column + filled + 1 > width:
+                filled = (n + _LANES - 1) // _LANES * _LANES  # as in `element_right_side`
+                if slot + filled > out.size or column + filled + 3 > width + 2 * PAD:
                     filled = n
                 i0, r, c = np.uint64(slot), np.uint64(row + PAD - 1), np.uint64(column + PAD - 1)
                 k0, k1 = coefficients[r, c:], coefficients[r + np.uint64(1), c:]
                 k2, k3 = coefficients[r + np.uint64(2), c:], coefficients[r + np.uint64(3), c:]
-                right = np.uint32(1 if column < width - 1 else 0)
-                above = deformed_weight[row, np.uint64(column) :]
-                below = deformed_weight[min(row + 1, height - 1), np.uint64(column) :]
                 for i in range(np.uint32(filled)):
                     t = np.float32(np.int32(i))
-                    fx, fy = tx + (fxx - _ONE) * t, ty + fyx * t
-                    g = _spline(k0, k1, k2, k3, i, fx, fy)
-                    w00, w01, w10, w11 = above[i], above[i + right], below[i], below[i + right]
-                    mean = (_ONE - fy) * ((_ONE - fx) * w00 + fx * w01) + fy * ((_ONE - fx) * w10 + fx * w11)
-                    # a pixel next to an excluded one would borrow from it through the interpolation
-                    w = reference_weight[i0 + i] * mean if min(min(w00, w01), min(w10, w11)) > _ZERO else _ZERO
+                    g = _spline(k0, k1, k2, k3, i, tx + (fxx - _ONE) * t, ty + fyx * t)
                     if np.int32(i) < np.int32(n):
                         out[i0 + i] = g
-                        weight[i0 + i] = w
+                right_x = max(right_x, px + fxx * np.float32(n))
+                top_y, bottom_y = min(top_y, py + fyx * np.float32(n)), max(bottom_y, py + fyx * np.float32(n))
                 slot, left, x = slot + n, left - n, x + np.float32(n)
+        if run_offsets[e] == run_offsets[e + 1]:
+            continue
+        first, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
+        inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
+        if inside and not _any_partial(partial, base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y):
+            for i in range(np.uint64(first), np.uint64(end)):
+                weight[i] = reference_weight[i]
+            continue
+        for run in range(run_offsets[e], run_offsets[e + 1]):
+            x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
+            for i in range(runs[run, 0], runs[run, 0] + runs[run, 1]):
+                px = ux + fxx * x + fxy * y
+                py = uy + fyx * x + fyy * y
+                within = px >= low_x and py >= low_y and px <= high_x and py <= high_y
+                mean = _beside(deformed_weight, base_x, base_y, px, py) if within else _ZERO
+                weight[i] = reference_weight[i] * mean
+                x += _ONE
+
+
+@helper()
+def _any_partial(partial, left, top, right, bottom):
+    """Whether a block is partial that holds a pixel of this rectangle, or the next one on the right or below."""
+    a, b = np.int64(left) // BLOCK, np.int64(top) // BLOCK
+    c = min((np.int64(right) + 1) // BLOCK + 1, partial.shape[1] - 1)
+    d = min((np.int64(bottom) + 1) // BLOCK + 1, partial.shape[0] - 1)
+    return partial[d, c] - partial[b, c] - partial[d, a] + partial[b, a] > 0
+
+
+@helper()
+def _beside(weight, base_x, base_y, px, py):
+    """Bilinear mean of a weight (H, W) at a position inside; 0 next to an excluded pixel, which would lend to it."""
+    cx, cy = np.floor(px), np.floor(py)
+    column, row = base_x + np.int64(cx), base_y + np.int64(cy)
+    tx, ty = px - cx, py - cy
+    right, below = min(column + 1, weight.shape[1] - 1), min(row + 1, weight.shape[0] - 1)
+    a, b = weight[row, column], weight[row, right]
+    c, d = weight[below, column], weight[below, right]
+    if min(a, b, c, d) <= _ZERO:
+        return _ZERO
+    return (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
 
 
 @over_ranges("out")

@@ -70,6 +70,11 @@ class Assembly:
         data = np.bincount(self.slots, weights=full.ravel(), minlength=len(self.indices))
         return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
 
+    def node_blocks(self, blocks: FloatArray) -> FloatArray:
+        """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""
+        corners, own = self.unknowns[:, ::2].ravel() // 2, np.einsum("eaad->dea", blocks).reshape(3, -1)
+        return np.stack([np.bincount(corners, weights=part, minlength=self.size // 2) for part in own])
+
     def vector(self, parts: FloatArray) -> FloatArray:
         """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""
         sums = np.bincount(self.unknowns.ravel(), weights=parts.ravel(), minlength=self.size)

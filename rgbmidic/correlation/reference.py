@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from rgbmidic._kernels.correlation import bring_back, element_hessian, element_right_side
+from rgbmidic._kernels.correlation import BLOCK, bring_back, element_hessian, element_right_side
 from rgbmidic._kernels.interpolation import PAD
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
@@ -34,11 +35,17 @@ class Deformed:
         Cubic B-spline coefficients of `images`.
     weights : ndarray, shape (k, H, W), float32
         0 where a pixel is excluded or must not be interpolated.
+    partial : ndarray, shape (k, h + 1, w + 1), int32
+        Number of blocks of `BLOCK` px, above and to the left, with a weight other than 1.
     """
 
     images: FloatImage
     coefficients: FloatImage
     weights: FloatImage
+    partial: npt.NDArray[np.int32] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
 
     @classmethod
     def prepare(cls, images: FloatImage, weights: FloatImage | None = None, *, prefilter: str = "none") -> Deformed:
@@ -147,7 +154,12 @@ class Reference:
     ) -> None:
         """A light's deformed image brought back by a nodal displacement (N, 2), g(x + u) at the owned pixels, into
         `out` (P,), and its weight, the reference's times the deformed image's there, into `weight` (P,)."""
-        images = deformed.coefficients[light], deformed.weights[light], self.pixel_weights[light]
+        images = (
+            deformed.coefficients[light],
+            deformed.weights[light],
+            deformed.partial[light],
+            self.pixel_weights[light],
+        )
         bring_back(*images, *self._geometry(), displacement, out, weight)
 
     def right_side(
@@ -189,6 +201,16 @@ def _prepare(images: FloatImage, weights: FloatImage | None, prefilter: str) -> 
     ready = np.stack([apply_prefilter(fill_holes(image, np.isfinite(image)), prefilter) for image in images])
     usable = np.stack([usable_pixels(known, prefilter) for known in valid]).astype(np.float32)
     return ready, usable if weights is None else usable * weights
+
+
+def _partial_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
+    """See `Deformed.partial`, for one weight (H, W)."""
+    partial = np.where(weight == 1, np.uint8(0), np.uint8(255))
+    below, right = (-side % BLOCK for side in weight.shape)
+    whole = cv2.copyMakeBorder(partial, 0, below, 0, right, cv2.BORDER_REPLICATE)
+    size = whole.shape[1] // BLOCK, whole.shape[0] // BLOCK
+    blocks = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA)) > 0  # one of 64 pixels gives 4 of 255
+    return np.asarray(cv2.integral(blocks.astype(np.uint8)), dtype=np.int32)
 
 
 def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:

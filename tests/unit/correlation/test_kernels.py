@@ -11,6 +11,7 @@ import pytest
 from rgbmidic._kernels import correlation as kernels
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic._kernels.threads import set_threads, threads
+from rgbmidic.correlation.reference import _partial_blocks
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 SHAPE = (31, 38)
@@ -142,8 +143,9 @@ def test_what_is_brought_back_equals_the_naive_twins(motion):
     case.coefficients[9 + PAD, 20 + PAD] = np.nan
     given = case.random.uniform(0.2, 1, SHAPE).astype(np.float32)
     given[case.random.random(SHAPE) < 0.1] = 0
+    given[4:25, 5:30] = 1
     out, weight = np.full((2, case.pixels.rows.size), 7, dtype=np.float32)
-    kernels.bring_back(case.coefficients, given, case.weight, *moved(case), out, weight)
+    kernels.bring_back(case.coefficients, given, _partial_blocks(given), case.weight, *moved(case), out, weight)
     expected = naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement)
     np.testing.assert_allclose(out, expected, atol=0.02)
     expected = naive.pull_back(given, case.weight, case.pixels, case.mesh, case.displacement)
@@ -160,7 +162,7 @@ def test_without_motion_the_image_comes_back_up_to_its_last_row_and_column():
     case.pixels, case.mesh, case.displacement = pixels, mesh, np.zeros(mesh.nodes.shape)
     out, weight = np.empty((2, pixels.rows.size), dtype=np.float32)
     given = np.ones(SHAPE, dtype=np.float32)
-    kernels.bring_back(case.coefficients, given, np.ones_like(out), *moved(case), out, weight)
+    kernels.bring_back(case.coefficients, given, _partial_blocks(given), np.ones_like(out), *moved(case), out, weight)
     np.testing.assert_allclose(out, pixels.gather(case.image), atol=2e-3)
     np.testing.assert_array_equal(weight, 1)
 
@@ -208,7 +210,9 @@ def all_outputs(number):
         case.coefficients, case.reference, *case.gradient, case.weight, *moved(case), right, sums
     )
     kernels.element_hessian(*case.gradient, case.weight, *case.on_map, case.pixels.barycentric, hessian)
-    kernels.bring_back(case.coefficients, case.image, case.weight, *moved(case), warped, weights)
+    kernels.bring_back(
+        case.coefficients, case.image, _partial_blocks(case.image), case.weight, *moved(case), warped, weights
+    )
     kernels.element_moments(case.reference, warped, case.weight, case.pixels.offsets, moments)
     kernels.element_vector(*case.gradient, *case.on_map, case.pixels.barycentric, vector)
     kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)

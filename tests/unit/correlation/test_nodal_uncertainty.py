@@ -10,6 +10,7 @@ from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.recovery import Recovery
+from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.blocks import BLOCK
 from rgbmidic.correlation.uncertainty.propagation import functional_std
 
