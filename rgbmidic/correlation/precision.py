@@ -61,10 +61,10 @@ def learn_precision(residual: Residual) -> Precision:
     """
     pixels, weighted = residual.reference.pixels, residual.weights > 0
     variance = window_means(pixels, residual.difference**2, residual.weights)
-    typical = _typical(spread(pixels, variance), weighted)
-    if typical <= 0:
+    typical = float(np.median(variance[variance > 0])) if variance.any() else 0.0
+    if typical <= 0 or not weighted.any():
         return Precision(factor=np.ones_like(residual.weights), bend=np.ones_like(residual.weights[0]))
-    contrast = float(np.var(residual.values[weighted], dtype=np.float64))
+    contrast = float(np.var(_some(residual.values, weighted), dtype=np.float64))
     floor = np.float32(max(0.1 * typical, 1e-6 * contrast))
     share = _best_mean(residual, np.maximum(variance, floor), weighted)
     whole = _of_mean(residual, share)
@@ -73,7 +73,8 @@ def learn_precision(residual: Residual) -> Precision:
     around = np.maximum(around, floor / len(share))
     ratio = square[0] / around
     displacing = around * displacing_share(whole, np.broadcast_to(around, share.shape)).max(axis=0)
-    trusted = (_typical(displacing, used) / displacing) ** _TRUST
+    unit = np.median(_some(displacing, used)) if used.any() else 0.0
+    trusted = (unit / displacing) ** _TRUST
     factor = share * (trusted * (_FREEDOM + 1) / (_FREEDOM + ratio))
     bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
     return Precision(factor=np.asarray(factor, dtype=np.float32), bend=np.asarray(bend, dtype=np.float32))
@@ -117,8 +118,8 @@ def _solved_for_ones(matrices: FloatArray) -> FloatImage:
     return np.asarray(right / left[range(len(right)), range(len(right))], dtype=np.float32)
 
 
-def _typical(variance: FloatImage, weighted: BoolArray) -> float:
-    """Median where `weighted`, from about 100 000 values."""
-    if not weighted.any():
-        return 0.0
-    return float(np.median(variance[weighted][:: max(1, int(weighted.sum()) // 100_000)]))
+def _some(values: FloatImage, chosen: BoolArray) -> FloatImage:
+    """About 100 000 of the `chosen` values (..., P)."""
+    every = slice(None, None, max(1, values.size // 100_000))
+    some = values[..., every][chosen[..., every]]
+    return np.asarray(some if some.size else values[chosen])

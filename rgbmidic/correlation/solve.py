@@ -100,7 +100,7 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
     weighting = first_weighting(problem, estimate)
     equations: Equations | None = None
     for number in range(_PASSES):
-        if equations is not None and settled(weighting, equations) and not refining(problem, weighting, number):
+        if equations is not None and not refining(problem, weighting, number) and settled(weighting, equations):
             break
         equations = _equations(problem, weighting, estimate)
         reached = max(tolerance, FIRST_PASS) if number == 0 else tolerance
