@@ -123,7 +123,7 @@ def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:
     xx, xy, yy = equations.node_blocks
     half, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     weak = half - difference
-    one_sided = equations.textured & (weak < _ONE_SIDED * (half + difference))
+    one_sided = np.asarray(equations.textured & (weak < _ONE_SIDED * (half + difference)))
     if not one_sided.any():
         return one_sided
     angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2  # of the weaker direction

@@ -15,6 +15,7 @@ from rgbmidic.correlation.precision import Precision, learn_precision
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.nodal import nodal_std
+from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = [
@@ -77,6 +78,7 @@ class Weighting:
         return self.given if self.precision is None else self.given * self.precision.factor
 
 
+@stage("weights")
 def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
     residual = compare(problem, problem.reference.values, estimate)
     return Weighting(
@@ -86,6 +88,7 @@ def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
     )
 
 
+@stage("weights")
 def next_weighting(
     problem: Problem, last: Weighting, equations: Equations, estimate: Estimate, number: int
 ) -> Weighting:

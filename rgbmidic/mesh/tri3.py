@@ -178,7 +178,7 @@ class Tri3Mesh:
     def _boundary_edges(self) -> npt.NDArray[np.int32]:
         """Edges (B, 2) that belong to one element only."""
         pairs, count = self._edges()
-        return pairs[count == 1]
+        return np.asarray(pairs[count == 1])
 
     def _edges(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.intp]]:
         """Every edge once (M, 2), and the number of elements that share it (M,)."""
