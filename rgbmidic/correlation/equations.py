@@ -101,10 +101,10 @@ class Equations:
         if given is not None:
             texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
             textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
-        smoothness = sp.csc_matrix((_SMOOTHNESS * scale) * assembly.smoothness)
+        smoothness = assembly.with_structure(_SMOOTHNESS * scale * assembly.smoothness.data)
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
-        anchor = 1e-9 * scale * sp.eye(assembly.size, format="csc")
-        solve = factorise(sp.csc_matrix(hessian + smoothness + anchor))
+        anchor = 1e-9 * scale * assembly.diagonal
+        solve = factorise(assembly.with_structure(hessian.data + smoothness.data + anchor))
         border, corner = _border([assembly.matrix(blocks) for blocks in per_light[1:]], functions)
         solved = solve(border) if border.shape[1] else border
         return cls(

@@ -24,7 +24,7 @@ NARROW = 10
 serve the filters only."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tri3Mesh:
     """Triangles on the reference image.
 

@@ -93,10 +93,12 @@ def functional_std(
         reaches far and would spoil those of its colour.
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
-    members = sp.csr_matrix((nodes * 1.0, (np.arange(count), colouring.colour)), shape=(count, colours))
     variance = np.empty((count, len(functionals)))
     for i, functional in enumerate(functionals):
-        columns = solve((functional.T @ members).toarray())
+        row = np.repeat(np.arange(count), np.diff(functional.indptr))
+        place = functional.indices.astype(np.int64) * colours + colouring.colour[row]
+        columns = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
+        columns = solve(columns.reshape(2 * count, colours))
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
         variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
     return np.sqrt(np.maximum(variance, 0))
