@@ -82,9 +82,9 @@ def misfit(residual: Residual, weights: FloatImage, measured: BoolArray) -> Floa
     `weights` (k, P) are those of the solve, in units of the inverse variance of the residual.
     """
     mesh, pixels = residual.reference.mesh, residual.reference.pixels
-    square, count = (
-        mesh.to_nodes(pixels.by_element(part.sum(axis=0))) for part in (weights * residual.difference**2, weights > 0)
-    )
+    lights = zip(weights, residual.difference, strict=True)
+    sums = [(pixels.by_element(own * difference**2), pixels.by_element(own > 0)) for own, difference in lights]
+    square, count = (mesh.to_nodes(np.sum(part, axis=0)) for part in zip(*sums, strict=True))
     around = square / np.maximum(count, 1.0)
     typical = float(np.median(around[measured])) if measured.any() else 0.0
     return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -43,8 +43,10 @@ class Precision:
 
     def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
         """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less than they say."""
-        parts = weights, weights * self.bend
-        total, bent = (reference.mesh.to_nodes(reference.pixels.by_element(part.sum(axis=0))) for part in parts)
+        whole = weights.sum(axis=0)
+        total, bent = (
+            reference.mesh.to_nodes(reference.pixels.by_element(part)) for part in (whole, whole * self.bend)
+        )
         return np.divide(total, np.maximum(bent, _LEAST_BEND * total), out=np.ones_like(total), where=total > 0)
 
 
@@ -67,24 +69,19 @@ def learn_precision(residual: Residual) -> Precision:
     contrast = float(np.var(_some(residual.values, weighted), dtype=np.float64))
     floor = np.float32(max(0.1 * typical, 1e-6 * contrast))
     share = _best_mean(residual, np.maximum(variance, floor), weighted)
-    whole = _of_mean(residual, share)
-    used, square = share.max(axis=0) > 0, whole.difference[:1] ** 2
+    used, mean = share.max(axis=0) > 0, np.einsum("kp,kp->p", share, residual.difference)
+    square = mean[None] ** 2
     around = spread(pixels, window_means(pixels, square, used[None].astype(np.float32)))[0]
-    around = np.maximum(around, floor / len(share))
-    ratio = square[0] / around
-    displacing = around * displacing_share(whole, np.broadcast_to(around, share.shape)).max(axis=0)
-    unit = np.median(_some(displacing, used)) if used.any() else 0.0
-    trusted = (unit / displacing) ** _TRUST
-    factor = share * (trusted * (_FREEDOM + 1) / (_FREEDOM + ratio))
-    bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
-    return Precision(factor=np.asarray(factor, dtype=np.float32), bend=np.asarray(bend, dtype=np.float32))
-
-
-def _of_mean(residual: Residual, share: FloatImage) -> Residual:
-    """The same with the lights' mean residual in place of each light's own, for their `share` (k, P) in it."""
-    mean = (share * residual.difference).sum(axis=0)
-    everywhere = np.repeat(mean[None], len(share), axis=0)
-    return replace(residual, values=everywhere, warped=np.zeros_like(everywhere), weights=share)
+    np.maximum(around, floor / len(share), out=around)
+    trusted = displacing_share(residual.reference, mean, share > 0, around) * around
+    unit = np.median(_some(trusted, used)) if used.any() else np.float32(0)
+    np.divide(unit, trusted, out=trusted)
+    np.power(trusted, np.float32(_TRUST), out=trusted)
+    ratio = np.divide(square[0], around, out=square[0])
+    bend = (np.float32(_FREEDOM) - ratio) / (np.float32(_FREEDOM) + ratio)
+    trusted *= np.float32(_FREEDOM + 1) / (np.float32(_FREEDOM) + ratio)
+    share *= trusted
+    return Precision(factor=share, bend=bend)
 
 
 def _best_mean(residual: Residual, variance: FloatImage, weighted: BoolArray) -> FloatImage:
