@@ -15,6 +15,7 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +51,9 @@ def bandwidth(threads: int) -> float:
     with ThreadPoolExecutor(threads) as pool:
 
         def copy() -> None:
-            parts = [slice(*edge) for edge in zip(edges[:-1], edges[1:], strict=True)]
-            list(pool.map(lambda part: np.copyto(target[part], source[part]), parts))
+            parts = [slice(*edge) for edge in pairwise(edges)]
+            for _ in pool.map(lambda part: np.copyto(target[part], source[part]), parts):
+                pass
 
         return 8 * _COPIED / best(copy)
 
