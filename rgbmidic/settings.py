@@ -26,6 +26,7 @@ __all__ = [
     "IlluminationSettings",
     "RegionSettings",
     "ScaleSettings",
+    "SetupSettings",
     "SolverSettings",
     "TestSettings",
     "WeightSettings",
@@ -267,12 +268,51 @@ class ScaleSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SetupSettings:
+    """What only the person in the laboratory knows (``[setup]``), in words for `rgbmidic report`; None: not stated.
+
+    The good-practice guide of the International Digital Image Correlation Society asks for these (section 5 and
+    appendix; doi:10.32720/idics/gpg.ed1).
+
+    Attributes
+    ----------
+    camera
+        Maker and model of camera and sensor.
+    lens, aperture
+        Maker, model and focal length; f-number.
+    stand_off
+        Distance from the lens to the specimen.
+    lamps
+        Kind, colours and places of the lamps, filters and polarisers.
+    pattern
+        How the speckle was made.
+    specimen, loading
+        What was tested, and how.
+    operator
+        Who tested.
+    notes
+        Anything else.
+    """
+
+    camera: str | None = None
+    lens: str | None = None
+    aperture: str | None = None
+    stand_off: str | None = None
+    lamps: str | None = None
+    pattern: str | None = None
+    specimen: str | None = None
+    loading: str | None = None
+    operator: str | None = None
+    notes: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TestSettings:
     """Everything `rgbmidic.pipeline.measure` needs to know about a test.
 
     Attributes
     ----------
-    frames, region, illumination, weights, solver, scale
+    frames, region, illumination, weights, solver, scale, setup
         The sections of the same name.
     calibration_file
         ``file`` in ``[calibration]``; needed for colour frames.
@@ -295,6 +335,7 @@ class TestSettings:
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
     scale: ScaleSettings = field(default_factory=ScaleSettings)
+    setup: SetupSettings = field(default_factory=SetupSettings)
     base: Path = field(default_factory=Path, metadata={"key": ""})
 
     def __post_init__(self) -> None:
