@@ -258,13 +258,28 @@ class SolverSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleSettings:
-    """Physical units (``[scale]``): millimetres per pixel, frames per second; None where not known."""
+    """Physical units (``[scale]``); they change nothing of what is measured, only how it is told.
+
+    Attributes
+    ----------
+    mm_per_pixel
+        Millimetres on the specimen for a pixel; None: lengths are told in px.
+    mm_per_pixel_std
+        Its standard uncertainty.
+    frame_rate
+        Frames per second, for files that do not tell when their frames were taken.
+    """
 
     mm_per_pixel: float | None = _bounded(None, above=0)
+    mm_per_pixel_std: float = _bounded(0.0, at_least=0)
     frame_rate: float | None = _bounded(None, above=0)
 
     def __post_init__(self) -> None:
         _check_bounds(self, "scale")
+        if self.mm_per_pixel_std and self.mm_per_pixel is None:
+            raise ConfigurationError(
+                "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

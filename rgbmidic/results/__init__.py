@@ -2,6 +2,7 @@
 
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
+from rgbmidic.results.measures import frame_times, reference_frames, shared_part, units_of
 from rgbmidic.results.provenance import Origin
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
 from rgbmidic.results.record import FrameRecord
@@ -20,4 +21,8 @@ __all__ = [
     "ResultStore",
     "export_result",
     "finish_result",
+    "frame_times",
+    "reference_frames",
+    "shared_part",
+    "units_of",
 ]

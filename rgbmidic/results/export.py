@@ -12,7 +12,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.fields.units import column
+from rgbmidic.fields import column
 from rgbmidic.results.files import write_complete, writing
 from rgbmidic.results.hdf5 import write_hdf5
 from rgbmidic.results.physical import Physical

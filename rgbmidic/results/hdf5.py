@@ -1,7 +1,7 @@
 """A result as one HDF5 file that h5py, MATLAB (`h5read`), xarray and ParaView open alike.
 
 The arrays lie at the root, as netCDF has it: uncompressed, the frames as first axis, every axis named by a dimension
-scale, the units as attributes. The group ``/VTKHDF`` (Kitware's VTKHDF 2.0, temporal unstructured grid) shows the same to
+scale, the units as attributes. The group ``/VTKHDF`` (Kitware's VTKHDF 2.0, temporal unstructured grid) shows them to
 ParaView: one mesh that all steps share, and the root's arrays as virtual datasets, which hold no copy. Only what changes
 its sign with the direction of y is there a second time: images have y down, ParaView has it up.
 """
@@ -78,7 +78,7 @@ def _write_shared(out: h5py.File, told: Physical) -> None:
     if units.mm_per_pixel is not None:
         out.attrs.update({"mm_per_pixel": units.mm_per_pixel, "mm_per_pixel_std": units.mm_per_pixel_std})
     out.create_dataset("provenance", data=json.dumps(dict(result.provenance)), dtype=text)
-    scales = {
+    scales: dict[str, tuple[AnyArray, str, str]] = {
         "time": (told.times, units.time, "time of the frame" if units.timed else "place of the frame, counted from 0"),
         "node": (np.arange(len(mesh.nodes), dtype=np.int32), "1", "index of the node, as in elements"),
         "element": (np.arange(len(mesh.elements), dtype=np.int32), "1", "index of the element"),
@@ -170,7 +170,7 @@ def _declare_grid(group: h5py.Group, out: h5py.File, told: Physical) -> None:
 
 
 def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, turned: bool) -> None:
-    """A nodal quantity (T, N, ...) of the root as VTK has it, (T N, ...): the same numbers, unless they are `turned`."""
+    """A nodal quantity (T, N, ...) of the root as VTK has it, (T N, ...): the same numbers unless `turned`."""
     import h5py
 
     name, shape = source.name.strip("/"), (source.shape[0] * source.shape[1], *source.shape[2:])

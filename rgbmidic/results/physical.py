@@ -11,10 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from rgbmidic.fields.covariance import NodalCovariance
-from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
-from rgbmidic.fields.strain import StrainGauges
-from rgbmidic.fields.units import Units
+from rgbmidic.fields import MEASURES, NodalCovariance, Strain, StrainGauges, Units, strain_of_gradient
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.measures import frame_times, units_of
 from rgbmidic.results.quantities import QUANTITIES, Quantity
@@ -123,5 +120,5 @@ class Physical:
 
 def _part(strain: Strain, entry: Quantity) -> FloatArray:
     attribute, _, column = entry.source.partition(".")
-    values = getattr(strain, attribute)
+    values: FloatArray = getattr(strain, attribute)
     return values[:, int(column)] if column else values
