@@ -1,5 +1,6 @@
 """What is made of a finished result: figures, the pictures beside it, pages of text and pictures."""
 
+from rgbmidic.report.document import write_report
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -27,4 +28,5 @@ __all__ = [
     "save_figure",
     "share_figure",
     "write_figures",
+    "write_report",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,10 +20,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LIGHT_COLOURS",
+    "LINES",
     "STYLE",
     "colour_range",
     "colour_scale",
     "draw_figure",
+    "embedded",
     "finish_picture",
     "finish_plot",
     "save_figure",
@@ -40,6 +44,8 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
 }
 LIGHT_COLOURS = {"red": "#c8102e", "green": "#1a7f37", "blue": "#1f5fbf"}
+LINES = ("-", "--", "-.", ":")
+"""Line styles in turn: who does not tell colours apart tells the lines apart by these."""
 _WIDTH = 7.5
 """Width of a figure in inches."""
 _CLIPPED, _WILD = 0.5, 0.1
@@ -78,6 +84,13 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
     """
     with writing(path):
         figure.savefig(path, dpi=dpi, bbox_inches="tight", pad_inches=0.08)
+
+
+def embedded(figure: Figure, *, dpi: int = 130) -> str:
+    """A figure as an address that holds the picture itself, for pages without files beside them."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0.08)
+    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
 def colour_range(known: FloatArray) -> tuple[float, float]:
@@ -128,12 +141,12 @@ def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *
     axis.locator_params(nbins=5)
 
 
-def finish_plot(axis: Axes, x: str, y: str) -> None:
-    """Named axes, whole numbers along x, a light grid."""
+def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
+    """Named axes, `whole` numbers along x, a light grid."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.xaxis.set_major_locator(MaxNLocator(integer=whole))
     axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)

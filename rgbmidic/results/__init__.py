@@ -3,6 +3,7 @@
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
 from rgbmidic.results.measures import frame_times, reference_frames, shared_part, units_of
+from rgbmidic.results.physical import Physical
 from rgbmidic.results.provenance import Origin
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
 from rgbmidic.results.record import FrameRecord
@@ -16,6 +17,7 @@ __all__ = [
     "UNKNOWN_TIME",
     "FrameRecord",
     "Origin",
+    "Physical",
     "Quantity",
     "Result",
     "ResultStore",

@@ -11,9 +11,9 @@ from typing import IO, Any, BinaryIO
 
 import numpy as np
 
-from rgbmidic.errors import InputError, ResultError
+from rgbmidic.errors import InputError
 from rgbmidic.fields import column
-from rgbmidic.results.files import write_complete, writing
+from rgbmidic.results.files import check_new, write_complete
 from rgbmidic.results.hdf5 import write_hdf5
 from rgbmidic.results.physical import Physical
 from rgbmidic.results.quantities import QUANTITIES, Quantity
@@ -29,8 +29,8 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     ``"npz"`` is the store, in px: nodes (N, 2), elements (E, 3), names (T,), lights (k,) and every quantity of
     `rgbmidic.results.QUANTITIES` that has one shape in all frames, the frames as first axis.
     ``"csv"`` and ``"hdf5"`` (`rgbmidic.results.hdf5`) are for engineers: seconds, millimetres where the scale is known,
-    Green-Lagrange strain over the shortest virtual strain gauge. csv has a header line, whose names hold the units, and a
-    row per node and frame with the quantities that are one number per node.
+    Green-Lagrange strain over the shortest virtual strain gauge. csv has a header line, whose names hold the units, and
+    a row per node and frame with the quantities that are one number per node.
     x is to the right, y down (ParaView's part of hdf5: up); NaN (an empty field in csv) where not measured.
 
     Parameters
@@ -54,13 +54,7 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     out = Path(out)
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
-    with writing(out):
-        if out.exists() and not (overwrite and out.is_file()):
-            raise ResultError(
-                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
-            )
-        if not out.parent.is_dir():
-            raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
+    check_new(out, overwrite=overwrite)
     write_complete(out, lambda file: _WRITERS[to](result, file))
 
 

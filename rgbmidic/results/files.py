@@ -18,7 +18,16 @@ import numpy as np
 from rgbmidic.errors import ResultError
 from rgbmidic.typing import AnyArray
 
-__all__ = ["read_arrays", "read_json", "write_arrays", "write_complete", "write_json", "write_new_json", "writing"]
+__all__ = [
+    "check_new",
+    "read_arrays",
+    "read_json",
+    "write_arrays",
+    "write_complete",
+    "write_json",
+    "write_new_json",
+    "writing",
+]
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -121,6 +130,23 @@ def write_complete(
     finally:
         with contextlib.suppress(OSError):  # a read-only disk refuses even to remove what is not there
             temporary.unlink()
+
+
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse to write a file that is there already (unless `overwrite`), or whose folder is not.
+
+    Raises
+    ------
+    ResultError
+        It is so, or the disk does not tell.
+    """
+    with writing(path):
+        if path.exists() and not (overwrite and path.is_file()):
+            raise ResultError(
+                f"{path} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
+            )
+        if not path.parent.is_dir():
+            raise ResultError(f"{path} cannot be written: there is no folder {path.parent}")
 
 
 @contextlib.contextmanager

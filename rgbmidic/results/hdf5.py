@@ -2,8 +2,8 @@
 
 The arrays lie at the root, as netCDF has it: uncompressed, the frames as first axis, every axis named by a dimension
 scale, the units as attributes. The group ``/VTKHDF`` (Kitware's VTKHDF 2.0, temporal unstructured grid) shows them to
-ParaView: one mesh that all steps share, and the root's arrays as virtual datasets, which hold no copy. Only what changes
-its sign with the direction of y is there a second time: images have y down, ParaView has it up.
+ParaView: one mesh that all steps share, and the root's arrays as virtual datasets, which hold no copy. Only what
+changes its sign with the direction of y is there a second time: images have y down, ParaView has it up.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from rgbmidic.results.measures import frame_times, units_of
 from rgbmidic.results.quantities import QUANTITIES, Quantity
 from rgbmidic.results.record import FrameRecord
 from rgbmidic.results.result import Result
+from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import FloatArray
 
 __all__ = ["Physical"]
@@ -65,13 +66,13 @@ class Physical:
     mesh: Tri3Mesh
 
     @classmethod
-    def of(cls, result: Result) -> Self:
-        """With the scale and the times that the result knows."""
-        times, mesh = frame_times(result), Tri3Mesh(nodes=result.nodes, elements=result.elements)
+    def of(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
+        """With the scale and the times that the result knows, or with another ``[scale]`` in place of its own."""
+        times, units = frame_times(result, scale), units_of(result, scale)
+        mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
         if times is None or not (np.diff(times) > 0).all():
-            times = np.arange(len(result), dtype=np.float64)
-            return cls(result=result, units=replace(units_of(result), timed=False), times=times, mesh=mesh)
-        return cls(result=result, units=units_of(result), times=times, mesh=mesh)
+            times, units = np.arange(len(result), dtype=np.float64), replace(units, timed=False)
+        return cls(result=result, units=units, times=times, mesh=mesh)
 
     @cached_property
     def gauges(self) -> StrainGauges:
@@ -82,6 +83,11 @@ class Physical:
     def measure(self) -> str:
         """Name of the strain measure."""
         return MEASURES[0]
+
+    def in_units(self, length: float) -> str:
+        """A length, given in px, in words: in px, and in mm where the scale is known."""
+        scale = self.units.mm_per_pixel
+        return f"{length:.4g} px" + ("" if scale is None else f" ({length * scale:.3g} mm)")
 
     @cached_property
     def quantities(self) -> dict[str, Quantity]:
