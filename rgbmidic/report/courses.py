@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.report.facts import Course, NoiseFloor
-from rgbmidic.report.style import LINES, draw_figure, finish_plot
+from rgbmidic.report.style import GAP, LINES, NUMBERS, draw_figure, finish_plot
 from rgbmidic.results import QUANTITIES, Physical
 from rgbmidic.typing import FloatArray
 
@@ -26,9 +26,9 @@ _MARKED = 40
 def course_figure(told: Physical, course: Course) -> Figure:
     """Displacement and strain over the frames: median of the nodes as a line, 5 to 95 % of them as a band."""
     length = told.units.length
-    panels = {f"displacement ({length})": ("u", "v"), f"strain ({told.measure})": ("exx", "eyy", "exy")}
+    panels = {f"displacement ({length})": ("u", "v"), f"strain ({told.measure_name})": ("exx", "eyy", "exy")}
 
-    def draw(_: Figure, axes: list[Axes]) -> None:
+    def draw(axes: list[Axes]) -> None:
         for axis, (label, names) in zip(axes, panels.items(), strict=True):
             times, unit = _times(told, course)
             for name, colour, line in zip(names, _COLOURS, LINES, strict=False):
@@ -38,14 +38,17 @@ def course_figure(told: Physical, course: Course) -> Figure:
             axis.legend(loc="best")
             finish_plot(axis, unit, label, whole=not told.units.timed)
 
-    return draw_figure(draw, count=2, aspect=0.75, colour_bars=False)
+    return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
 
 
 def uncertainty_figure(told: Physical, course: Course, floor: NoiseFloor | None) -> Figure:
     """Stated uncertainty over the frames, median of the nodes, and the noise floor of static frames as thin lines."""
-    panels = {f"standard uncertainty ({told.units.length})": ("u", "v"), "of strain": ("exx", "eyy", "exy")}
+    panels = {
+        f"standard uncertainty ({told.units.length})": ("u", "v"),
+        "standard uncertainty of strain": ("exx", "eyy", "exy"),
+    }
 
-    def draw(_: Figure, axes: list[Axes]) -> None:
+    def draw(axes: list[Axes]) -> None:
         for axis, (label, names) in zip(axes, panels.items(), strict=True):
             times, unit = _times(told, course)
             for name, colour, line in zip(names, _COLOURS, LINES, strict=False):
@@ -57,13 +60,13 @@ def uncertainty_figure(told: Physical, course: Course, floor: NoiseFloor | None)
             axis.legend(loc="best")
             finish_plot(axis, unit, label, whole=not told.units.timed)
 
-    return draw_figure(draw, count=2, aspect=0.75, colour_bars=False)
+    return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
 
 
 def status_figure(told: Physical, course: Course) -> Figure:
     """Share of the nodes with each status over the frames."""
 
-    def draw(_: Figure, axes: list[Axes]) -> None:
+    def draw(axes: list[Axes]) -> None:
         times, unit = _times(told, course)
         colours = ("#56b4e9", "#333333", "#d55e00", "#f0e442")
         shown = [code for code, share in enumerate(course.shares.T) if code == 0 or share.any()]
@@ -78,7 +81,7 @@ def status_figure(told: Physical, course: Course) -> Figure:
         axes[0].legend(loc="lower left", frameon=True)
         finish_plot(axes[0], unit, "share of the nodes", whole=not told.units.timed)
 
-    return draw_figure(draw, count=1, aspect=0.5, colour_bars=False)
+    return draw_figure(draw, count=1, aspect=0.5, beside=GAP)
 
 
 def _times(told: Physical, course: Course) -> tuple[FloatArray, str]:

@@ -53,7 +53,8 @@ def write_report(
     settings
         Of which ``[setup]`` and ``[scale]`` stand in place of those that were kept; None: those kept.
     frames
-        Indices of the frames of which maps are shown; None: three deformed ones, evenly spaced, the last one included.
+        Indices of the frames of which maps are shown; None: three deformed ones, evenly spaced, the last one included,
+        and the one that has moved farthest.
     overwrite
         Whether an existing file may be replaced.
 
@@ -86,10 +87,10 @@ class _Report:
     @classmethod
     def of(cls, told: Physical, setup: SetupSettings, frames: Sequence[int] | None) -> _Report:
         deformed = figures.shown_frames(told.result)
-        shown = figures.spread(deformed, _KEY) if frames is None else tuple(frames)
-        for frame in shown:
-            told.result.frame(frame)
+        for frame in frames or ():
+            told.result.frame(frame)  # what is wrong with one is told before the long work
         course = Course.of(told, figures.spread(deformed, _MOST))
+        shown = tuple(sorted({*figures.spread(deformed, _KEY), course.farthest})) if frames is None else tuple(frames)
         return cls(told=told, setup=setup, course=course, floor=noise_floor(told), shown=shown)
 
     def page(self) -> Page:
@@ -171,7 +172,7 @@ class _Report:
         told, length = self.told, self.told.units.length
         page.heading("Displacement and strain")
         page.text(
-            f"Displacement in {length} and strain ({told.measure}, virtual strain gauge of "
+            f"Displacement in {length} and strain ({told.measure_name}, virtual strain gauge of "
             f"{told.in_units(told.gauges.length)}), at their places on the reference image."
         )
         for frame in self.shown:

@@ -75,6 +75,12 @@ class Course:
         known = known[np.isfinite(known)]
         return float(np.median(known)) if known.size else float("nan")
 
+    @property
+    def farthest(self) -> int:
+        """The frame whose median node has moved farthest."""
+        way = np.hypot(self.quantiles["u"][:, 1], self.quantiles["v"][:, 1])
+        return self.frames[int(np.nan_to_num(way).argmax())]
+
     def extreme(self, name: str) -> float:
         """The value farthest from 0 of a quantity's median over the nodes; NaN where nothing is measured."""
         known = self.quantiles[name][:, 1]

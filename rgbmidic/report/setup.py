@@ -91,7 +91,7 @@ def analysis_rows(told: Physical, floor: NoiseFloor | None) -> Rows:
     yield from _known("grey-level correction", set_("solver", "brightness"))
     yield from _known("rigid motion between lights", set_("solver", "rigid"))
     length = told.in_units(told.gauges.length)
-    yield "strain", f"{told.measure}, plane fitted to the displacements of the nodes in a virtual strain gauge"
+    yield "strain", f"{told.measure_name}: plane fitted to the displacements of the nodes in a virtual strain gauge"
     yield "virtual strain gauge", f"{length}, at every node"
     yield "smoothing afterwards", "none"
     yield "noise floor", noise_words(told, floor)
@@ -108,7 +108,9 @@ def reference_words(told: Physical) -> str:
     if len(frames) == 1:
         return f"frame {frames[0]}"
     even = frames == list(range(frames[0], frames[-1] + 1))
-    return f"mean of {len(frames)} frames, " + (f"{frames[0]} to {frames[-1]}" if even else ", ".join(map(str, frames)))
+    return f"the mean of {len(frames)} frames, " + (
+        f"{frames[0]} to {frames[-1]}" if even else ", ".join(map(str, frames))
+    )
 
 
 def _elements(told: Physical) -> str:

@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -15,13 +15,19 @@ from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colorbar import Colorbar
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
 __all__ = [
+    "BAR",
+    "GAP",
     "LIGHT_COLOURS",
     "LINES",
+    "NUMBERS",
     "STYLE",
+    "add_colour_bar",
     "colour_range",
     "colour_scale",
     "draw_figure",
@@ -46,8 +52,12 @@ STYLE: dict[Any, Any] = {
 LIGHT_COLOURS = {"red": "#c8102e", "green": "#1a7f37", "blue": "#1f5fbf"}
 LINES = ("-", "--", "-.", ":")
 """Line styles in turn: who does not tell colours apart tells the lines apart by these."""
-_WIDTH = 7.5
-"""Width of a figure in inches."""
+_WIDTH, _TALLEST = 9.0, 9.5
+"""Largest width and height of a figure in inches."""
+NUMBERS, BAR, GAP = 0.65, 0.95, 0.15
+"""Inches: room left of a panel for its numbers, right of it for a colour bar or for nothing."""
+_BELOW, _ABOVE = 0.52, 0.3
+"""Inches: room for the numbers below a panel, and for its title."""
 _CLIPPED, _WILD = 0.5, 0.1
 """Colours span all values but this percentage at each end, and what lies within this share of that span beyond."""
 _SPAN = 4.0
@@ -55,22 +65,34 @@ _SPAN = 4.0
 
 
 def draw_figure(
-    draw: Callable[[Figure, list[Axes]], None], *, count: int, aspect: float, colour_bars: bool, title: str = ""
+    draw: Callable[[list[Axes]], None], *, count: int, aspect: float, beside: float, title: str = ""
 ) -> Figure:
-    """A figure of `count` panels whose height is `aspect` times their width: side by side, or stacked when flat."""
+    """A figure of `count` panels whose height is `aspect` times their width: side by side, or stacked when flat.
+
+    `beside` is the room right of each panel, in inches: `BAR`, `NUMBERS` or `GAP`.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    stacked = aspect < 0.5 and count > 1
-    rows, columns = (count, 1) if stacked else (1, count)
-    width = min(_WIDTH, max(6.0, 4.5 * columns)) / columns
-    height = (width * (0.8 if colour_bars else 0.9) * aspect + 0.75) * rows + (0.3 if title else 0)
+    # placed by numbers: matplotlib's layout engines draw every text several times to find the same
+    columns = 1 if aspect < 0.5 and count > 1 else count
+    rows = count // columns
+    total = min(_WIDTH, max(6.0, 4.5 * columns))
+    width = (total - NUMBERS) / columns - beside
+    height = min(width * aspect, (_TALLEST - 2 * GAP) / rows - _BELOW - _ABOVE)
+    heading = 2 * GAP if title else 0.0
+    whole = rows * (height + _BELOW + _ABOVE) + heading
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width * columns, min(height, 9.5)), layout="compressed")
-        axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-        draw(figure, axes)
+        figure = Figure(figsize=(total, whole))
+        boxes = [
+            (NUMBERS + column * (width + beside), whole - heading - (row + 1) * (height + _ABOVE) - row * _BELOW)
+            for row in range(rows)
+            for column in range(columns)
+        ]
+        axes = [figure.add_axes((x / total, y / whole, width / total, height / whole)) for x, y in boxes]
+        draw(axes)
         if title:
-            figure.suptitle(title, fontsize=10)
+            figure.suptitle(title, fontsize=10, y=1 - 0.5 * heading / whole, va="center")
     return figure
 
 
@@ -83,13 +105,13 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
         The file cannot be written.
     """
     with writing(path):
-        figure.savefig(path, dpi=dpi, bbox_inches="tight", pad_inches=0.08)
+        figure.savefig(path, dpi=dpi)
 
 
 def embedded(figure: Figure, *, dpi: int = 130) -> str:
     """A figure as an address that holds the picture itself, for pages without files beside them."""
     file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=dpi, bbox_inches="tight", pad_inches=0.08)
+    figure.savefig(file, format="png", dpi=dpi)
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
@@ -119,6 +141,15 @@ def show_image(axis: Axes, image: AnyArray) -> None:
     axis.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), interpolation="antialiased")
 
 
+def add_colour_bar(axis: Axes, shown: ScalarMappable, **options: Any) -> Colorbar:
+    """A colour bar beside a panel of `draw_figure`, as high as the panel's picture."""
+    figure = cast("Figure", axis.figure)
+    width = axis.get_position().width * figure.get_figwidth()
+    bar = figure.colorbar(shown, cax=axis.inset_axes((1 + 0.08 / width, 0, 0.12 / width, 1)), **options)
+    bar.outline.set_linewidth(0.6)
+    return bar
+
+
 def shade(axis: Axes, cover: FloatImage, step: int = 1) -> None:
     """Cover an image by a picture from 0 (clear) to 1, of which one pixel is `step` pixels of the image."""
     from matplotlib.colors import to_rgb
@@ -138,6 +169,7 @@ def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *
     axis.set_xlabel("x (px)")
     if first:
         axis.set_ylabel("y (px)")
+    axis.tick_params(labelleft=first)
     axis.locator_params(nbins=5)
 
 

@@ -18,12 +18,15 @@ from rgbmidic.results.hdf5 import write_hdf5
 from rgbmidic.results.physical import Physical
 from rgbmidic.results.quantities import QUANTITIES, Quantity
 from rgbmidic.results.result import Result
+from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
 
 
-def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool = False) -> None:
+def export_result(
+    result: Result, to: str, out: Path | str, *, scale: ScaleSettings | None = None, overwrite: bool = False
+) -> None:
     """Write all frames of a result into one file.
 
     ``"npz"`` is the store, in px: nodes (N, 2), elements (E, 3), names (T,), lights (k,) and every quantity of
@@ -41,6 +44,8 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
         One of `EXPORT_FORMATS`.
     out
         File to write; it appears once it is complete.
+    scale
+        Stands in place of the ``[scale]`` that was kept with the result; None: that one. npz knows none.
     overwrite
         Whether an existing file may be replaced.
 
@@ -55,10 +60,12 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
     check_new(out, overwrite=overwrite)
-    write_complete(out, lambda file: _WRITERS[to](result, file))
+    told = Physical.of(result, scale)
+    write_complete(out, lambda file: _WRITERS[to](told, file))
 
 
-def _write_npz(result: Result, file: BinaryIO) -> None:
+def _write_npz(told: Physical, file: BinaryIO) -> None:
+    result = told.result
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("nodes", "elements", "names", "lights"):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -78,8 +85,8 @@ def _write_frames(result: Result, quantity: Quantity, file: IO[bytes]) -> None:
         file.write(np.asarray(value, dtype=one.dtype).tobytes())
 
 
-def _write_csv(result: Result, file: BinaryIO) -> None:
-    told, text = Physical.of(result), io.TextIOWrapper(file, encoding="utf-8", newline="")
+def _write_csv(told: Physical, file: BinaryIO) -> None:
+    result, text = told.result, io.TextIOWrapper(file, encoding="utf-8", newline="")
     fields = {name: entry.unit for name, entry in told.quantities.items() if entry.axes == ("node",)}
     del fields["node_status"]  # a whole number
     length, writer = told.units.length, csv.writer(text)
@@ -101,6 +108,6 @@ def _csv_rows(one: list[Any], status: AnyArray, numbers: FloatArray) -> Iterator
         yield [*one, node, code, *("" if number != number else f"{number:.9g}" for number in row)]
 
 
-_WRITERS: dict[str, Callable[[Result, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv, "hdf5": write_hdf5}
+_WRITERS: dict[str, Callable[[Physical, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv, "hdf5": write_hdf5}
 EXPORT_FORMATS = tuple(_WRITERS)
 """Names of the formats that `export_result` writes."""

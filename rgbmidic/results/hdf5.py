@@ -17,7 +17,6 @@ import numpy as np
 from rgbmidic._version import __version__
 from rgbmidic.results.physical import Physical
 from rgbmidic.results.quantities import Quantity
-from rgbmidic.results.result import Result
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -35,13 +34,13 @@ _TURNED = ("exy", "direction")
 """Nodal quantities of one number that change their sign with the direction of y; u and v become a vector."""
 
 
-def write_hdf5(result: Result, file: BinaryIO) -> None:
+def write_hdf5(told: Physical, file: BinaryIO) -> None:
     """Write all frames of a result, one after the other: the memory that is needed is that of one frame.
 
     Parameters
     ----------
-    result
-        The result.
+    told
+        The result, in its units.
     file
         Open file on the disk, of which only the name is used: HDF5 opens it once more.
 
@@ -54,14 +53,13 @@ def write_hdf5(result: Result, file: BinaryIO) -> None:
     """
     import h5py
 
-    told = Physical.of(result)
     try:
         with h5py.File(file.name, "w") as out:
             _write_shared(out, told)
             for entry in told.quantities.values():
                 _declare(out, told, entry)
             _declare_grid(out.create_group("VTKHDF"), out, told)
-            for index in range(len(result)):
+            for index in range(len(told.result)):
                 _write_frame(out, told, index)
     except RuntimeError as error:  # how HDF5 says, when it closes a file, that it cannot write
         raise OSError(str(error).splitlines()[0]) from None

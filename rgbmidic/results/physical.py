@@ -84,6 +84,11 @@ class Physical:
         """Name of the strain measure."""
         return MEASURES[0]
 
+    @property
+    def measure_name(self) -> str:
+        """It with capitals, as people write it."""
+        return self.measure.title()
+
     def in_units(self, length: float) -> str:
         """A length, given in px, in words: in px, and in mm where the scale is known."""
         scale = self.units.mm_per_pixel
