@@ -8,16 +8,20 @@ changes its sign with the direction of y is there a second time: images have y d
 
 from __future__ import annotations
 
+import errno
 import json
 import os
-from typing import TYPE_CHECKING, BinaryIO
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.results.physical import Physical
 from rgbmidic.results.quantities import Quantity
-from rgbmidic.typing import AnyArray
+from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     import h5py
@@ -28,6 +32,8 @@ _VERSION = (2, 0)
 """Of VTKHDF: the first with time steps, which ParaView reads from 5.12 on."""
 _TRIANGLE = 5
 """VTK's number of a cell with three corners."""
+_HEADERS = 1_000_000
+"""Bytes, more than enough, for what HDF5 writes of the arrays themselves."""
 _AXES = "x to the right, y down; (0, 0) is the centre of the image's top-left pixel"
 _AXES_UP = "x to the right, y up: y, v, shears and directions are those of the file's root times -1"
 _TURNED = ("exy", "direction")
@@ -37,12 +43,15 @@ _TURNED = ("exy", "direction")
 def write_hdf5(told: Physical, file: BinaryIO) -> None:
     """Write all frames of a result, one after the other: the memory that is needed is that of one frame.
 
+    HDF5 lays the file out, with the room for all frames, and says where each array begins; the numbers are then written
+    there as into any file. A disk that fills up is an ordinary error so, of which HDF5 would not recover.
+
     Parameters
     ----------
     told
         The result, in its units.
     file
-        Open file on the disk, of which only the name is used: HDF5 opens it once more.
+        Open file on the disk, empty.
 
     Raises
     ------
@@ -53,18 +62,63 @@ def write_hdf5(told: Physical, file: BinaryIO) -> None:
     """
     import h5py
 
-    try:
-        with h5py.File(file.name, "w") as out:
-            _write_shared(out, told)
-            for entry in told.quantities.values():
-                _declare(out, told, entry)
-            _declare_grid(out.create_group("VTKHDF"), out, told)
-            for index in range(len(told.result)):
-                _write_frame(out, told, index)
-    except RuntimeError as error:  # how HDF5 says, when it closes a file, that it cannot write
-        raise OSError(str(error).splitlines()[0]) from None
-    except OSError as error:
-        raise OSError(error.errno, os.strerror(error.errno)) if error.errno else error from None
+    _check_room(told, Path(file.name).parent)
+    with h5py.File(file.name, "w") as out:
+        _write_shared(out, told)
+        for entry in told.quantities.values():
+            _declare(out, told, entry)
+        group = out.create_group("VTKHDF")
+        _declare_grid(group, told)
+        arrays = {name: _Rows.of(out[name]) for name in told.quantities}
+        turned = {name: _Rows.of(group["PointData"][name]) for name in ("displacement", *_TURNED)}
+    for index in range(len(told.result)):
+        values = told.frame(index)
+        for name, rows in arrays.items():
+            rows.write(file, index, values[name])
+        for name, rows in turned.items():
+            rows.write(file, index, _upward(values) if name == "displacement" else -values[name])
+
+
+class _Rows(NamedTuple):
+    """An array in the file, of which each frame has a row: where it begins, its type, the bytes of a row."""
+
+    first: int
+    dtype: np.dtype[Any]
+    size: int
+
+    @classmethod
+    def of(cls, dataset: h5py.Dataset) -> _Rows:
+        frames = dataset.file["time"].size
+        return cls(dataset.id.get_offset(), dataset.dtype, dataset.nbytes // frames)
+
+    def write(self, file: BinaryIO, index: int, values: Any) -> None:
+        file.seek(self.first + index * self.size)
+        file.write(np.asarray(values, dtype=self.dtype).tobytes())
+
+
+def _check_room(told: Physical, folder: Path) -> None:
+    """Refuse a disk that is too small before anything is written: what HDF5 itself writes must find room."""
+    sizes = {"node": len(told.mesh.nodes), "element": len(told.mesh.elements), "light": len(told.result.lights)}
+    frame = sum(entry.unmeasured(sizes).nbytes for entry in told.quantities.values()) + 20 * sizes["node"]
+    shared = 200 * (len(told.result) + sum(sizes.values())) + _HEADERS
+    if shutil.disk_usage(folder).free < frame * len(told.result) + shared:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _upward(values: Mapping[str, Any]) -> FloatArray:
+    """Displacement (N, 3) with y up."""
+    u, v = values["u"], values["v"]
+    return np.stack([u, -v, np.where(np.isfinite(u), 0.0, np.nan)], axis=1)
+
+
+def _room(out: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
+    """An array without content, with its place in the file."""
+    import h5py
+
+    made = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    made.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    made.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    return out.create_dataset(name, shape, np.dtype(dtype).newbyteorder("<"), dcpl=made)
 
 
 def _write_shared(out: h5py.File, told: Physical) -> None:
@@ -112,7 +166,7 @@ def _declare(out: h5py.File, told: Physical, entry: Quantity) -> None:
     """An array for all frames of a quantity, still without content."""
     axes = tuple(_axis(out, axis) for axis in entry.axes)
     shape = (len(told.result), *(len(out[axis]) for axis in axes))
-    dataset = out.create_dataset(entry.name, shape, np.dtype(entry.dtype).newbyteorder("<"))
+    dataset = _room(out, entry.name, shape, entry.dtype)
     _describe(out, dataset, ("time", *axes), entry.unit, entry.meaning)
     if entry.codes:
         words = " ".join(code.replace(" ", "_") for code in entry.codes)
@@ -131,7 +185,7 @@ def _axis(out: h5py.File, axis: str | int) -> str:
     return name
 
 
-def _declare_grid(group: h5py.Group, out: h5py.File, told: Physical) -> None:
+def _declare_grid(group: h5py.Group, told: Physical) -> None:
     """The group that VTK's reader looks for: the mesh, the steps, and the nodal quantities."""
     import h5py
 
@@ -159,10 +213,10 @@ def _declare_grid(group: h5py.Group, out: h5py.File, told: Physical) -> None:
         "ConnectivityId": (frames, 1),
     }.items():
         steps[f"{name}Offsets"] = first.reshape(shape)
-    data.create_dataset("displacement", (frames * nodes, 3), "<f4")
+    _room(data, "displacement", (frames * nodes, 3), np.float32)
     for entry in told.quantities.values():
         if entry.axes[:1] == ("node",) and entry.name not in ("u", "v"):
-            _declare_nodal(data, out[entry.name], turned=entry.name in _TURNED)
+            _declare_nodal(data, group.file[entry.name], turned=entry.name in _TURNED)
     for name in data:
         steps[f"PointDataOffsets/{name}"] = nodes * np.arange(frames, dtype=np.int64)
 
@@ -173,20 +227,8 @@ def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, turned: bool) -> N
 
     name, shape = source.name.strip("/"), (source.shape[0] * source.shape[1], *source.shape[2:])
     if turned:
-        data.create_dataset(name, shape, source.dtype)
+        _room(data, name, shape, source.dtype)
         return
     layout = h5py.VirtualLayout(shape, source.dtype)
     layout[...] = h5py.VirtualSource(".", source.name, source.shape, source.dtype)
     data.create_virtual_dataset(name, layout)
-
-
-def _write_frame(out: h5py.File, told: Physical, index: int) -> None:
-    values = told.frame(index)
-    for name, value in values.items():
-        out[name][index] = value
-    data, count = out["VTKHDF/PointData"], len(told.mesh.nodes)
-    here = slice(index * count, (index + 1) * count)
-    u, v = values["u"], values["v"]
-    data["displacement"][here] = np.stack([u, -v, np.where(np.isfinite(u), 0, np.nan)], axis=1)
-    for name in _TURNED:
-        data[name][here] = -values[name]
