@@ -49,9 +49,18 @@ _SPAN = 4.0
 
 
 def draw_figure(
-    draw: Callable[[Figure, list[Axes]], None], *, count: int, aspect: float, colour_bars: bool, title: str = ""
+    draw: Callable[[Figure, list[Axes]], None],
+    *,
+    count: int,
+    aspect: float,
+    colour_bars: bool,
+    title: str = "",
+    tall: bool = False,
 ) -> Figure:
-    """A figure of `count` panels whose height is `aspect` times their width: side by side, or stacked when flat."""
+    """A figure of `count` panels whose height is `aspect` times their width: side by side, or stacked when flat.
+
+    `tall` lets it grow beyond a page.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -60,7 +69,7 @@ def draw_figure(
     width = min(_WIDTH, max(6.0, 4.5 * columns)) / columns
     height = (width * (0.8 if colour_bars else 0.9) * aspect + 0.75) * rows + (0.3 if title else 0)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width * columns, min(height, 9.5)), layout="compressed")
+        figure = Figure(figsize=(width * columns, height if tall else min(height, 9.5)), layout="compressed")
         axes = list(figure.subplots(rows, columns, squeeze=False).flat)
         draw(figure, axes)
         if title:
@@ -128,12 +137,12 @@ def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *
     axis.locator_params(nbins=5)
 
 
-def finish_plot(axis: Axes, x: str, y: str) -> None:
-    """Named axes, whole numbers along x, a light grid."""
+def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
+    """Named axes, `whole` numbers along x, a light grid."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.xaxis.set_major_locator(MaxNLocator(integer=whole))
     axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)

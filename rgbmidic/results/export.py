@@ -11,8 +11,8 @@ from typing import IO, Any, BinaryIO
 
 import numpy as np
 
-from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.files import write_complete, writing
+from rgbmidic.errors import InputError
+from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.quantities import QUANTITIES, Quantity
 from rgbmidic.results.result import Result
 
@@ -50,13 +50,7 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     out = Path(out)
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
-    with writing(out):
-        if out.exists() and not (overwrite and out.is_file()):
-            raise ResultError(
-                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
-            )
-        if not out.parent.is_dir():
-            raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
+    check_file(out, overwrite=overwrite)
     write_complete(out, lambda file: _WRITERS[to](result, file))
 
 

@@ -123,6 +123,23 @@ def write_complete(
             temporary.unlink()
 
 
+def check_file(out: Path, *, overwrite: bool) -> None:
+    """Refuse a file that is already there, unless it may be replaced, or whose folder is not.
+
+    Raises
+    ------
+    ResultError
+        It cannot be written.
+    """
+    with writing(out):
+        if out.exists() and not (overwrite and out.is_file()):
+            raise ResultError(
+                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
+            )
+        if not out.parent.is_dir():
+            raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
+
+
 @contextlib.contextmanager
 def writing(path: Path | str) -> Iterator[None]:
     """What the disk refuses inside becomes a `ResultError` that names the file."""
