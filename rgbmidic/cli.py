@@ -1,28 +1,30 @@
-"""The command `rgbmidic`: thin; each sub-command calls one function of the library."""
+"""The command `rgbmidic`: thin; each sub-command calls one function of the library, imported when it is called."""
 
 from __future__ import annotations
 
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from rgbmidic import command
 from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
-from rgbmidic.results import EXPORT_FORMATS, Result, export_result, finish_result
-from rgbmidic.settings import FrameSettings
+
+if TYPE_CHECKING:
+    from rgbmidic.results import Result
+    from rgbmidic.settings import ProbeSettings
 
 __all__ = ["app", "main"]
 
+_WIDE = 400
+"""Columns that a table may take: where the terminal has fewer it breaks the lines, and nothing is cut off."""
 _CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -132,6 +134,8 @@ def finish(
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """End a result that was measured in parts: check that no frame is missing, and draw it."""
+    from rgbmidic.results import Result, finish_result
+
     started = time.perf_counter()
     finish_result(result)
     _conclude(Result.open(result), started, draw=draw)
@@ -176,6 +180,7 @@ def figures(
 ) -> None:
     """Draw a result: maps, masks and reflections of some frames, and what happened over all of them."""
     from rgbmidic.report import write_figures
+    from rgbmidic.results import Result
 
     chosen = _whole_numbers(frames, "--frames") if frames else None
     for file in write_figures(Result.open(result, partial=partial), out or result / "figures", chosen):
@@ -186,11 +191,13 @@ def figures(
 def export(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="File to write.")],
-    to: Annotated[str, typer.Option("--to", help=f"Format: {', '.join(EXPORT_FORMATS)}.")] = "npz",
+    to: Annotated[str, typer.Option("--to", help="Format: npz or csv.")] = "npz",
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
     """Write a result into one file for another program."""
+    from rgbmidic.results import Result, export_result
+
     export_result(Result.open(result, partial=partial), to, out, overwrite=overwrite)
 
 
@@ -278,12 +285,15 @@ def demo(
     ),
 ) -> None:
     """Make a small virtual test, calibrate, measure it, and compare with the known truth."""
+    from rich.table import Table
+
     _messages.print(
         f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}", soft_wrap=True
     )
     _tell_first_run()
     from rgbmidic.lab.demo import run_demo
     from rgbmidic.report import write_figures
+    from rgbmidic.results import Result
 
     started = time.perf_counter()
     with _progress("demo") as progress:
@@ -303,6 +313,7 @@ def demo(
 
 def _calibrate_demo(test: Path) -> None:
     """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` finds it."""
+    from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.jobs import calibrate_crosstalk
 
     lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
@@ -369,6 +380,7 @@ def frames(
 ) -> None:
     """What a reader sees of raw frames: how many, of what size and levels, when they were taken, how many are lost."""
     from rgbmidic.frames.describe import describe, save_frame
+    from rgbmidic.settings import FrameSettings
 
     stated = _stated(kind, cfa, black_level, white_level, shape, dtype)
     settings = FrameSettings(path=(path,), **{key: value for key, value in stated.items() if value is not None})
@@ -447,13 +459,15 @@ def _stated(
 def _print_table(
     title: str, headings: list[str], rows: list[list[str]], words: Mapping[str, str] | None = None
 ) -> None:
+    from rich.table import Table
+
     table = Table(box=None, pad_edge=False)
     for number, heading in enumerate(headings):
         table.add_column(heading, justify="right" if number else "left", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     print(title)
-    Console(soft_wrap=True).print(table)
+    Console(soft_wrap=True, width=_WIDE).print(table)
     for heading, meaning in (words or {}).items():
         print(f"  {heading}: {meaning}")
     print()
@@ -513,28 +527,19 @@ def _tell_first_run() -> None:
         )
 
 
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one."""
-    # only for people who watch: an error stays one line, a log file stays short
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
-    last = TextColumn("{task.fields[line]}", markup=False)
-    with Progress(*columns, last, console=_messages, transient=True, disable=not _messages.is_terminal) as bar:
-        task = bar.add_task(what, total=None, line="")
-        yield lambda done, total, line: bar.update(task, completed=done, total=total, line=line)
+def _progress(what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:
+    """A bar on stderr for people who watch, see `rgbmidic.progress`."""
+    from rgbmidic.progress import progress_bar
 
-
-class _Rate(ProgressColumn):
-    """Frames per second."""
-
-    def render(self, task: Task) -> str:
-        return f"{task.speed:.3g}/s" if task.speed else ""
+    return progress_bar(what, _messages)
 
 
 def _print_summary(result: Result, seconds: float) -> None:
     """What became of the deformed frames; the reference, matched with itself, says nothing."""
     deformed = list(result.deformed)
-    ends = [int((result.status[deformed] == code).sum()) for code in (_CONVERGED, _UNCONVERGED, _FAILED)]
+    ends = [int((result.status[deformed] == code).sum()) for code in (_WIDE = 400
+"""Columns that a table may take: where the terminal has fewer it breaks the lines, and nothing is cut off."""
+_CONVERGED, _UNCONVERGED, _FAILED)]
     words = [f"{ends[0]} converged", *([f"{ends[1]} not converged"] if ends[1] else []), f"{ends[2]} failed"]
     measured = [float((status == 0).mean()) for status in result.each("node_status", deformed)]
     rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}

@@ -75,8 +75,8 @@ class FrameSettings:
         i mod `lights`, and so many frames make one state, which is what the other keys count.
     renew
         Whether a later frame becomes the reference where the match with the one before no longer serves, for paint that
-        changes and rotations beyond 20 degrees. Uncertainties add up (`rgbmidic.correlation.renewal`), and a node that
-        is lost in such a frame is lost for good.
+        changes. Uncertainties add up (`rgbmidic.correlation.renewal`), and a node that is lost in such a frame is lost
+        for good.
     shape, dtype
         Rows and columns, and sample type, of headerless files.
     crop_origin

@@ -38,11 +38,18 @@ def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Equations:
-    """Factorised normal equations for given weights.
+    """Factorised normal equations for given weights, in axes that turn with the surface.
+
+    The reference's gradient stands for that of the deformed image, which the surface has turned with it: the motion is
+    solved for in the axes of the reference and turned to where they are now.
 
     Attributes
     ----------
     weights : ndarray, shape (k, P), float32
+    rotation : ndarray, shape (N, 2, 2)
+        Of the surface around each node.
+    functions : ndarray, shape (2 N, m)
+        The rigid functions in the axes of the reference.
     hessian, smoothness : csc_matrix, shape (2 N, 2 N)
     solve
         Solves ``(hessian + smoothness) x = b``.
@@ -57,6 +64,8 @@ class Equations:
     """
 
     weights: FloatImage
+    rotation: FloatArray
+    functions: FloatArray
     hessian: sp.csc_matrix
     smoothness: sp.csc_matrix
     solve: Callable[[FloatArray], FloatArray]
@@ -68,13 +77,20 @@ class Equations:
 
     @classmethod
     def build(
-        cls, reference: Reference, weights: FloatImage, functions: FloatArray, given: FloatImage | None = None
+        cls,
+        reference: Reference,
+        weights: FloatImage,
+        functions: FloatArray,
+        displacement: FloatArray,
+        given: FloatImage | None = None,
     ) -> Equations:
-        """Assemble and factorise for pixel weights (k, P) and rigid functions (2 N, m).
+        """Assemble and factorise for pixel weights (k, P), rigid functions (2 N, m), around a displacement (N, 2).
 
         `given` are the weights without the precision of the lights, where it is part of `weights`.
         """
         assembly = reference.assembly
+        rotation = _rotation(reference.mesh.nodal_gradient(displacement))
+        functions = _turned_back(rotation, functions)
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
         hessian = assembly.matrix(np.sum(per_light, axis=0))
         textured, scale = _observability(hessian, assembly.nodal_area, SEEN if given is None else _INFORMED)
@@ -89,6 +105,8 @@ class Equations:
         solved = solve(border) if border.shape[1] else border
         return cls(
             weights=weights,
+            rotation=rotation,
+            functions=functions,
             hessian=hessian,
             smoothness=smoothness,
             solve=solve,
@@ -100,12 +118,29 @@ class Equations:
         )
 
     def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Solve for the motion of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
+        """Solve for the motion of the nodes (N, 2) and of the rigid functions ((k - 1) m,)."""
         free = self.solve(right_side)
-        if not self.border.shape[1]:
-            return free, np.empty(0)
-        rigid = np.linalg.lstsq(self.schur, rigid_side - self.border.T @ free, rcond=1e-9)[0]
-        return free - self.border_solved @ rigid, np.asarray(rigid, dtype=np.float64)
+        rigid = np.zeros(self.border.shape[1])
+        if rigid.size:
+            rigid[:] = np.linalg.lstsq(self.schur, rigid_side - self.border.T @ free, rcond=1e-9)[0]
+        motion = (free - self.border_solved @ rigid).reshape(-1, 2)
+        return np.einsum("nij,nj->ni", self.rotation, motion), rigid
+
+    def turned_back(self, columns: FloatArray) -> FloatArray:
+        """Nodal vectors (2 N, m) in the axes of the reference."""
+        return _turned_back(self.rotation, columns)
+
+
+def _turned_back(rotation: FloatArray, columns: FloatArray) -> FloatArray:
+    turned = np.einsum("nji,njm->nim", rotation, columns.reshape(len(rotation), 2, -1))
+    return np.asarray(turned.reshape(columns.shape))
+
+
+def _rotation(gradient: FloatArray) -> FloatArray:
+    """Rotation (N, 2, 2): the polar factor of ``I + grad u`` in the plane, for a gradient (N, 2, 2)."""
+    angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
 
 
 def _border(hessians: list[sp.csc_matrix], functions: FloatArray) -> tuple[FloatArray, FloatArray]:

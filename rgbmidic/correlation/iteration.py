@@ -102,7 +102,6 @@ def _stepped(problem: Problem, equations: Equations, values: FloatImage, estimat
     """One Gauss-Newton iteration."""
     right_side, rigid_side, squares = _right_sides(problem, equations, values, estimate)
     motion, shifts = equations.increment(right_side, rigid_side)
-    motion = motion.reshape(-1, 2)
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
     rigid = estimate.rigid.copy()
@@ -124,7 +123,7 @@ def _right_sides(
     problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Right-hand sides of the nodes (2 N,) and of the rigid functions ((k - 1) m,), and each light's sums (k, 3)."""
-    total = -(equations.smoothness @ estimate.displacement.ravel())
+    total = -equations.turned_back((equations.smoothness @ estimate.displacement.ravel())[:, None]).ravel()
     squares, rigid = np.zeros_like(estimate.squares), []
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         vector, squares[light] = problem.reference.right_side(
@@ -132,7 +131,7 @@ def _right_sides(
         )
         total += vector
         if light:
-            rigid.append(problem.functions.T @ vector)
+            rigid.append(equations.functions.T @ vector)
     return total, np.concatenate(rigid) if rigid else np.empty(0), squares
 
 

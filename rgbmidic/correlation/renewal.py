@@ -33,10 +33,6 @@ it is lost. Measured on paint that changes by 2 % a frame, nodes left after 24 f
 with 0.8; without renewal all are lost from frame 12 on."""
 _POOR_SHARE = 0.1
 """Share of the measured elements that must call for it."""
-_STEEP = 0.3
-"""Size of the displacement gradient from which the reference's grey-level gradient is too different from the deformed
-one's: an iteration leaves about this share of the error. A rotation of 17 degrees has it. Measured in steps of 3
-degrees to 90: at 0.3 every node is measured within .015 px, at 0.4 a tenth is lost; without renewal all, from 45."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,29 +127,22 @@ class Renewal:
             best = np.where(total > 0, np.maximum(best, own), best)
         return np.where(known & (best > -np.inf), best, np.nan)
 
-    def is_due(self, solution: Solution, match: FloatArray, best: float) -> bool:
-        """Whether a frame with a `solution` on the first one should become the next reference.
+    @staticmethod
+    def is_due(match: FloatArray, best: float) -> bool:
+        """Whether a frame should become the next reference: a tenth of its measured elements match poorly.
 
-        So it is where a tenth of the measured elements match poorly, and where rotation or strain since the reference
-        slow the iteration down. What is lost calls for none: it would be lost for good, where a glare passes and a
+        What is lost calls for none: it would be lost for good, where a glare passes and a
         crack closes.
 
         Parameters
         ----------
-        solution
-            Of the frame.
         match
             See `match`.
         best
             Largest median of `match` of the frames on this reference: camera noise alone keeps it below 1.
         """
         known = np.isfinite(match)
-        if not known.any():
-            return False
-        if (match[known] < _POOR * best).mean() > _POOR_SHARE:
-            return True
-        slopes = self.reference.mesh.element_gradient(solution.displacement - self.displacement)[known]
-        return bool(np.median(np.linalg.norm(slopes, ord=2, axis=(1, 2))) > _STEEP)
+        return bool(known.any() and (match[known] < _POOR * best).mean() > _POOR_SHARE)
 
     def renewed(self, solution: Solution, images: FloatImage, weights: FloatImage | None = None) -> Renewal:
         """The reference of a frame with a `solution` on the first one and images and weights (k, H, W) as

@@ -3,7 +3,8 @@
 Minimised over the nodal displacement u and, where asked for, the rigid motions beta_j of the lights after the first:
 ``sum_j integral (g_j(x + u + R beta_j) - f_j(x))^2 p_j dx``. A rigid motion is linear in x, so it lies in the TRI3
 space: the light's own nodal displacement is ``u + R beta_j`` and its derivative is the light's Hessian times R.
-The gradient of the reference image stands for that of the deformed one, so the Hessian is constant within a pass.
+The gradient of the reference image stands for that of the deformed one, turned by the surface's own rotation, so the
+Hessian is constant within a pass.
 
 One pass after the other: compare the states -> match -> weigh -> equations -> iterate; then conclude. Every step is a
 function from frozen states to a frozen state.
@@ -131,7 +132,7 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
         )
     given = None if weighting.precision is None else weighting.given
     try:
-        equations = Equations.build(problem.reference, weights, problem.functions, given)
+        equations = Equations.build(problem.reference, weights, problem.functions, estimate.displacement, given)
     except RuntimeError as error:  # what SuperLU raises on a matrix that is singular in double precision
         raise UnsolvableError(f"the equations cannot be solved: {error}", estimate) from None
     if not equations.textured.any():

@@ -15,6 +15,7 @@ from rgbmidic.typing import FloatArray
 
 __all__ = ["Units", "column"]
 
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Units:
     """In what a result is told; the store keeps px and frames.

@@ -137,7 +137,7 @@ def _compared(
     match = renewal.match(deformed, solution)
     median = float(np.nanmedian(match)) if np.isfinite(match).any() else float("nan")
     best = float(np.fmax(start.best_match, np.float32(median)))
-    if index in plan.settings.frames.reference or not renewal.is_due(solution, match, best):
+    if index in plan.settings.frames.reference or not renewal.is_due(match, best):
         return median, best, start.renewals
     logger.warning("frame %d (%s) becomes the reference of those after it", index, plan.series.name(index))
     return median, 0.0, (*start.renewals, plan.series.chosen.index(index))

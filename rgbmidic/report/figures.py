@@ -9,7 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.report.style import (
+    BAR,
+    GAP,
     LIGHT_COLOURS,
+    NUMBERS,
+    add_colour_bar,
     colour_scale,
     draw_figure,
     finish_picture,
@@ -124,9 +128,9 @@ def convergence_figure(result: Result) -> Figure:
     shown = shown_frames(result)
     frames = shown[:: math.ceil(len(shown) / _MOST_LINES)]
 
-    def draw(figure: Figure, axes: list[Axes]) -> None:
+    def draw(axes: list[Axes]) -> None:
         axis = axes[0]
-        colours = _colour_per_frame(figure, axis, frames)
+        colours = _colour_per_frame(axis, frames)
         for frame, history, colour in zip(frames, result.each("history", frames), colours, strict=True):
             steps, name = np.arange(1, len(history) + 1), result.names[frame]
             axis.plot(steps, history, marker="o", markersize=2.5, linewidth=1, color=colour, label=name)
@@ -135,16 +139,16 @@ def convergence_figure(result: Result) -> Figure:
         axis.set_yscale("log")
         finish_plot(axis, "iteration", "largest motion of a measured node (px)")
         if len(frames) <= _MANY_FRAMES:
-            figure.legend(loc="outside right upper")
+            axis.legend(loc="upper right")
 
-    return draw_figure(draw, count=1, aspect=0.6, colour_bars=False)
+    return draw_figure(draw, count=1, aspect=0.6, beside=BAR if len(frames) > _MANY_FRAMES else GAP)
 
 
 def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
     """One panel per quantity (T, k), one line per light over the deformed frames."""
     frames = list(shown_frames(result))
 
-    def draw(figure: Figure, axes: list[Axes]) -> None:
+    def draw(axes: list[Axes]) -> None:
         for axis, (label, values) in zip(axes, panels.items(), strict=True):
             for light, series in zip(result.lights, values[frames].T, strict=True):
                 colour = LIGHT_COLOURS.get(light)
@@ -156,7 +160,7 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
             finish_plot(axis, "frame", label)
         axes[-1].legend(loc="best")
 
-    return draw_figure(draw, count=len(panels), aspect=0.75, colour_bars=False)
+    return draw_figure(draw, count=len(panels), aspect=0.75, beside=NUMBERS)
 
 
 def _scale(record: FrameRecord, name: str, kind: str) -> Normalize | None:
@@ -176,24 +180,22 @@ def _maps(
     """One map per nodal field, over the reference where there is one."""
     x, y = _view(result, result.nodes)
 
-    def draw(figure: Figure, axes: list[Axes]) -> None:
+    def draw(axes: list[Axes]) -> None:
         for axis, (label, (values, norm)) in zip(axes, maps.items(), strict=True):
             if result.reference is not None:
                 show_image(axis, result.reference.mean(axis=0))
             if norm is not None and np.isfinite(values).any():
-                _show_field(figure, axis, result, values, norm, colour_map)
+                _show_field(axis, result, values, norm, colour_map)
             else:
                 box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
                 axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
             axis.set_title(label)
             finish_picture(axis, x, y, first=axis is axes[0])
 
-    return draw_figure(draw, count=len(maps), aspect=np.ptp(y) / np.ptp(x), colour_bars=True, title=title)
+    return draw_figure(draw, count=len(maps), aspect=np.ptp(y) / np.ptp(x), beside=BAR, title=title)
 
 
-def _show_field(
-    figure: Figure, axis: Axes, result: Result, values: FloatArray, norm: Normalize, colour_map: str
-) -> None:
+def _show_field(axis: Axes, result: Result, values: FloatArray, norm: Normalize, colour_map: str) -> None:
     """A nodal field with its colour bar; blank where a node of the element is not measured."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullFormatter
@@ -202,8 +204,7 @@ def _show_field(
     axis.imshow(picture, extent=extent, cmap=colour_map, norm=norm, interpolation="nearest")
     scaled = norm(values[np.isfinite(values)])
     extend = ("neither", "min", "max", "both")[int(scaled.min() < -_EQUAL) + 2 * int(scaled.max() > 1 + _EQUAL)]
-    bar = figure.colorbar(ScalarMappable(norm, colour_map), ax=axis, extend=extend, aspect=25, pad=0.03)
-    bar.outline.set_linewidth(0.6)
+    bar = add_colour_bar(axis, ScalarMappable(norm, colour_map), extend=extend)
     bar.ax.yaxis.set_major_locator(MaxNLocator(6))
     bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%.4g"))
     bar.ax.yaxis.set_minor_formatter(NullFormatter())
@@ -235,7 +236,7 @@ def _shaded(
     moved = result.nodes + np.stack([record.u, record.v], axis=1)
     x, y = view = _view(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
 
-    def draw(figure: Figure, axes: list[Axes]) -> None:
+    def draw(axes: list[Axes]) -> None:
         for axis, image, part, light in zip(axes, reference, cover, result.lights, strict=True):
             show_image(axis, image)
             shade(axis, part, step)
@@ -243,7 +244,7 @@ def _shaded(
             finish_picture(axis, x, y, first=axis is axes[0])
 
     title = f"{_frame_title(result, frame, record)}, over the reference image"
-    return draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), colour_bars=False, title=title)
+    return draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=GAP, title=title)
 
 
 def _view(result: Result, points: FloatArray) -> View:
@@ -269,7 +270,7 @@ def _label(name: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
-def _colour_per_frame(figure: Figure, axis: Axes, frames: Sequence[int]) -> list[Any]:
+def _colour_per_frame(axis: Axes, frames: Sequence[int]) -> list[Any]:
     """A few frames get distinct colours and a legend, many a colour bar."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -278,7 +279,7 @@ def _colour_per_frame(figure: Figure, axis: Axes, frames: Sequence[int]) -> list
     if len(frames) <= _MANY_FRAMES:
         return [f"C{index}" for index in range(len(frames))]
     norm, colours = Normalize(frames[0], frames[-1]), colormaps["viridis"]
-    figure.colorbar(ScalarMappable(norm, colours), ax=axis, label="frame", aspect=25)
+    add_colour_bar(axis, ScalarMappable(norm, colours), label="frame")
     return [colours(norm(frame)) for frame in frames]
 
 

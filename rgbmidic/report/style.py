@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -13,12 +13,18 @@ from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colorbar import Colorbar
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
 __all__ = [
+    "BAR",
+    "GAP",
     "LIGHT_COLOURS",
+    "NUMBERS",
     "STYLE",
+    "add_colour_bar",
     "colour_range",
     "colour_scale",
     "draw_figure",
@@ -40,8 +46,12 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
 }
 LIGHT_COLOURS = {"red": "#c8102e", "green": "#1a7f37", "blue": "#1f5fbf"}
-_WIDTH = 7.5
-"""Width of a figure in inches."""
+_WIDTH, _TALLEST = 9.0, 9.5
+"""Largest width and height of a figure in inches."""
+NUMBERS, BAR, GAP, LEGEND = 0.65, 0.95, 0.15, 2.2
+"""Inches: room left of a panel for its numbers, right of it for a colour bar, for nothing or for names of lines."""
+_BELOW, _ABOVE = 0.52, 0.3
+"""Inches: room for the numbers below a panel, and for its title."""
 _CLIPPED, _WILD = 0.5, 0.1
 """Colours span all values but this percentage at each end, and what lies within this share of that span beyond."""
 _SPAN = 4.0
@@ -49,31 +59,40 @@ _SPAN = 4.0
 
 
 def draw_figure(
-    draw: Callable[[Figure, list[Axes]], None],
+    draw: Callable[[list[Axes]], None],
     *,
     count: int,
     aspect: float,
-    colour_bars: bool,
+    beside: float,
     title: str = "",
-    tall: bool = False,
+    tallest: float = _TALLEST,
 ) -> Figure:
     """A figure of `count` panels whose height is `aspect` times their width: side by side, or stacked when flat.
 
-    `tall` lets it grow beyond a page.
+    `beside` is the room right of each panel, in inches: `BAR`, `NUMBERS`, `GAP` or `LEGEND`.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    stacked = aspect < 0.5 and count > 1
-    rows, columns = (count, 1) if stacked else (1, count)
-    width = min(_WIDTH, max(6.0, 4.5 * columns)) / columns
-    height = (width * (0.8 if colour_bars else 0.9) * aspect + 0.75) * rows + (0.3 if title else 0)
+    # placed by numbers: matplotlib's layout engines draw every text several times to find the same
+    columns = 1 if aspect < 0.5 and count > 1 else count
+    rows = count // columns
+    total = min(_WIDTH, max(6.0, 4.5 * columns))
+    width = (total - NUMBERS) / columns - beside
+    height = min(width * aspect, (tallest - 2 * GAP) / rows - _BELOW - _ABOVE)
+    heading = 2 * GAP if title else 0.0
+    whole = rows * (height + _BELOW + _ABOVE) + heading
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width * columns, height if tall else min(height, 9.5)), layout="compressed")
-        axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-        draw(figure, axes)
+        figure = Figure(figsize=(total, whole))
+        boxes = [
+            (NUMBERS + column * (width + beside), whole - heading - (row + 1) * (height + _ABOVE) - row * _BELOW)
+            for row in range(rows)
+            for column in range(columns)
+        ]
+        axes = [figure.add_axes((x / total, y / whole, width / total, height / whole)) for x, y in boxes]
+        draw(axes)
         if title:
-            figure.suptitle(title, fontsize=10)
+            figure.suptitle(title, fontsize=10, y=1 - 0.5 * heading / whole, va="center")
     return figure
 
 
@@ -86,7 +105,7 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
         The file cannot be written.
     """
     with writing(path):
-        figure.savefig(path, dpi=dpi, bbox_inches="tight", pad_inches=0.08)
+        figure.savefig(path, dpi=dpi)
 
 
 def colour_range(known: FloatArray) -> tuple[float, float]:
@@ -115,6 +134,15 @@ def show_image(axis: Axes, image: AnyArray) -> None:
     axis.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), interpolation="antialiased")
 
 
+def add_colour_bar(axis: Axes, shown: ScalarMappable, **options: Any) -> Colorbar:
+    """A colour bar beside a panel of `draw_figure`, as high as the panel's picture."""
+    figure = cast("Figure", axis.figure)
+    width = axis.get_position().width * figure.get_figwidth()
+    bar = figure.colorbar(shown, cax=axis.inset_axes((1 + 0.08 / width, 0, 0.12 / width, 1)), **options)
+    bar.outline.set_linewidth(0.6)
+    return bar
+
+
 def shade(axis: Axes, cover: FloatImage, step: int = 1) -> None:
     """Cover an image by a picture from 0 (clear) to 1, of which one pixel is `step` pixels of the image."""
     from matplotlib.colors import to_rgb
@@ -134,6 +162,7 @@ def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *
     axis.set_xlabel("x (px)")
     if first:
         axis.set_ylabel("y (px)")
+    axis.tick_params(labelleft=first)
     axis.locator_params(nbins=5)
 
 

@@ -134,3 +134,20 @@ def test_texture_in_one_direction_only_is_no_texture_and_no_crash(prefilter):
     found = correlate(ramp, ramp - 1, region=(15, 15, 95, 85), prefilter=prefilter)
     assert found.status is Status.FAILED
     assert np.isnan(found.displacement).all()
+
+
+@pytest.mark.parametrize("degrees", [8, 30, 85])
+def test_a_turn_costs_no_iterations(degrees):
+    shape, lights = (160, 160), (Texture.random(3), Texture.random(4))
+    motions = [Affine.strain_and_rotation(0.01, degrees, shift) for shift in ((2.3, 1.1), (2.7, 0.7))]
+    images = np.stack([texture.image(shape) for texture in lights])
+    turned = np.stack([texture.image(shape, motion) for texture, motion in zip(lights, motions, strict=True)])
+    start = correlate(images, images, region=(50, 50, 110, 110), initial=(0, 0)).nodes
+    truth = motions[0].displacement(start, shape)
+    found = correlate(
+        images, turned, region=(50, 50, 110, 110), initial=truth + 0.3, rigid="translation", statistics=False
+    )
+    assert found.status is Status.CONVERGED
+    assert found.iterations <= 8
+    np.testing.assert_allclose(found.displacement, truth, atol=0.02)
+    np.testing.assert_allclose(found.rigid[1], (0.4, -0.4), atol=0.005)

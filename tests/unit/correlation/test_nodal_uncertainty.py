@@ -81,7 +81,7 @@ def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
     deformed = Deformed.prepare(noisy(image, 1)[None].astype(np.float32), weights, prefilter="binomial")
     rest = np.zeros_like(mesh.nodes)
     pulled = reference.pull_back(deformed, 0, rest)[None]
-    equations = Equations.build(reference, pulled, np.zeros((2 * len(mesh.nodes), 0)))
+    equations = Equations.build(reference, pulled, np.zeros((2 * len(mesh.nodes), 0)), np.zeros_like(mesh.nodes))
     inner = equations.textured & ~mesh.beside(~equations.textured)
     assert 0 < inner.sum() < equations.textured.sum() < len(mesh.nodes)
     strain = reference.functionals[2:]

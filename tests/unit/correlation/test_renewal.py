@@ -58,7 +58,7 @@ def always(*_):
 
 def when_needed(_, renewal, deformed, step):
     solution = renewal.accumulated(step, deformed)
-    return renewal.is_due(solution, renewal.match(deformed, solution), best=1.0)
+    return renewal.is_due(renewal.match(deformed, solution), best=1.0)
 
 
 def noisy(image, sigma, random):
@@ -123,16 +123,24 @@ def test_the_uncertainty_of_the_total_covers_noise_that_cancels_and_paint_that_c
     assert growth > 1.7 if changing else growth < 1.35  # 2 where four steps add up, 1 where their noise cancels
 
 
-def test_a_rotation_is_followed_beyond_what_one_reference_matches():
-    texture, random = Texture.random(1), np.random.default_rng(5)
-    shape_motions = [Affine.strain_and_rotation(0, 3.0 * k) for k in range(0, 21)]
-    images = [noisy(texture.image(SHAPE, motion), 2.0, random) for motion in shape_motions]
+def test_paint_that_wears_off_is_followed_beyond_what_one_reference_matches():
+    """One texture gives way to another while the surface moves: the last frame has nothing of the first."""
+    (old, new), random = (Texture.random(seed) for seed in (1, 2)), np.random.default_rng(5)
+    motions = [Affine.strain_and_rotation(0.001 * k, 1.0 * k, (0.4 * k, 0.0)) for k in range(13)]
+    parts = [(np.cos(angle), np.sin(angle)) for angle in np.linspace(0, np.pi / 2, 13)]
+    images = [
+        noisy(200 + a * (old.image(SHAPE, motion) - 200) + b * (new.image(SHAPE, motion) - 200), 2.0, random)
+        for (a, b), motion in zip(parts, motions, strict=True)
+    ]
     solutions, renewed = chained(images, when_needed)
-    assert 2 <= len(renewed) <= 5
-    assert all(solution.measured.all() for solution in solutions)
-    assert rms(error(solutions[-1], shape_motions[-1])) < 0.03
+    assert 2 <= len(renewed) <= 6
     alone, _ = chained(images, lambda *_: False)
-    assert alone[-1].status is Status.FAILED or not alone[-1].measured.all()
+    assert alone[-1].status is Status.FAILED
+    assert solutions[-1].measured.mean() > 0.6
+    last, truth = solutions[-1], motions[-1].displacement(solutions[-1].nodes, SHAPE)
+    assert (
+        rms((last.displacement - truth) / last.displacement_std) < 2
+    )  # what the paint changes by adds up in one sense
 
 
 def pair(motion, change=0.0, noise=2.0):
@@ -153,7 +161,7 @@ def pair(motion, change=0.0, noise=2.0):
         (Affine(shift=(3.4, 0.6)), 0.0, 25.0, False),
         (Affine(shift=(60.0, 0.0)), 0.0, 2.0, False),  # half has left the picture
         (Affine.strain_and_rotation(0.05, 8.0), 0.0, 2.0, False),
-        (Affine.strain_and_rotation(0.0, 20.0), 0.0, 2.0, True),
+        (Affine.strain_and_rotation(0.3, 60.0), 0.0, 2.0, False),
         (Affine(shift=(3.4, 0.6)), 0.4, 2.0, True),
     ],
 )
@@ -161,7 +169,7 @@ def test_a_reference_is_renewed_for_what_no_longer_matches_only(motion, change, 
     reference, deformed, solution = pair(motion, change, noise)
     renewal = Renewal.none(reference)
     match = renewal.match(deformed, solution)
-    assert renewal.is_due(solution, match, best=np.nanmedian(match) if noise > 10 else 1.0) is called
+    assert renewal.is_due(match, best=np.nanmedian(match) if noise > 10 else 1.0) is called
 
 
 def test_a_node_that_the_new_reference_did_not_measure_stays_unmeasured_on_it():
