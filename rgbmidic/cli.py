@@ -212,7 +212,9 @@ def history(
     gauges: Gauges = None,
     straight_gauges: StraightGauges = None,
     strain_gauges: StrainGauges = None,
-    measure: Annotated[str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")] = None,
+    measure: Annotated[
+        str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")
+    ] = None,
     window: Annotated[int | None, typer.Option("--window", help="Frames for rates, 4 or more; 0: no rates.")] = None,
     rigid: Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")] = None,
     channels: Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then a column each.")] = None,
@@ -537,9 +539,7 @@ def _progress(what: str) -> AbstractContextManager[Callable[[int, int, str], Non
 def _print_summary(result: Result, seconds: float) -> None:
     """What became of the deformed frames; the reference, matched with itself, says nothing."""
     deformed = list(result.deformed)
-    ends = [int((result.status[deformed] == code).sum()) for code in (_WIDE = 400
-"""Columns that a table may take: where the terminal has fewer it breaks the lines, and nothing is cut off."""
-_CONVERGED, _UNCONVERGED, _FAILED)]
+    ends = [int((result.status[deformed] == code).sum()) for code in (_CONVERGED, _UNCONVERGED, _FAILED)]
     words = [f"{ends[0]} converged", *([f"{ends[1]} not converged"] if ends[1] else []), f"{ends[2]} failed"]
     measured = [float((status == 0).mean()) for status in result.each("node_status", deformed)]
     rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}

@@ -74,7 +74,7 @@ class Channels:
         return cls(path=path, times=times, values=dict(zip(names[1:], table[:, 1:].T, strict=True)))
 
     def at(self, times: FloatArray, offset: float = 0.0) -> dict[str, FloatArray]:
-        """Each channel at the times (T,) of the frames, linear between its values; NaN before the first and after the last.
+        """Each channel at the times (T,) of the frames, linear between its values, NaN beyond them.
 
         Parameters
         ----------

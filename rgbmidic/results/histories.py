@@ -232,7 +232,7 @@ def _told(
     length = history.unit == "px"
     unit = units.length if length else history.unit
     yield _in_units(history.name, unit, history.values, history.std, units if length else None)
-    if not window or history.unit == "deg" and history.name != "rigid_rotation":
+    if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
     found = rates(clock, history.values, history.std, window=span, share=share, references=references)
