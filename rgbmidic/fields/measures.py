@@ -48,7 +48,7 @@ class Strain:
         The larger and the smaller principal strain, in the plane.
     direction_deg, direction_std_deg : ndarray, shape (...)
         Direction of the larger one on the reference, from x towards y, between -90 and 90 degrees. Where both are the
-        same within their uncertainty it means nothing, and the uncertainty tends to 52 degrees.
+        same within their uncertainty it means nothing, and the uncertainty tends to 52 degrees; NaN without strain.
     equivalent, equivalent_std : ndarray, shape (...)
         Von Mises equivalent at constant volume, ``sqrt(4/3 (e1^2 + e1 e2 + e2^2))``: e in a tensile test of e.
         Being positive, it is more than 0 in noise alone, by about its uncertainty.
@@ -134,14 +134,15 @@ def _told(measure: str, tensor: FloatArray, covariance: FloatArray, shape: tuple
     along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
     turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        direction = np.degrees(_deviation(turn, covariance) / (principal[:, 0] - principal[:, 1]))
+        apart = principal[:, 0] - principal[:, 1]
+        direction = np.degrees(_deviation(turn, covariance) / apart)
         equivalent, equivalent_std = _equivalent(e, covariance)
     parts = {
         "components": e,
         "components_std": np.sqrt(np.einsum("naa->na", covariance)),
         "principal": principal,
         "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
-        "direction_deg": (angle + 90) % 180 - 90,
+        "direction_deg": np.where(apart > 0, (angle + 90) % 180 - 90, np.nan),
         "direction_std_deg": np.minimum(direction, _LARGEST_ANGLE),
         "equivalent": equivalent,
         "equivalent_std": equivalent_std,

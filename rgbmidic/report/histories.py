@@ -47,7 +47,7 @@ def history_figure(histories: Histories) -> Figure:
             finish_plot(axes[-1], strain.name, f"{stress.name} ({stress.unit})", whole=False)
 
     count = len(panels) + (histories.stress_strain is not None)
-    return draw_figure(draw, count=count, aspect=0.3, beside=LEGEND, tallest=_PANEL * count + 1)
+    return draw_figure(draw, count=count, aspect=0.45, beside=LEGEND, tallest=_PANEL * count + 1)
 
 
 def _kind(told: Told) -> str:

@@ -172,6 +172,6 @@ def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
 
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    axis.xaxis.set_major_locator(MaxNLocator(integer=whole))
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True) if whole else MaxNLocator(5))
     axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)

@@ -43,7 +43,7 @@ class Channels:
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
-        """Read a CSV file: a header line, then rows; the first column is the time, ``time_s``, ``time_ms`` or ``time_us``.
+        """Read a CSV file: a header line, then rows; the first column is ``time_s``, ``time_ms`` or ``time_us``.
 
         Columns are parted by commas, semicolons (then a comma may be the decimal point) or tabs.
 
