@@ -5,7 +5,7 @@
 Every contender runs in a process of its own, twice or more after a first run that compiles and fills caches; the best
 time counts. Absolute times depend on the machine: compare the ratios. The pair is a star field, v = 0.5 cos(2 pi y /
 period) px with a period that grows from 100 to 300 px along x, exactly rendered, with noise of 1 DN. All start from
-zero. The nodes of linear elements overshoot a wave by about 3.3 (element / period)**2 of its height.
+zero.
 """
 
 from __future__ import annotations

@@ -376,47 +376,6 @@ def _largest(values: FloatArray) -> float:
     return float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else float("nan")
 
 
-def curvature(quick: bool) -> None:
-    """Sphere with and without the correction for what linear elements cannot follow; errors at the nodes."""
-    heading(
-        "camera",
-        "angle",
-        "corrected",
-        "nodes",
-        "error, px",
-        "stated, px",
-        "ratio",
-        "covered",
-        "strain ratio",
-        "strain error",
-    )
-    for kind, name in KINDS.items():
-        for angle in (4.0,) if quick else (1.0, 4.0, 8.0):
-            pair = pair_of(Setting(body="sphere", state=turn(angle)))
-            images = both(pair, kind)
-            for corrected in (False, True):
-                solution = solve_pair(pair, images, curvature=corrected)
-                verdict = Verdict.of(solution, pair)
-                strain = solution.strain - true_strain(pair, solution.nodes)
-                for title, nodes in rings(solution).items():
-                    ratio = verdict.ratio[nodes]
-                    row(
-                        name, f"{angle:g}°", corrected, title, rms(verdict.error[nodes]),
-                        rms(solution.displacement_std[nodes]),
-                        f"{rms(ratio):.2f}", f"{covered(ratio):.1%}", f"{rms(verdict.strain_ratio[nodes]):.2f}",
-                        f"{rms(strain[nodes]):.1e}",
-                    )  # fmt: skip
-
-
-def rings(solution: Solution) -> dict[str, BoolArray]:
-    """Nodes on the mesh's border, those beside them, and the others."""
-    mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
-    border = mesh.on_boundary
-    beside = np.zeros_like(border)
-    beside[mesh.elements[border[mesh.elements].any(axis=1)]] = True
-    return {"border": border, "second ring": beside & ~border, "deep": ~beside}
-
-
 def texture(quick: bool) -> None:
     """Stripes that show one direction only, and grey levels of any size."""
     y, x = np.mgrid[:200, :200].astype(float)
@@ -503,7 +462,6 @@ TABLES: dict[str, Callable[[bool], None]] = {
     "scenes": scenes,
     "noise": noise,
     "spoiled": spoiled,
-    "curvature": curvature,
     "texture": texture,
     "elements": elements,
 }

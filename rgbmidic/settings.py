@@ -234,9 +234,6 @@ class SolverSettings:
     brightness
         Grey-level correction: ``"global"``, a gain and offset per light; ``"local"``, both as linear shape functions on
         the mesh.
-    curvature
-        Correct the nodal values for the curvature that linear elements cannot follow. Without it the linear field is
-        the best fit, its nodes are off by what the correction would be, and that is part of their uncertainty.
     fill
         Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
         flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
@@ -249,7 +246,6 @@ class SolverSettings:
     prefilter: Literal["none", "binomial", "gaussian"] = "binomial"
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
     brightness: Literal["none", "global", "local"] = "none"
-    curvature: bool = False
     fill: float = _bounded(0.0, at_least=0)
     tolerance: float = _bounded(1e-3, above=0)
     max_iterations: int = _bounded(50, at_least=1)

@@ -159,12 +159,14 @@ def interpolate_nodal(values, pixels, mesh):
 
 
 def curvature_deviation(curvature, pixels, mesh):
-    """A quadratic field with the second derivatives (E, 2, 3) of each element minus its linear interpolant, (2, P)."""
+    """A field with the second derivatives (N, 2, 3) of the nodes minus its linear interpolant, (2, P): quadratic along
+    an edge, with the mean of its ends."""
     out = []
     for e, i in owned(pixels):
-        xx, xy, yy = curvature[e].T
-        corners = mesh.nodes[mesh.elements[e]]
-        points = np.vstack([corners, [pixels.columns[i], pixels.rows[i]]]) - corners[0]
-        quadratic = [(xx * x * x + 2 * xy * x * y + yy * y * y) / 2 for x, y in points]
-        out.append(quadratic[3] - shape_functions(pixels, e, i) @ quadratic[:3])
+        phi, total = shape_functions(pixels, e, i), np.zeros(2)
+        for first, second in ((0, 1), (1, 2), (2, 0)):
+            a, b = mesh.elements[e, first], mesh.elements[e, second]
+            (dx, dy), (xx, xy, yy) = mesh.nodes[b] - mesh.nodes[a], ((curvature[a] + curvature[b]) / 2).T
+            total -= phi[first] * phi[second] / 2 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy)
+        out.append(total)
     return np.array(out).T

@@ -348,14 +348,14 @@ def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, 
 def curvature_deviation(start, stop, nodes, elements, curvature, local_x, local_y, offsets, barycentric, out):
     """Deviation of a curved field from its linear interpolant, ``out`` (2, P) float32.
 
-    `curvature` (E, 2, 3) float64 holds the second derivatives (xx, xy, yy) of both components, constant per element:
-    ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H (x_a - x_b)``.
+    `curvature` (N, 2, 3) float64 holds the second derivatives (xx, xy, yy) of both components at the nodes; along an
+    edge that is the mean of its ends: ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H_ab (x_a - x_b)``, continuous.
     """
     for e in range(start, stop):
         for c in range(2):
-            half_01 = _half_sag(nodes, elements[e, 0], elements[e, 1], curvature, e, c)
-            half_12 = _half_sag(nodes, elements[e, 1], elements[e, 2], curvature, e, c)
-            half_20 = _half_sag(nodes, elements[e, 2], elements[e, 0], curvature, e, c)
+            half_01 = _half_sag(nodes, elements[e, 0], elements[e, 1], curvature, c)
+            half_12 = _half_sag(nodes, elements[e, 1], elements[e, 2], curvature, c)
+            half_20 = _half_sag(nodes, elements[e, 2], elements[e, 0], curvature, c)
             for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
                 l0 = barycentric[e, 0, 0] + barycentric[e, 0, 1] * local_x[i] + barycentric[e, 0, 2] * local_y[i]
                 l1 = barycentric[e, 1, 0] + barycentric[e, 1, 1] * local_x[i] + barycentric[e, 1, 2] * local_y[i]
@@ -364,8 +364,9 @@ def curvature_deviation(start, stop, nodes, elements, curvature, local_x, local_
 
 
 @helper()
-def _half_sag(nodes, a, b, curvature, e, c):
-    """Half the second difference of component c along the edge from node a to node b of element e."""
+def _half_sag(nodes, a, b, curvature, c):
+    """Half the second difference of component c along the edge from node a to node b."""
     dx = nodes[a, 0] - nodes[b, 0]
     dy = nodes[a, 1] - nodes[b, 1]
-    return -0.5 * (curvature[e, c, 0] * dx * dx + 2.0 * curvature[e, c, 1] * dx * dy + curvature[e, c, 2] * dy * dy)
+    h = curvature[a, c] + curvature[b, c]
+    return -0.25 * (h[0] * dx * dx + 2.0 * h[1] * dx * dy + h[2] * dy * dy)

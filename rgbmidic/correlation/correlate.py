@@ -60,7 +60,7 @@ def correlate(
     statistics
         Weight every light by the inverse variance of its own residual around each pixel, robustly.
     **options
-        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, curvature,
+        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness,
         tolerance, max_iterations.
 
     Returns

@@ -117,6 +117,10 @@ class Equations:
             light_share=_light_share(reference, per_light),
         )
 
+    def information(self, reference: Reference) -> FloatArray:
+        """Texture times weight around each node, over its area, (N,): what the inverse variance of a node goes with."""
+        return np.asarray(self.hessian.diagonal().reshape(-1, 2).sum(axis=1) / reference.assembly.nodal_area)
+
     def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solve for the motion of the nodes (N, 2) and of the rigid functions ((k - 1) m,)."""
         free = self.solve(right_side)

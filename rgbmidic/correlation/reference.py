@@ -6,18 +6,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
 from rgbmidic._kernels.interpolation import sample_with_gradient
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
-from rgbmidic.correlation.uncertainty.blocks import unfitted_share
-from rgbmidic.correlation.uncertainty.propagation import (
-    NodeColouring,
-    displacement_functionals,
-    strain_functionals,
-)
+from rgbmidic.correlation.recovery import linear_fit_offset
+from rgbmidic.correlation.uncertainty.blocks import block_side, unfitted_share
+from rgbmidic.correlation.uncertainty.propagation import NodeColouring
 from rgbmidic.correlation.windows import spread, window_means
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -59,8 +55,10 @@ class Reference:
     ----------
     mesh, pixels, assembly, colouring
         TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
-    functionals : tuple of csr_matrix, shape (N, 2 N)
-        u, v, exx, eyy, exy at the nodes as linear functions of the unknowns.
+    material : Tri3Mesh
+        The mesh on the first frame, where fields are recovered and strains count: `mesh` itself before any renewal.
+    linear_offset : ndarray, shape (N, 3)
+        What a linear fit makes of fields curved on `material` (`linear_fit_offset`).
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded.
     unfitted : float
@@ -74,7 +72,8 @@ class Reference:
     pixels: PixelMap
     assembly: Assembly
     colouring: NodeColouring
-    functionals: tuple[sp.csr_matrix, ...]
+    material: Tri3Mesh
+    linear_offset: FloatArray
     unfitted: float
     images: FloatImage
     weights: FloatImage
@@ -118,8 +117,9 @@ class Reference:
             pixels=pixels,
             assembly=assembly,
             colouring=NodeColouring.from_mesh(mesh),
-            functionals=(*displacement_functionals(len(mesh.nodes)), *strain_functionals(mesh)),
-            unfitted=unfitted_share(pixels, assembly, samples[1] * used, samples[2] * used),
+            material=mesh,
+            linear_offset=linear_fit_offset(mesh),
+            unfitted=unfitted_share(pixels, assembly, samples[1] * used, samples[2] * used, block_side(mesh.size)),
             images=ready,
             weights=usable,
             values=samples[0],
@@ -128,10 +128,6 @@ class Reference:
             pixel_weights=weighted,
             prefilter=prefilter,
         )
-
-    def strain(self, displacement: FloatArray) -> FloatArray:
-        """Strain (N, 3) exx, eyy, exy at the nodes for a nodal displacement (N, 2)."""
-        return np.stack([functional @ displacement.ravel() for functional in self.functionals[2:]], axis=1)
 
     def blocks(self, weight: FloatImage, gradient_x: FloatImage, gradient_y: FloatImage) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""

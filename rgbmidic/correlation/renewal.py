@@ -171,7 +171,12 @@ class Renewal:
         return Renewal(
             first=self.first,
             # distances on the first frame, where the sides of a crack meet; strains against it
-            reference=replace(reference, colouring=self.first.colouring, functionals=self.first.functionals),
+            reference=replace(
+                reference,
+                colouring=self.first.colouring,
+                material=self.first.mesh,
+                linear_offset=self.first.linear_offset,
+            ),
             displacement=displacement,
             variance=_single(solution.displacement_std) ** 2,
             strain=_single(solution.strain),

@@ -47,13 +47,13 @@ class Solution:
         Node positions (x, y) in px on the reference image.
     elements : ndarray, shape (E, 3), int32
     displacement : ndarray, shape (N, 2), float64
-        (u, v) in px; NaN where not measured.
+        (u, v) in px at the nodes, recovered from the best linear fit (`recovery`); NaN where not measured.
     displacement_std : ndarray, shape (N, 2), float64
-        Standard uncertainty of the nodal values in px, from the residual (noise, demosaicing, erratic reflections) and
-        from the curvature that linear elements cannot follow; NaN where not measured.
+        Standard uncertainty of the nodal values in px, from the residual (noise, demosaicing, erratic reflections, what
+        no quadratic follows); NaN where not measured.
     strain, strain_std : ndarray, shape (N, 3), float64
-        Small strain (exx, eyy, exy), tensor shear, and its standard uncertainty: the area-weighted mean of the elements
-        around each node; NaN where the node or a neighbour is not measured.
+        Small strain (exx, eyy, exy), tensor shear, and its standard uncertainty: slopes of the quadratic through the
+        nodes around; NaN where the node or a neighbour is not measured.
     node_status : ndarray, shape (N,), uint8
         See `NodeStatus`.
     light_share : ndarray, shape (N, k), float64

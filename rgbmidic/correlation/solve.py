@@ -17,11 +17,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation.curvature import CurvatureOffset, curvature_offset
 from rgbmidic.correlation.equations import Equations, rigid_functions
 from rgbmidic.correlation.iteration import Estimate, Problem, UnsolvableError, compare, iterate
 from rgbmidic.correlation.matching import misfit
 from rgbmidic.correlation.node_status import Evidence, judge, one_sided_texture
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
 from rgbmidic.correlation.weighting import (
@@ -60,7 +60,7 @@ def solve(
     initial : ndarray, shape (N, 2)
         Displacement (u, v) in px to start from, within about half a speckle of the solution.
     options
-        Rigid functions, grey-level correction, curvature, tolerance and iterations.
+        Rigid functions, grey-level correction, tolerance and iterations.
     statistics
         Weight every light by the inverse variance of its own residual around each pixel, robustly.
 
@@ -153,23 +153,25 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     reference, options, mesh = problem.reference, problem.options, problem.reference.mesh
     mismatched = np.zeros(len(mesh.nodes), dtype=bool)
     mismatched[mesh.elements[~weighting.matched]] = True
-    sound = equations.textured & ~mismatched
-    offset = curvature_offset(reference, equations, estimate.displacement, sound)
-    std = standard_uncertainty(weighting.residual.without(offset.deviation), equations, weighting.precision, 5)
+    used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
+    recovery = Recovery.over(reference.material, used, equations.information(reference), reference.linear_offset)
+    fitted = estimate.displacement
+    deviation = recovery.deviation(reference.material, reference.pixels, fitted, reference.linear_offset)
+    residual = weighting.residual.without(deviation)
+    std = standard_uncertainty(residual, equations, weighting.precision, recovery)
     node_status, misfits = _judged(estimate, equations, weighting, mismatched, std)
     measured = node_status == NodeStatus.MEASURED
-    displacement, strain, std = _with_curvature(reference, estimate.displacement, std, offset, options.curvature)
-    inner = measured & ~mesh.beside(~measured)
+    inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        residual = np.sqrt(estimate.squares[:, 0] / estimate.squares[:, 1])
+        rms = np.sqrt(estimate.squares[:, 0] / estimate.squares[:, 1])
     history = estimate.history(measured)
     converged = bool(history[-1] <= options.tolerance)
     return Solution(
         nodes=mesh.nodes,
         elements=mesh.elements,
-        displacement=np.where(measured[:, None], displacement, np.nan),
+        displacement=np.where(measured[:, None], recovery.displacement(fitted), np.nan),
         displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
-        strain=np.where(inner[:, None], strain, np.nan),
+        strain=np.where(inner[:, None], recovery.strain(fitted), np.nan),
         strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
         node_status=node_status,
         light_share=equations.light_share,
@@ -177,7 +179,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
         reason="" if converged else f"the last iteration still moved a node by {history[-1]:.3g} px",
         rigid=estimate.rigid,
-        residual=residual,
+        residual=rms,
         weight_share=_shares(equations.weights),
         history=history,
     )
@@ -210,17 +212,6 @@ def _judged(
             estimate,
         )
     return node_status, misfits
-
-
-def _with_curvature(
-    reference: Reference, displacement: FloatArray, std: FloatArray, offset: CurvatureOffset, corrected: bool
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Displacement, strain and standard uncertainty (N, 5), the curvature's offset taken off or part of the latter."""
-    if not corrected:
-        whole = np.concatenate([offset.displacement, offset.strain], axis=1)
-        return displacement, reference.strain(displacement), np.hypot(std, whole)
-    displacement = displacement - offset.displacement
-    return displacement, reference.strain(displacement) - offset.one_sided, std
 
 
 def _shares(weights: FloatImage) -> FloatArray:

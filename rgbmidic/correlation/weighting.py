@@ -12,6 +12,7 @@ from rgbmidic.correlation.iteration import Estimate, Problem, compare
 from rgbmidic.correlation.matching import matching_elements
 from rgbmidic.correlation.node_status import lost_elements, one_sided_texture
 from rgbmidic.correlation.precision import Precision, learn_precision
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.nodal import nodal_std
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -92,7 +93,7 @@ def next_weighting(
     if not matched.all() or estimate.longest > FIRST_PASS:
         exhausted = len(estimate.increments) >= problem.options.max_iterations
         motion = np.zeros(len(estimate.displacement)) if exhausted else estimate.increments[-1]
-        std = standard_uncertainty(residual, equations, last.precision, 2)
+        std = standard_uncertainty(residual, equations, last.precision)
         one_sided = one_sided_texture(equations, residual)
         matched &= ~lost_elements(problem.reference.mesh, std, motion, one_sided)
     if number >= _RETURNS:
@@ -122,8 +123,8 @@ def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
 
 
 def standard_uncertainty(
-    residual: Residual, equations: Equations, precision: Precision | None, quantities: int
+    residual: Residual, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
 ) -> FloatArray:
-    """Standard uncertainty (N, quantities) of the first of u, v (px), exx, eyy, exy."""
-    std = nodal_std(residual, equations, quantities)
+    """Standard uncertainty of the linear fit's u and v, (N, 2), or of what the `recovery` gives, (N, 5)."""
+    std = nodal_std(residual, equations, recovery)
     return std if precision is None else std * precision.robust_loss(residual.reference, equations.weights)[:, None]

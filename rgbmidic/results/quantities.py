@@ -86,7 +86,7 @@ _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
 _EXACT: dict[str, Any] = {"dtype": np.float64}
-_AROUND = "the area-weighted mean of the elements around a node; NaN also beside a node that is not measured"
+_AROUND = "slope of the quadratic through the nodes around; NaN also beside a node that is not measured"
 _TIME = "time of the frame from the trigger; the smallest 64-bit integer where it is not known"
 _MISFIT = "weighted rms residual around a node over its median: 1 is ordinary, 3 is suspicious"
 _RESIDUAL = (
@@ -123,16 +123,23 @@ _TABLE = (
     Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
     Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
     Quantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
-    Quantity("u", _NODE, "px", "displacement.0", "displacement in x against the reference", **_EXACT),
-    Quantity("v", _NODE, "px", "displacement.1", "displacement in y against the reference", **_EXACT),
+    Quantity(
+        "u",
+        _NODE,
+        "px",
+        "displacement.0",
+        "displacement in x against the reference, at the node (not the best linear fit's nodal value)",
+        **_EXACT,
+    ),
+    Quantity("v", _NODE, "px", "displacement.1", "displacement in y against the reference, at the node", **_EXACT),
     Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
     Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
     Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
     Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
     Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
-    Quantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx, curvature included"),
-    Quantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy, curvature included"),
-    Quantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy, curvature included"),
+    Quantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx"),
+    Quantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy"),
+    Quantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
     Quantity("match", (), "", "", _MATCH),
     Quantity("best_match", (), "", "", _BEST, blank=0),
     Quantity("renewals", ("renewal",), "", "", _RENEWALS, dtype=np.int64, blank=0),

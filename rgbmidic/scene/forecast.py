@@ -8,9 +8,9 @@ the speckle's gradient spectrum: of the texture alone for M, of its product with
 - what demosaicing leaves of the mosaic in the images, which stays with the sensor while the texture moves;
 - the erratic part of the reflections, which changes as facets and droplets turn in and out of the mirror direction.
 
-The elements enter by the consistent mass matrix of a regular TRI3 mesh. Images are taken to be locally normalised and
-every light weighted by the inverse variance of its residual, as the main job does by default. A plain Gaussian law is
-taken for the slopes of the wrinkles.
+The elements enter by the consistent mass matrix of a regular TRI3 mesh and the recovery of its nodal values. Images
+are taken to be locally normalised and every light weighted by the inverse variance of its residual, as the main job
+does by default. A plain Gaussian law is taken for the slopes of the wrinkles.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
+from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.illumination.camera_noise import QUANTISATION
 from rgbmidic.illumination.unmix import NEGLIGIBLE
+from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.speckle_patch import SpecklePatch, cross_spectra, mosaic_disturbances
 from rgbmidic.scene.speckle_spectrum import SpeckleSpectrum
@@ -40,17 +43,22 @@ _SATURATED = 0.98
 """Fraction of full scale from which the white paint is taken to saturate a channel: noise does the rest."""
 
 
+@cache
 def node_constant() -> float:
-    """Variance of an inner node's value per unit of white noise density and element area: about 2.6.
+    """Variance of an inner node's value per unit of white noise density and element area: about 1.1.
 
-    The diagonal of the inverse of the consistent mass matrix of a regular mesh of right triangles with alternating
-    diagonals, in units of 1/h^2: a mean over all wave numbers (a, b), and over its two kinds of nodes, with eight
-    triangles (2/3 + cos a cos b / 3 on the diagonal) and with four (1/3), coupled by (cos a + cos b)/6.
+    On a regular mesh the linear fit has the inverse of the consistent mass matrix (2.6 on its diagonal); of that, what
+    the recovery of the nodal values leaves.
     """
-    angle = (np.arange(256) + 0.5) * (2 * np.pi / 256)
-    a, b = np.cos(np.meshgrid(angle, angle))
-    eight, four, coupling = 2 / 3 + a * b / 3, 1 / 3, (a + b) / 6
-    return float(((eight + four) / (eight * four - coupling**2)).mean() / 2)
+    side = 16
+    mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 10 * side, 10 * side), (10 * side + 1,) * 2), 10)
+    everywhere = np.ones(len(mesh.elements), dtype=bool)
+    recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
+    value = recovery.value.toarray()
+    variance = np.einsum("ij,ij->i", value @ np.linalg.inv(mass_matrix(mesh).toarray()), value)
+    # an even number of rows and columns: as many nodes with eight triangles as with four
+    inner = (np.abs(mesh.nodes / 10 - side / 2 + 0.5) < side / 4).all(axis=1)
+    return float(variance[inner].mean() * mesh.size**2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

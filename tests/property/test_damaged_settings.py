@@ -78,7 +78,6 @@ method = "threshold"
 threshold = "auto"
 [solver]
 rigid = "translation"
-curvature = true
 [scale]
 mm_per_pixel = 0.05
 """

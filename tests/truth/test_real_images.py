@@ -1,7 +1,6 @@
 """Real images with a known answer or a second opinion; mesh and prefilter are stated, limits are named constants.
 
-A TRI3 node at the crest of a short wave overshoots the wave (least squares by straight pieces), so the gain is taken
-from the finite-element field at the pixels, which is what the solve fits; at the nodes it is 2 to 8 % larger.
+Waves keep their height at the nodes and in the field at the pixels, which is as curved as the nodes say it is.
 """
 
 from __future__ import annotations
@@ -18,8 +17,10 @@ SHIFT_ERROR = 1e-4
 """px: the shifted images are copies of the pixels."""
 SAMPLE14_GAIN = 0.025
 """Deviation of the measured from the commanded amplitude; its statistical error is about 0.01."""
+NODAL_GAIN = 0.015
+"""The same at the nodes, where the best linear fit overshoots by 2 to 8 %."""
 SAMPLE14_RMS = 0.02
-"""px, finite-element field against the command: mostly the noise of the images."""
+"""px, field at the pixels against the command: mostly the noise of the images."""
 SECOND_OPINION = 0.02
 """px, rms difference to DICe (27 px subsets, other interpolation) away from the hole."""
 WAVE = 0.03
@@ -74,7 +75,7 @@ def test_challenge_sample_14_has_the_commanded_amplitude(grey, shared_data, leve
     assert np.sqrt(np.mean((u - truth) ** 2)) <= SAMPLE14_RMS
     assert abs(v[inside].mean()) <= 0.005
     commanded = np.interp(found.nodes[:, 0], np.arange(len(command)), command)
-    assert 1.0 <= (found.displacement[:, 0] @ commanded) / (commanded @ commanded) <= 1.10
+    assert (found.displacement[:, 0] @ commanded) / (commanded @ commanded) == pytest.approx(1, abs=NODAL_GAIN)
 
 
 @pytest.mark.parametrize("load", ["04", "11"])

@@ -126,16 +126,6 @@ def test_strain_in_motion_is_as_stated_up_to_the_edge(sphere: Sphere, kind: str,
     assert IN_MOTION[0] < ratio < IN_MOTION[1]
 
 
-@pytest.mark.parametrize("kind", ["rgb", "bayer"])
-def test_corrected_for_curvature_the_error_is_smaller_and_as_stated(sphere: Sphere, kind: str) -> None:
-    pair = [sphere.images(sphere.lights[a], kind, seed).values for seed, a in enumerate((0.0, 4.0))]
-    linear, corrected = (correlate(*pair, region=REGION, normalise=10, curvature=on) for on in (False, True))
-    exact = at_nodes(sphere.truth[4.0], linear.nodes)
-    error, smaller = (np.sqrt(np.nanmean((one.displacement - exact) ** 2)) for one in (linear, corrected))
-    assert smaller < 0.85 * error
-    assert IN_MOTION[0] < sphere.ratio(corrected, 4.0) < IN_MOTION[1]
-
-
 def test_statistics_beat_the_best_threshold_where_reflections_are_erratic() -> None:
     scene = sphere_scene(size=SIZE, seed=12)
     white, black = (replace(paint, spacing=0.05) for paint in (scene.surface.white, scene.surface.black))

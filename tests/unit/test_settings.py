@@ -188,7 +188,7 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST + "[weights]\nthreshold = 1.5", r"weights\.threshold must be at most 1, not 1.5"),
         (LEAST + "[weights]\nmethod = 'magic'", r'weights\.method must be one of .*not "magic"'),
         (LEAST + "[solver]\nmax_iterations = 5.5", r"solver\.max_iterations must be a whole number, not 5.5"),
-        (LEAST + "[solver]\ncurvature = 1", r"solver\.curvature must be true or false, not 1"),
+        (LEAST + "[solver]\ncurvature = true", r'unknown key "curvature" in \[solver\]'),
         (LEAST + "[solver]\ntolerance = inf", r"solver\.tolerance must be finite"),
         (LEAST + "[scale]\nmm_per_pixel = 0", r"scale\.mm_per_pixel must be above 0"),
         (LEAST + "[calibration]\nfile = 1", r"calibration\.file must be a file name in quotes, not 1"),

@@ -5,30 +5,29 @@ from __future__ import annotations
 import numpy as np
 
 from rgbmidic.correlation.equations import Equations
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.correlation.uncertainty.propagation import functional_std
+from rgbmidic.correlation.uncertainty.propagation import displacement_functionals, functional_std
 from rgbmidic.correlation.uncertainty.scores import score_covariance
 from rgbmidic.typing import FloatArray
 
 __all__ = ["nodal_std"]
 
 
-def nodal_std(residual: Residual, equations: Equations, quantities: int) -> FloatArray:
-    """Standard uncertainty (N, quantities) of the first of u, v (px), exx, eyy, exy from the scores.
+def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | None = None) -> FloatArray:
+    """Standard uncertainty of u and v (px) of the linear fit, (N, 2); with a `recovery`, of what it gives: u, v, exx,
+    eyy, exy, (N, 5).
 
     The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs/uncertainty.md).
     Displacement is told at the textured nodes, strain where all nodes around are textured, too.
     """
     reference, textured = residual.reference, equations.textured
-    inner = textured & ~reference.mesh.beside(~textured)
     covariance = reference.assembly.matrix(score_covariance(residual, equations.weights))
+    if recovery is None:
+        asked = [(displacement_functionals(len(textured)), textured)]
+    else:
+        inner = textured & ~reference.mesh.beside(~textured)
+        asked = [(recovery.displacement_functionals, textured), (recovery.strain_functionals, inner)]
     return np.concatenate(
-        [
-            functional_std(equations.solve, covariance, reference.colouring, functionals, nodes)
-            for functionals, nodes in (
-                (reference.functionals[:2], textured),
-                (reference.functionals[2:quantities], inner),
-            )
-        ],
-        axis=1,
+        [functional_std(equations.solve, covariance, reference.colouring, *one) for one in asked], axis=1
     )

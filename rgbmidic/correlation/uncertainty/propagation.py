@@ -17,10 +17,10 @@ import scipy.sparse as sp
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NodeColouring", "displacement_functionals", "functional_std", "strain_functionals"]
+__all__ = ["NodeColouring", "displacement_functionals", "functional_std"]
 
 
-_RINGS = 4
+_RINGS = 5
 """Nodes of one colour are at least this many edges apart."""
 
 
@@ -106,21 +106,3 @@ def displacement_functionals(nodes: int) -> list[sp.csr_matrix]:
     """The displacements u and v themselves, as `functional_std` takes them."""
     row = np.arange(nodes)
     return [sp.csr_matrix((np.ones(nodes), (row, 2 * row + axis)), shape=(nodes, 2 * nodes)) for axis in (0, 1)]
-
-
-def strain_functionals(mesh: Tri3Mesh) -> list[sp.csr_matrix]:
-    """Strains exx, eyy, exy at the nodes, means of the elements around by area, as `functional_std` takes them."""
-    slopes = mesh.shape_gradients() * mesh.areas[:, None, None]
-    share = 1 / mesh.to_nodes(mesh.areas)
-    row = np.repeat(mesh.elements, 3, axis=1).ravel()
-    column = np.tile(mesh.elements, 3).ravel()
-    count = len(mesh.nodes)
-
-    def matrix(*parts: tuple[int, int, float]) -> sp.csr_matrix:
-        total = sp.csr_matrix((count, 2 * count))
-        for component, axis, factor in parts:
-            values = factor * np.tile(slopes[..., axis], 3).ravel() * share[row]
-            total = total + sp.csr_matrix((values, (row, 2 * column + component)), shape=(count, 2 * count))
-        return sp.csr_matrix(total)
-
-    return [matrix((0, 0, 1.0)), matrix((1, 1, 1.0)), matrix((0, 1, 0.5), (1, 0, 0.5))]

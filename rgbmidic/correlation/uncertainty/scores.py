@@ -12,28 +12,30 @@ import numpy as np
 from rgbmidic._kernels.grid import block_sums, score_sums
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.correlation.uncertainty.blocks import BLOCK
+from rgbmidic.correlation.uncertainty.blocks import BLOCK, block_side
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 __all__ = ["displacing_share", "score_covariance"]
 
 _LEAST_RATIO = 1e-2
 """Least share of a residual's variance that is taken to displace."""
+_LEAST_SHARE = 0.05
+"""Least share of a direction in the texture: less is not measured."""
 _EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken."""
 _SCORE_RANGE = 30.0
 """Standard deviation (px) of the window over which block sums are averaged."""
 _LEAST_FREEDOM = 0.25
 """Least number of blocks, less one, that is taken: in a region of one block the uncertainty is hardly known."""
-_PRIOR = 0.1 * BLOCK**2
-"""Pixels for which the region's typical score counts in that window: beside a hole few blocks speak."""
+_PRIOR = 0.1
+"""Blocks for which the region's typical score counts in that window: beside a hole few blocks speak."""
 
 
 def displacing_share(residual: Residual, variance: FloatImage) -> FloatImage:
     """Variance of each light's scores over what white noise of that `variance` (k, P) would give, (k, P)."""
     pixels = residual.reference.pixels
-    sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32))
-    ratios = [_score_ratios(*light)[0] for light in sums]
+    sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32), BLOCK)
+    ratios = [_score_ratios(x, y, part, count, BLOCK) for x, y, part, count in sums]
     return np.stack([pixels.from_blocks(np.maximum(r[0] + r[2], _LEAST_RATIO), BLOCK) for r in ratios])
 
 
@@ -41,27 +43,40 @@ def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
     """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P)."""
     reference = residual.reference
     used = np.asarray(weights.any(axis=0), dtype=np.float32)
-    x, y, information, _ = _score_sums(residual, weights).sum(axis=0)
-    index, shape = reference.pixels.blocks(BLOCK)
+    side = block_side(reference.mesh.size)
+    x, y, information, _ = _score_sums(residual, weights, side).sum(axis=0)
+    index, shape = reference.pixels.blocks(side)
     count = np.zeros((1, information.size), dtype=np.float32)
     block_sums(used[None], index, count)
-    ratios, level = _score_ratios(x, y, information, count.reshape(shape).astype(np.float64))
-    return _per_element(reference, level * ratios / reference.unfitted, used)
+    ratios = _score_ratios(x, y, information, count.reshape(shape).astype(np.float64), side)
+    texture = np.sum([reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)], axis=0)
+    along_x, _, along_y = _per_element(reference, ratios, side) / reference.unfitted
+    share = _share_along_x(reference, texture)
+    along_x, along_y = along_x / share, along_y / (1 - share)
+    scale = np.stack([along_x, np.sqrt(along_x * along_y), along_y], axis=-1)
+    return np.asarray(texture * scale[:, None, None])
 
 
-def _score_sums(residual: Residual, weights: FloatImage) -> FloatArray:
+def _share_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
+    """Share (E,) of the gradients along x in the `texture` (E, 3, 3, 3) around each element."""
+    mesh = reference.mesh
+    own = texture.sum(axis=(1, 2))
+    x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (own[:, 0], own[:, 2]))
+    share = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
+    return np.asarray(np.clip(share, _LEAST_SHARE, 1 - _LEAST_SHARE))
+
+
+def _score_sums(residual: Residual, weights: FloatImage, side: int) -> FloatArray:
     """Sums (k, 4, rows, columns) over blocks of the lights' scores in x and y, their information, and pixels."""
     reference = residual.reference
-    index, shape = reference.pixels.blocks(BLOCK)
+    index, shape = reference.pixels.blocks(side)
     sums = np.zeros((len(weights), 4, shape[0] * shape[1]))
     score_sums(residual.difference, weights, reference.gradient_x, reference.gradient_y, index, sums)
     return sums.reshape(len(weights), 4, *shape)
 
 
-def _score_ratios(
-    x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Covariance (xx, xy, yy) of the scores of blocks over their information, and the information per pixel.
+def _score_ratios(x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray, side: int) -> FloatArray:
+    """Covariance (xx, xy, yy) of the scores of blocks over their information; shape (3, rows, columns).
 
     A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
     smooth, and averaged, is its ratio to the information; xx + yy is 1 for white noise and ideal weights.
@@ -70,21 +85,22 @@ def _score_ratios(
     scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
     x, y = x * scale, y * scale
     typical = _typical_square(x, y, count)
-    around = _blur(count, _SCORE_RANGE / BLOCK)
+    around = _blur(count, _SCORE_RANGE / side)
+    prior = _PRIOR * side**2
     ratios = [
-        (_blur(product, _SCORE_RANGE / BLOCK) + _PRIOR * expected) / (around + _PRIOR)
+        (_blur(product, _SCORE_RANGE / side) + prior * expected) / (around + prior)
         for product, expected in ((x * x, typical), (x * y, 0.0), (y * y, typical))
     ]
-    return np.stack(ratios) * _few_blocks(around, count), level
+    return np.asarray(np.stack(ratios) * _few_blocks(around, count, side))
 
 
-def _few_blocks(around: FloatArray, count: FloatArray) -> FloatArray:
+def _few_blocks(around: FloatArray, count: FloatArray, side: int) -> FloatArray:
     """Factor on a variance that few blocks tell, so that an error over its stated uncertainty has the variance 1.
 
     An estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large.
     """
-    window = 4 * np.pi * (_SCORE_RANGE / BLOCK) ** 2
-    number = np.minimum(window * around, count.sum()) / BLOCK**2
+    window = 4 * np.pi * (_SCORE_RANGE / side) ** 2
+    number = np.minimum(window * around, count.sum()) / side**2
     return np.asarray(number / np.maximum(number - 1, _LEAST_FREEDOM))
 
 
@@ -99,17 +115,15 @@ def _typical_square(x: FloatArray, y: FloatArray, count: FloatArray) -> float:
     return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
 
 
-def _per_element(reference: Reference, density: FloatArray, used: FloatImage) -> FloatArray:
-    """Element blocks of a score variance per pixel (xx, xy, yy) that is constant in each element."""
+def _per_element(reference: Reference, grid: FloatArray, side: int) -> FloatArray:
+    """Values (n, E) at the elements' centres of n grids of blocks."""
     mesh = reference.mesh
     top, left, _, _ = reference.pixels.bounds
     place = mesh.nodes[mesh.elements].mean(axis=1) - (left, top)
-    centre = np.round(place / BLOCK - 0.5).astype(int)
-    column = np.clip(centre[:, 0], 0, density.shape[2] - 1)
-    row = np.clip(centre[:, 1], 0, density.shape[1] - 1)
-    # summed over the pixels in use: at an edge they do not cover the element evenly
-    mass = reference.blocks(used, np.ones_like(used), np.zeros_like(used))[..., :1]
-    return np.asarray(mass * density[:, row, column].T[:, None, None, :])
+    centre = np.round(place / side - 0.5).astype(int)
+    column = np.clip(centre[:, 0], 0, grid.shape[2] - 1)
+    row = np.clip(centre[:, 1], 0, grid.shape[1] - 1)
+    return np.asarray(grid[:, row, column])
 
 
 def _blur(image: AnyArray, sigma: float) -> AnyArray:

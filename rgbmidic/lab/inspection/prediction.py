@@ -19,7 +19,8 @@ from rgbmidic.correlation.assembly import Assembly, factorise
 from rgbmidic.correlation.equations import SEEN
 from rgbmidic.correlation.images import PREFILTERS, apply_prefilter
 from rgbmidic.correlation.node_status import LOST
-from rgbmidic.correlation.uncertainty.propagation import NodeColouring, displacement_functionals, functional_std
+from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
+from rgbmidic.correlation.uncertainty.propagation import NodeColouring, functional_std
 from rgbmidic.illumination.normalise import local_mean
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection.disturbances import Disturbances
@@ -145,7 +146,9 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
 
     # elements that no light sees must not make the system singular
     solve = factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
-    along_x, colouring = displacement_functionals(len(density))[:1], NodeColouring.from_mesh(mesh)
+    used = np.asarray(seen[mesh.elements].all(axis=1))
+    recovery = Recovery.over(mesh, used, density, linear_fit_offset(mesh))
+    along_x, colouring = recovery.displacement_functionals[:1], NodeColouring.from_mesh(mesh)
     std = np.stack([functional_std(solve, assembled(score), colouring, along_x, seen)[:, 0] for score in scores])
     return np.where(seen & (std < LOST), std, np.nan)
 

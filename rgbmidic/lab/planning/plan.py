@@ -50,8 +50,6 @@ class Outlook:
         Whether white paint saturates in either.
     forecast
         Uncertainty of a node there.
-    mesh : ndarray, shape (h, w)
-        Root mean square, per component, of what linear elements cannot follow of the displacement at a node (px).
     """
 
     state: State
@@ -61,7 +59,6 @@ class Outlook:
     lit: BoolArray
     saturated: BoolArray
     forecast: Forecast
-    mesh: FloatArray
 
     @property
     def clean(self) -> npt.NDArray[np.int64]:
@@ -70,7 +67,7 @@ class Outlook:
 
     @property
     def std(self) -> FloatArray:
-        """Standard uncertainty (h, w) of u, and of v, in px: noise and reflections, without the mesh."""
+        """Standard uncertainty (h, w) of u, and of v, in px: noise and reflections."""
         return np.hypot(self.forecast.std, self.forecast.bias)
 
 
@@ -206,7 +203,6 @@ def outlook(
         lit=np.isfinite(reference.share) & np.isfinite(zones.share),
         saturated=instrument.saturated(reference) | instrument.saturated(zones),
         forecast=instrument.forecast(reference, zones, change),
-        mesh=_mesh_offset(displacement, step, instrument.element_size),
     )
 
 
@@ -218,18 +214,6 @@ def _around(values: FloatArray, reach: float) -> FloatArray:
         for stack in (np.where(known, values, 0.0), known.astype(np.float64))
     )
     return np.where(known, total / np.where(known, weight, 1.0), np.nan)
-
-
-def _mesh_offset(displacement: FloatArray, step: float, element_size: float) -> FloatArray:
-    """How far the nodes of the best linear elements lie off a curved displacement, (h, w).
-
-    On a regular mesh it is h^2/12 times the sum of the second derivatives along x and y, whatever the diagonals, up to
-    the mixed derivative, which changes its sign with the diagonal and adds its square.
-    """
-    along_x = np.gradient(np.gradient(displacement, step, axis=2), step, axis=2)
-    along_y = np.gradient(np.gradient(displacement, step, axis=1), step, axis=1)
-    offset = element_size**2 / 12 * (along_x + along_y)
-    return np.asarray(np.sqrt((offset**2).mean(axis=0)))
 
 
 def _field_in_view(

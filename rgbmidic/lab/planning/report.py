@@ -77,9 +77,9 @@ def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     rows = []
     for label, one in _labelled(plan):
         std = one["std_px"]
-        values = [std["median"], std["q95"], one["random_px"], one["feigned_by_domes_px"], one["mesh_px"]]
+        values = [std["median"], std["q95"], one["random_px"], one["feigned_by_domes_px"]]
         rows.append([label, *("-" if value is None else f"{value:.4f}" for value in values)])
-    return ["state", "median", "95 %", "random", "feigned", "mesh"], rows
+    return ["state", "median", "95 %", "random", "feigned"], rows
 
 
 ZONE_WORDS = {
@@ -91,7 +91,6 @@ ZONE_WORDS = {
 UNCERTAINTY_WORDS = {
     "random": "camera noise, what demosaicing leaves of the mosaic, reflections that change",
     "feigned": "droplets whose lit sides change look as if they moved",
-    "mesh": "what linear elements cannot follow; not part of median and 95 %",
 }
 """What the headings of `uncertainty_rows` mean."""
 
@@ -178,7 +177,6 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
         "std_px": dict(zip(("median", "q95", "largest"), quantiles, strict=True)),
         "random_px": _rms(outlook.forecast.std[inside]),
         "feigned_by_domes_px": _rms(outlook.forecast.bias[inside]),
-        "mesh_px": _rms(outlook.mesh[inside]),
     }
 
 

@@ -187,7 +187,7 @@ def test_projection_and_interpolation_of_pixel_fields_equal_their_naive_twins():
 @pytest.mark.parametrize("outlined", [False, True])
 def test_deviation_of_a_curved_field_equals_the_naive_twin(outlined):
     case = scene(12, outlined=outlined)
-    curvature = case.random.normal(size=(len(case.mesh.elements), 2, 3))
+    curvature = case.random.normal(size=(len(case.mesh.nodes), 2, 3))
     out = np.full((2, case.reference.size), 7, dtype=np.float32)
     kernels.curvature_deviation(
         case.mesh.nodes, case.mesh.elements, curvature, *case.on_map, case.pixels.barycentric, out
@@ -212,7 +212,7 @@ def all_outputs(number):
     kernels.pull_back(case.image, case.weight, *moved(case), weights)
     kernels.element_vector(*case.gradient, *case.on_map, case.pixels.barycentric, vector)
     kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
-    deviation, bend = np.empty((2, count), np.float32), case.random.normal(size=(elements, 2, 3))
+    deviation, bend = np.empty((2, count), np.float32), case.random.normal(size=(len(case.mesh.nodes), 2, 3))
     kernels.curvature_deviation(
         case.mesh.nodes, case.mesh.elements, bend, *case.on_map, case.pixels.barycentric, deviation
     )

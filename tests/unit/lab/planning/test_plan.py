@@ -9,10 +9,9 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.lab.planning.lamps import APART, propose_colours, propose_lamps
-from rgbmidic.lab.planning.plan import Plan, _mesh_offset, make_plan
+from rgbmidic.lab.planning.plan import Plan, make_plan
 from rgbmidic.lab.virtual import Cylinder, Light, Plate, Scene, State, turned
 from rgbmidic.lab.virtual.scenes import paint, sphere_scene
-from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.camera import reference_camera
 from rgbmidic.scene.light import three_lights
 from rgbmidic.scene.scenefile import DatasetSettings, Experiment
@@ -153,26 +152,6 @@ def test_a_plan_without_states_compares_the_body_with_itself():
     made = plan(coarse(sphere_scene()))
     assert len(made.outlooks) == 1
     np.testing.assert_allclose(made.outlooks[0].displacement[:, made.inside], 0, atol=1e-9)
-    np.testing.assert_allclose(made.outlooks[0].mesh[made.inside], 0, atol=1e-9)
-
-
-def test_the_mesh_s_share_is_the_offset_of_the_best_linear_elements():
-    # least squares of a quadratic field on the mesh, by its own mass matrix
-    size = 10.0
-    mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 120, 120), (121, 121)), size)
-    mass, load = np.zeros((len(mesh.nodes),) * 2), np.zeros(len(mesh.nodes))
-    for element, area in zip(mesh.elements, mesh.areas, strict=True):
-        corners = mesh.nodes[element]
-        mass[np.ix_(element, element)] += area / 12 * (1 + np.eye(3))
-        points = np.random.default_rng(1).dirichlet(np.ones(3), 4000)
-        values = 1e-3 * (points @ corners)[:, 0] ** 2
-        load[element] += area * (points * values[:, None]).mean(axis=0)
-    inner = (abs(mesh.nodes - 60) < 30).all(axis=1)
-    offset = (np.linalg.solve(mass, load) - 1e-3 * mesh.nodes[:, 0] ** 2)[inner]
-    x = np.mgrid[:13, :13][1] * size
-    predicted = _mesh_offset(np.stack([1e-3 * x**2, 0 * x]), size, size)[4:-4, 4:-4]
-    np.testing.assert_allclose(np.sqrt(2) * predicted, 2e-3 * size**2 / 12)
-    assert np.sqrt((offset**2).mean()) == pytest.approx(2e-3 * size**2 / 12, rel=0.05)
 
 
 def test_a_paint_without_droplets_cannot_be_planned():

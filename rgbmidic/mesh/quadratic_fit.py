@@ -1,0 +1,123 @@
+"""A quadratic polynomial fitted to the nodal values around each node: value, slope and curvature at the node.
+
+The recovery of Zhang and Naga (SIAM J. Sci. Comput. 26, 2005), with weights that fall with the distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from rgbmidic._kernels.correlation import curvature_deviation, interpolate_nodal
+from rgbmidic.mesh.pixel_map import PixelMap
+from rgbmidic.mesh.tri3 import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = ["TERMS", "curved", "quadratic_fit"]
+
+Index = npt.NDArray[np.intp]
+
+TERMS = ("value", "x", "y", "xx", "xy", "yy")
+"""What the operators of `quadratic_fit` give: the value, its first and its second derivatives."""
+_WIDTH = 0.58
+"""Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements then
+have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear fit's; with
+.45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and at 45 degrees).
+Its square goes with the inverse of the angle that the mesh fills: with .58 everywhere corners scattered 2 times as much
+as the linear fit's, and waves at an edge were seen no better."""
+_TIP = 0.8
+"""Share of the full angle from which a corner of the mesh counts as a crack's tip: an opening of 70 degrees."""
+_RIDGE = np.array([1e-9, 1e-9, 1e-6, 1e-6, 1e-6])
+"""Weight with which slopes and curvatures are held at 0, where too few nodes tell them."""
+
+
+def quadratic_fit(
+    mesh: Tri3Mesh,
+    used: BoolArray,
+    *,
+    information: FloatArray | None = None,
+    offset: FloatArray | None = None,
+) -> tuple[sp.csr_matrix, ...]:
+    """Linear operators (N, N), one for each of `TERMS`, from nodal values to those of the polynomial at each node.
+
+    The polynomial is fitted to the nodes within two edges, reached over `used` elements only: not across a crack or a
+    hole. Quadratic fields are reproduced, at edges too; what too few nodes tell is 0.
+
+    Parameters
+    ----------
+    mesh
+        N nodes, E elements.
+    used : ndarray, shape (E,), bool
+    information : ndarray, shape (N,), optional
+        How well each node is known (inverse variance, any unit): one that is known badly counts little elsewhere.
+    offset : ndarray, shape (N, 3), optional
+        What the given values have beyond a field whose second derivative xx, xy or yy is 1, square px; 0 without.
+    """
+    share = _surrounded(mesh, used)
+    node, other, start = _pairs(mesh, used, share)
+    basis = _basis(mesh, node, other, offset)
+    square = _WIDTH**2 / share[node]  # at an edge the window holds as much of the mesh as inside
+    weight = np.exp(-(basis[1] ** 2 + basis[2] ** 2) / (2 * square))
+    if information is not None:
+        own, theirs = information[node], information[other]
+        weight *= np.divide(theirs, own + theirs, out=np.full_like(own, 0.5), where=own + theirs > 0)
+    weighted = weight * basis
+    normal = np.empty((len(start), 6, 6))
+    for i in range(6):
+        for j in range(i + 1):
+            normal[:, i, j] = normal[:, j, i] = np.add.reduceat(weighted[i] * basis[j], start)
+    normal[:, range(1, 6), range(1, 6)] += _RIDGE
+    inverse = np.linalg.inv(normal)
+    operators = []
+    for term, power in enumerate((0, 1, 1, 2, 2, 2)):
+        values = sum(weighted[i] * inverse[:, term, i][node] for i in range(6)) / mesh.size**power
+        operators.append(sp.csr_matrix((values, other, np.append(start, other.size)), shape=(len(start),) * 2))
+    return tuple(operators)
+
+
+def curved(
+    mesh: Tri3Mesh, pixels: PixelMap, values: FloatArray, curvature: Sequence[sp.csr_matrix], of: FloatArray
+) -> FloatImage:
+    """Nodal values (N, 2) between the nodes, as curved as the `curvature` operators say `of` (N, 2) is; (2, P)."""
+    second = np.stack([operator @ of for operator in curvature], axis=-1)
+    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+    linear, bent = np.empty((2, 2, pixels.rows.size), dtype=np.float32)
+    interpolate_nodal(values, mesh.elements, *geometry, linear)
+    curvature_deviation(mesh.nodes, mesh.elements, second, *geometry, bent)
+    return np.asarray(linear + bent)
+
+
+def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
+    """Share (N,) of the full angle around each node that `used` elements fill; 1 where there are none."""
+    corners = mesh.nodes[mesh.elements]
+    ahead, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    across = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
+    angle = np.arctan2(across, (ahead * back).sum(axis=-1)) * used[:, None]
+    share = np.bincount(mesh.elements.ravel(), weights=angle.ravel(), minlength=len(mesh.nodes)) / (2 * np.pi)
+    return np.asarray(np.where(share > 0, share, 1.0))
+
+
+def _basis(mesh: Tri3Mesh, node: Index, other: Index, offset: FloatArray | None) -> FloatArray:
+    """The polynomials 1, x, y, xx/2, xy, yy/2 about each node at the others, in sides of an element: (6, pairs)."""
+    x, y = (mesh.nodes[other] - mesh.nodes[node]).T / mesh.size
+    basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
+    if offset is not None:
+        basis[3:] += offset[other].T / mesh.size**2
+    return basis
+
+
+def _pairs(mesh: Tri3Mesh, used: BoolArray, share: FloatArray) -> tuple[Index, Index, Index]:
+    """Pairs (node, other) of nodes at most two edges of `used` elements apart, each node with itself, in the order of
+    the first; and where each node's pairs start. No way leads round the tip of a crack to its other side."""
+    count = len(mesh.nodes)
+    corners = mesh.elements[used]
+    rows, columns = np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel()
+    beside = sp.csr_matrix((np.ones(rows.size, dtype=np.int32), (rows, columns)), shape=(count, count))
+    beside = beside + sp.eye(count, dtype=np.int32, format="csr")
+    through = beside.multiply(~(mesh.on_boundary & (share > _TIP))[:, None])
+    reach = sp.csr_matrix(beside + beside @ through)
+    start, other = (np.asarray(part, dtype=np.intp) for part in (reach.indptr, reach.indices))
+    return np.repeat(np.arange(count), np.diff(start)), other, start[:-1]
