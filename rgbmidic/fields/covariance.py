@@ -1,7 +1,8 @@
 """How the errors of neighbouring nodes go together, which means, gauges and strains need.
 
 The solve is a least-squares fit of linear elements, whose covariance is the inverse of a Hessian: for a texture that is
-alike everywhere the inverse of the mesh's mass matrix. Where the texture, the weights or the noise vary, the stated
+alike everywhere the inverse of the mesh's mass matrix. The displacement at a node is then that of a quadratic through
+the nodes around it, a linear function of theirs. Where the texture, the weights or the noise vary, the stated
 uncertainty of each node says by how much; its correlation with the others is taken as the mesh's alone.
 """
 
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
@@ -22,7 +24,7 @@ __all__ = ["NodalCovariance"]
 _LOW, _HIGH = 0.5, 2.0
 """Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
 _RINGS = 4
-"""Edges from a node up to which its correlation is kept: what lies beyond is .8 % or less."""
+"""Edges from a node up to which the inverse mass matrix is kept: what lies beyond is .8 % or less."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,12 +44,15 @@ class NodalCovariance:
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh) -> Self:
-        """Of the inverse mass matrix, by as many steps of Chebyshev's iteration as there are rings of nodes to keep."""
-        mass = _mass(mesh)
+        """Of the linear fit (the inverse mass matrix), carried through the recovery of the nodal values."""
+        mass = mass_matrix(mesh)
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
-        inverse = _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale), _RINGS)
-        unit = sp.diags(1 / np.sqrt(inverse.diagonal()))
-        return cls(mesh=mesh, correlation=sp.csr_matrix(unit @ inverse @ unit))
+        inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale), _RINGS) @ scale
+        everywhere = np.ones(len(mesh.elements), dtype=bool)
+        recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes)), linear_fit_offset(mesh)).value
+        whole = sp.csr_matrix(recovery @ inverse @ recovery.T)
+        unit = sp.diags(1 / np.sqrt(whole.diagonal()))
+        return cls(mesh=mesh, correlation=sp.csr_matrix(unit @ whole @ unit))
 
     def variance(self, weights: FloatArray, std: FloatArray) -> FloatArray:
         """Variance of the sum of nodal values by `weights` (..., N) where their standard uncertainty is `std` (..., N).
@@ -65,14 +70,6 @@ class NodalCovariance:
             (np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=(len(nodes), len(self.mesh.nodes))
         )
         return np.asarray((chosen @ self.correlation @ chosen.T).toarray())
-
-
-def _mass(mesh: Tri3Mesh) -> sp.csr_matrix:
-    """Mass matrix (N, N) of the linear shape functions."""
-    blocks = mesh.areas[:, None, None] / 12 * (np.ones((3, 3)) + np.eye(3))
-    row, column = np.repeat(mesh.elements, 3, axis=1), np.tile(mesh.elements, 3)
-    count = len(mesh.nodes)
-    return sp.csr_matrix((blocks.ravel(), (row.ravel(), column.ravel())), shape=(count, count))
 
 
 def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int) -> sp.csr_matrix:

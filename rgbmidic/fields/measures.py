@@ -48,7 +48,7 @@ class Strain:
         The larger and the smaller principal strain, in the plane.
     direction_deg, direction_std_deg : ndarray, shape (...)
         Direction of the larger one on the reference, from x towards y, between -90 and 90 degrees. Where both are the
-        same within their uncertainty it means nothing, and the uncertainty tends to 52 degrees.
+        same within their uncertainty it means nothing, and the uncertainty tends to 52 degrees; NaN without strain.
     equivalent, equivalent_std : ndarray, shape (...)
         Von Mises equivalent at constant volume, ``sqrt(4/3 (e1^2 + e1 e2 + e2^2))``: e in a tensile test of e.
         Being positive, it is more than 0 in noise alone, by about its uncertainty.
@@ -86,43 +86,48 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
         raise InputError(f'unknown strain measure "{measure}"; allowed are {", ".join(MEASURES)}')
     shape = gradient.shape[:-2]
     h, spread = gradient.reshape(-1, 2, 2), covariance.reshape(-1, 4, 4)
-    tensor, slope = _small(h) if measure == "engineering" else _of_stretch(h, *_OF_STRETCH[measure])
-    slopes = np.stack([slope[:, 0, 0], slope[:, 1, 1], slope[:, 0, 1]], axis=1)
-    return _told(measure, tensor, np.einsum("nai,nij,nbj->nab", slopes, spread, slopes), shape)
+    tensor, slopes = _small(h) if measure == "engineering" else _of_stretch(h, *_OF_STRETCH[measure])
+    return _told(measure, tensor, slopes @ spread @ slopes.transpose(0, 2, 1), shape)
 
 
 def _small(gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Small strain (n, 2, 2) and its derivative (n, 2, 2, 4) by the gradient."""
-    slope = np.zeros((len(gradient), 2, 2, 4))
-    slope[:, 0, 0, 0] = slope[:, 1, 1, 3] = 1
-    slope[:, 0, 1, 1:3] = slope[:, 1, 0, 1:3] = 0.5
+    """Small strain (n, 2, 2) and the derivative (n, 3, 4) of its exx, eyy, exy by the gradient."""
+    slope = np.zeros((len(gradient), 3, 4))
+    slope[:, 0, 0] = slope[:, 1, 3] = 1
+    slope[:, 2, 1:3] = 0.5
     return (gradient + gradient.transpose(0, 2, 1)) / 2, slope
 
 
 def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function) -> tuple[FloatArray, FloatArray]:
-    """A function of C (n, 2, 2) and its derivative (n, 2, 2, 4) by the gradient (Daleckii and Krein)."""
+    """A function of C (n, 2, 2) and the derivative (n, 3, 4) of its xx, yy, xy by the gradient (Daleckii and Krein)."""
     f = np.eye(2) + gradient
-    values, vectors = _eigen(np.einsum("nki,nkj->nij", f, f))
+    values, vectors = _eigen(f.transpose(0, 2, 1) @ f)
     values = np.maximum(values, np.finfo(float).tiny)
     at = function(values)
     gap, mean = values[:, 1] - values[:, 0], values.mean(axis=1)
     close = np.abs(gap) < _SAME
     across = np.where(close, derivative(mean), (at[:, 1] - at[:, 0]) / np.where(close, 1, gap))
-    divided = derivative(values)[:, :, None] * np.eye(2) + across[:, None, None] * (1 - np.eye(2))
-    units = np.eye(4).reshape(4, 2, 2)
-    change = np.einsum("nki,mkj->nmij", f, units)
-    change = change + change.transpose(0, 1, 3, 2)
-    turned = np.einsum("nai,nmab,nbj->nmij", vectors, change, vectors) * divided[:, None]
-    slope = np.einsum("nai,nmij,nbj->nabm", vectors, turned, vectors)
-    return np.einsum("nai,ni,nbi->nab", vectors, at, vectors), slope
+    along = derivative(values)
+    # what a change of H[c, d] alone makes of C along the axes a and b of C: F_ca V_db + V_da F_cb, F turned by V
+    turned = f @ vectors
+    change = [turned[:, :, None, a] * vectors[:, None, :, b] for a in (0, 1) for b in (0, 1)]
+    parts = [2 * change[0] * along[:, 0, None, None], 2 * change[3] * along[:, 1, None, None]]
+    parts.append((change[1] + change[2]) * across[:, None, None])
+    first, second, shear = (part.reshape(-1, 4) for part in parts)
+    slope = np.empty((len(f), 3, 4))
+    for row, (i, j) in enumerate(((0, 0), (1, 1), (0, 1))):
+        (vi, wi), (vj, wj) = vectors[:, i].T[..., None], vectors[:, j].T[..., None]
+        slope[:, row] = vi * vj * first + wi * wj * second + (vi * wj + wi * vj) * shear
+    return (vectors * at[:, None]) @ vectors.transpose(0, 2, 1), slope
 
 
 def _eigen(tensor: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues (n, 2), the larger first, and eigenvectors (n, 2, 2) in columns; NaN for NaN."""
-    known = np.asarray(np.isfinite(tensor).all(axis=(1, 2)))
-    values, vectors = np.linalg.eigh(np.where(known[:, None, None], tensor, np.eye(2)))
-    values[~known], vectors[~known] = np.nan, np.nan
-    return values[:, ::-1], vectors[:, :, ::-1]
+    half, shear = (tensor[:, 0, 0] - tensor[:, 1, 1]) / 2, tensor[:, 0, 1]
+    middle, radius, angle = half + tensor[:, 1, 1], np.hypot(half, shear), np.arctan2(shear, half) / 2
+    c, s = np.cos(angle), np.sin(angle)
+    vectors = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    return np.stack([middle + radius, middle - radius], axis=1), vectors
 
 
 def _told(measure: str, tensor: FloatArray, covariance: FloatArray, shape: tuple[int, ...]) -> Strain:
@@ -134,14 +139,15 @@ def _told(measure: str, tensor: FloatArray, covariance: FloatArray, shape: tuple
     along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
     turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        direction = np.degrees(_deviation(turn, covariance) / (principal[:, 0] - principal[:, 1]))
+        apart = principal[:, 0] - principal[:, 1]
+        direction = np.degrees(_deviation(turn, covariance) / apart)
         equivalent, equivalent_std = _equivalent(e, covariance)
     parts = {
         "components": e,
         "components_std": np.sqrt(np.einsum("naa->na", covariance)),
         "principal": principal,
         "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
-        "direction_deg": (angle + 90) % 180 - 90,
+        "direction_deg": np.where(apart > 0, (angle + 90) % 180 - 90, np.nan),
         "direction_std_deg": np.minimum(direction, _LARGEST_ANGLE),
         "equivalent": equivalent,
         "equivalent_std": equivalent_std,

@@ -78,7 +78,26 @@ class RigidMotion:
             rotation_std=float(np.sqrt(turning)),
         )
 
+    def removed(self, nodes: FloatArray, field: FloatArray) -> FloatArray:
+        """A displacement field as one sees it who moves with the body.
+
+        What is left of the displacements is turned back by the rotation, so that lengths and strains stay as they are.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (N, 2)
+            In px on the reference.
+        field : ndarray, shape (4, N)
+            u, v and their standard uncertainty, px. That of the rigid motion itself is not added: it is the less, the
+            more nodes there are.
+        """
+        c, s = np.cos(self.rotation), np.sin(self.rotation)
+        back = np.array([[c, s], [-s, c]])
+        arm = nodes - self.centre
+        left = (arm + field[:2].T - self.shift) @ back.T - arm
+        return np.concatenate([left.T, np.sqrt(back**2 @ field[2:] ** 2)])
+
     def at(self, points: FloatArray) -> FloatArray:
-        """Displacement (P, 2) in px of points (P, 2) by the rigid motion; take it off to see the deformation."""
+        """Displacement (P, 2) in px of points (P, 2) by the rigid motion alone."""
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         return np.asarray((points - self.centre) @ (np.array([[c, -s], [s, c]]) - np.eye(2)).T + self.shift)

@@ -1,8 +1,8 @@
 """Strain over a virtual strain gauge: a plane is fitted to the displacements of the nodes around a place.
 
 Nothing is measured anew: gauges of any length follow from the stored displacements. The length of a virtual strain
-gauge is, as the iDICs good practice guide has it for windows of points, the diameter of the circle of nodes plus the
-element, over which a node itself is averaged.
+gauge is the diameter of a circle. A node stands for as much as an element is wide and counts by the part of that within
+the circle, so that, as in the iDICs good practice guide, the length is that of the window of points plus one of them.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ __all__ = ["SHORTEST", "StrainGauges", "shortest_gauge", "strain_of"]
 
 SHORTEST = 3.0
 """Length of the shortest gauge in elements: a node and those around it."""
-_ROUND = 1.15
-"""Distances up to this factor count as the gauge's radius: the sides of a mesh's elements differ by a little."""
+_ROUND = 0.9
+"""Share of it that will do: the sides of a mesh's elements are not quite what was asked for."""
 _FLAT = 1e-2
 """Least ratio of the second moments of a gauge's nodes across and along it: below, they lie on a line."""
 
@@ -92,8 +92,12 @@ class StrainGauges:
     rows, nodes : ndarray, shape (M,), int
         Gauge and node of every pair of them: nodes within the gauge's circle that hang together in it, so that none
         lies across a crack or a hole.
+    shares : ndarray, shape (M,)
+        Part of each node that is within the gauge's circle.
     needed : csr_matrix, shape (G, N)
         Nodes that must be measured for a gauge to tell anything: the centre and those beside it.
+    whole : ndarray, shape (2, M)
+        Weight of every node in the slopes along x and y where all are measured.
     inflation : ndarray, shape (G, 3)
         Variance of the slopes along x and y, and their covariance, over what independent nodes would give.
     """
@@ -103,7 +107,9 @@ class StrainGauges:
     points: FloatArray
     rows: npt.NDArray[np.int64]
     nodes: npt.NDArray[np.int64]
+    shares: FloatArray
     needed: sp.csr_matrix
+    whole: FloatArray
     inflation: FloatArray
 
     @classmethod
@@ -135,33 +141,37 @@ class StrainGauges:
     ) -> Self:
         mesh = covariance.mesh
         length = shortest_gauge(mesh) if length is None else float(length)
-        if not (np.isfinite(length) and length >= 0.99 * shortest_gauge(mesh)):
+        if not (np.isfinite(length) and length >= _ROUND * shortest_gauge(mesh)):
             raise InputError(
                 f"a strain gauge must be at least {shortest_gauge(mesh):.4g} px long, {SHORTEST:g} elements; given are "
                 f"{length:g} px"
             )
-        pattern = _reach(mesh, centres, (length - mesh.size) / 2, needed)
+        pattern = _reach(mesh, centres, length / 2, needed)
         rows = np.repeat(np.arange(len(centres)), np.diff(pattern.indptr))
+        away = np.hypot(*(mesh.nodes[pattern.indices] - centres[rows]).T)
         gauges = cls(
             length=length,
             centres=centres,
             points=mesh.nodes,
             rows=rows,
             nodes=pattern.indices.astype(np.int64),
+            shares=np.clip((length / 2 - away) / mesh.size, 0, 1),
             needed=needed,
+            whole=np.zeros((2, len(rows))),
             inflation=np.ones((len(centres), 3)),
         )
         return gauges._correlated(covariance.correlation)
 
     def _correlated(self, correlation: sp.csr_matrix) -> Self:
-        """The same with the `inflation` by the correlation (N, N) between nodes of one uncertainty."""
+        """The same with its weights, and the `inflation` by the correlation (N, N) between nodes of one uncertainty."""
         weights = self._weights(np.ones(len(self.points), dtype=bool))
         shape, row = (len(self.centres), len(self.points)), self.rows
         x, y = (sp.csr_matrix((weight, (row, self.nodes)), shape=shape) for weight in weights)
         together = [np.asarray((a @ correlation).multiply(b).sum(axis=1)).ravel() for a, b in ((x, x), (y, y))]
         alone = [np.asarray(a.multiply(a).sum(axis=1)).ravel() for a in (x, y)]
         along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
-        return replace(self, inflation=np.stack([along, across, np.sqrt(along * across)], axis=1))
+        inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
+        return replace(self, whole=weights, inflation=inflation)
 
     def gradient(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
@@ -169,7 +179,7 @@ class StrainGauges:
         """Displacement gradient (G, 2, 2) and its covariance (G, 4, 4), row by row; displacements (N,) in px."""
         measured = np.isfinite(u + v + u_std + v_std)
         known = self.needed @ (~measured * 1.0) == 0
-        weights = self._weights(measured)
+        weights = self.whole if measured.all() else self._weights(measured)
         values, spread = np.zeros((len(known), 2, 2)), np.zeros((len(known), 4, 4))
         for component, (value, std) in enumerate(((u, u_std), (v, v_std))):
             moved, square = (np.where(measured, part, 0.0)[self.nodes] for part in (value, std**2))
@@ -188,17 +198,17 @@ class StrainGauges:
         """Strain of every gauge from the displacements (N,) of one frame; errors as `strain_of`."""
         return strain_of_gradient(*self.gradient(u, v, u_std, v_std), measure)
 
-    def _weights(self, measured: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Weight (M,) of every node in the slopes along x and y of each gauge; NaN where its nodes lie on a line."""
-        use = measured[self.nodes] * 1.0
+    def _weights(self, measured: BoolArray) -> FloatArray:
+        """Weight (2, M) of every node in the slopes along x and y of each gauge; NaN where its nodes lie on a line."""
+        use = measured[self.nodes] * self.shares
         arm = (self.points[self.nodes] - self.centres[self.rows]).T
-        count = np.maximum(self._sum(use), 1)
+        count = np.maximum(self._sum(use), np.finfo(float).tiny)
         x, y = (part - (self._sum(use * part) / count)[self.rows] for part in arm)
         xx, xy, yy = (self._sum(use * a * b) for a, b in ((x, x), (x, y), (y, y)))
         determinant = xx * yy - xy * xy
         determinant = np.where(determinant > _FLAT * ((xx + yy) / 2) ** 2, determinant, np.nan)
         xx, xy, yy = (part[self.rows] / determinant[self.rows] for part in (xx, xy, yy))
-        return use * (yy * x - xy * y), use * (xx * y - xy * x)
+        return np.stack([use * (yy * x - xy * y), use * (xx * y - xy * x)])
 
     def _sum(self, values: AnyArray) -> FloatArray:
         sums = np.bincount(self.rows, weights=values, minlength=len(self.centres))
@@ -217,7 +227,7 @@ def _reach(mesh: Tri3Mesh, centres: FloatArray, radius: float, needed: sp.csr_ma
     """Nodes (G, N) within `radius` px of each centre that are joined with it by edges inside the circle."""
     from scipy.spatial import cKDTree
 
-    near = cKDTree(centres).query_ball_tree(cKDTree(mesh.nodes), max(radius, 0.0) * _ROUND)
+    near = cKDTree(centres).query_ball_tree(cKDTree(mesh.nodes), radius)
     starts = np.cumsum([0, *map(len, near)])
     columns = np.concatenate([np.asarray(some, dtype=np.int64) for some in near])
     inside = sp.csr_matrix((np.ones(len(columns)), columns, starts), shape=needed.shape)

@@ -10,12 +10,10 @@ from typing import Self
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import FloatArray
 
-__all__ = ["POINT_STD", "Units", "column"]
-
-POINT_STD = 0.5
-"""Standard uncertainty (px) of a point that is read off an image by eye, along either axis: half a pixel."""
+__all__ = ["Units", "column"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,10 +35,17 @@ class Units:
     timed: bool = False
 
     @classmethod
+    def of(cls, scale: ScaleSettings, *, timed: bool) -> Self:
+        """As ``[scale]`` states them."""
+        return cls(mm_per_pixel=scale.mm_per_pixel, mm_per_pixel_std=scale.mm_per_pixel_std, timed=timed)
+
+    @classmethod
     def from_points(
-        cls, points: Sequence[Sequence[float]], length: float, *, length_std: float = 0.0, point_std: float = POINT_STD
+        cls, points: Sequence[Sequence[float]], length: float, *, length_std: float = 0.0, point_std: float = 0.5
     ) -> Self:
         """The scale from two points (x, y) in px on an image and their distance in mm.
+
+        Along either axis a point is as uncertain as `point_std`: half a pixel where it is read off an image by eye.
 
         Raises
         ------

@@ -12,6 +12,7 @@ from rgbmidic.report.figures import (
     share_figure,
 )
 from rgbmidic.report.gallery import remove_figures, write_figures
+from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
 from rgbmidic.report.style import save_figure
 
@@ -20,6 +21,7 @@ __all__ = [
     "Page",
     "brightness_figure",
     "convergence_figure",
+    "history_figure",
     "map_figure",
     "mask_figure",
     "reflection_figure",

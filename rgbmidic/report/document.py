@@ -16,8 +16,8 @@ from rgbmidic.report.page import Page
 from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
 from rgbmidic.report.style import embedded
 from rgbmidic.results import QUANTITIES, Physical, Result
-from rgbmidic.results.files import check_new, write_complete
-from rgbmidic.settings import SetupSettings, TestSettings
+from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.settings import SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,9 +66,9 @@ def write_report(
         The file exists, its folder does not, or a frame of the result is damaged.
     """
     out = Path(out)
-    check_new(out, overwrite=overwrite)
+    check_file(out, overwrite=overwrite)
     kept = result.provenance.get("settings", {}).get("setup", {})
-    setup = SetupSettings(**kept) if settings is None else settings.setup
+    setup = read_section(SetupSettings, "setup", kept) if settings is None else settings.setup
     told = Physical.of(result, None if settings is None else settings.scale)
     text = _Report.of(told, setup, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))

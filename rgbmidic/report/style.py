@@ -54,8 +54,8 @@ LINES = ("-", "--", "-.", ":")
 """Line styles in turn: who does not tell colours apart tells the lines apart by these."""
 _WIDTH, _TALLEST = 9.0, 9.5
 """Largest width and height of a figure in inches."""
-NUMBERS, BAR, GAP = 0.65, 0.95, 0.15
-"""Inches: room left of a panel for its numbers, right of it for a colour bar or for nothing."""
+NUMBERS, BAR, GAP, LEGEND = 0.65, 0.95, 0.15, 2.2
+"""Inches: room left of a panel for its numbers, right of it for a colour bar, for nothing or for names of lines."""
 _BELOW, _ABOVE = 0.52, 0.3
 """Inches: room for the numbers below a panel, and for its title."""
 _CLIPPED, _WILD = 0.5, 0.1
@@ -65,11 +65,17 @@ _SPAN = 4.0
 
 
 def draw_figure(
-    draw: Callable[[list[Axes]], None], *, count: int, aspect: float, beside: float, title: str = ""
+    draw: Callable[[list[Axes]], None],
+    *,
+    count: int,
+    aspect: float,
+    beside: float,
+    title: str = "",
+    tallest: float = _TALLEST,
 ) -> Figure:
     """A figure of `count` panels whose height is `aspect` times their width: side by side, or stacked when flat.
 
-    `beside` is the room right of each panel, in inches: `BAR`, `NUMBERS` or `GAP`.
+    `beside` is the room right of each panel, in inches: `BAR`, `NUMBERS`, `GAP` or `LEGEND`.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -79,7 +85,7 @@ def draw_figure(
     rows = count // columns
     total = min(_WIDTH, max(6.0, 4.5 * columns))
     width = (total - NUMBERS) / columns - beside
-    height = min(width * aspect, (_TALLEST - 2 * GAP) / rows - _BELOW - _ABOVE)
+    height = min(width * aspect, (tallest - 2 * GAP) / rows - _BELOW - _ABOVE)
     heading = 2 * GAP if title else 0.0
     whole = rows * (height + _BELOW + _ABOVE) + heading
     with mpl.rc_context(STYLE):
@@ -179,6 +185,6 @@ def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
 
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    axis.xaxis.set_major_locator(MaxNLocator(integer=whole))
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True) if whole else MaxNLocator(5))
     axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)

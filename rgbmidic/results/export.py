@@ -13,7 +13,7 @@ import numpy as np
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import column
-from rgbmidic.results.files import check_new, write_complete
+from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.hdf5 import write_hdf5
 from rgbmidic.results.physical import Physical
 from rgbmidic.results.quantities import QUANTITIES, Quantity
@@ -59,7 +59,7 @@ def export_result(
     out = Path(out)
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
-    check_new(out, overwrite=overwrite)
+    check_file(out, overwrite=overwrite)
     told = Physical.of(result, scale)
     write_complete(out, lambda file: _WRITERS[to](told, file))
 

@@ -19,7 +19,7 @@ from rgbmidic.errors import ResultError
 from rgbmidic.typing import AnyArray
 
 __all__ = [
-    "check_new",
+    "check_file",
     "read_arrays",
     "read_json",
     "write_arrays",
@@ -132,21 +132,21 @@ def write_complete(
             temporary.unlink()
 
 
-def check_new(path: Path, *, overwrite: bool) -> None:
-    """Refuse to write a file that is there already (unless `overwrite`), or whose folder is not.
+def check_file(out: Path, *, overwrite: bool) -> None:
+    """Refuse a file that is already there, unless it may be replaced, or whose folder is not.
 
     Raises
     ------
     ResultError
-        It is so, or the disk does not tell.
+        It cannot be written.
     """
-    with writing(path):
-        if path.exists() and not (overwrite and path.is_file()):
+    with writing(out):
+        if out.exists() and not (overwrite and out.is_file()):
             raise ResultError(
-                f"{path} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
+                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
             )
-        if not path.parent.is_dir():
-            raise ResultError(f"{path} cannot be written: there is no folder {path.parent}")
+        if not out.parent.is_dir():
+            raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
 
 
 @contextlib.contextmanager

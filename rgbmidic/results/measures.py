@@ -10,10 +10,10 @@ from rgbmidic.fields.differences import reference_share
 from rgbmidic.fields.units import Units
 from rgbmidic.results.quantities import UNKNOWN_TIME
 from rgbmidic.results.result import Result
-from rgbmidic.settings import ScaleSettings
+from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["frame_times", "reference_frames", "shared_part", "units_of"]
+__all__ = ["exposure", "frame_times", "probes_of", "reference_frames", "scale_of", "shared_part", "units_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -21,33 +21,58 @@ _DIFFERENT = 0.01
 """Share by which a stated rate may differ from that of the frames' stamps before it is told."""
 
 
+def scale_of(result: Result) -> ScaleSettings:
+    """The ``[scale]`` that a result was measured with."""
+    return read_section(ScaleSettings, "scale", result.provenance.get("settings", {}).get("scale", {}))
+
+
+def probes_of(result: Result) -> ProbeSettings:
+    """The ``[probes]`` that a result was measured with."""
+    return read_section(ProbeSettings, "probes", result.provenance.get("settings", {}).get("probes", {}))
+
+
 def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
     """The units of a result, with its own ``[scale]`` or another one in its place."""
-    scale = _scale(result) if scale is None else scale
-    timed = frame_times(result, scale) is not None
-    return Units(mm_per_pixel=scale.mm_per_pixel, mm_per_pixel_std=scale.mm_per_pixel_std, timed=timed)
+    scale = scale_of(result) if scale is None else scale
+    return Units.of(scale, timed=frame_times(result, scale) is not None)
 
 
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
     """Time (T,) of each frame in seconds, from the trigger where the camera tells it; None where nobody knows.
 
     What the files tell of every frame, else the number of the frame over `frame_rate`, that of ``[scale]`` before the
-    camera's.
+    camera's. NaN for frames that are not measured yet.
     """
-    scale = _scale(result) if scale is None else scale
-    stamps, finished = result.time_ns, result.finished
-    rate = scale.frame_rate or result.provenance.get("frame_rate")
-    if finished.all() and (stamps != UNKNOWN_TIME).all():
-        times = np.asarray(stamps * 1e-9)
-        steps = np.diff(times) / np.maximum(np.diff(result.number), 1)
-        if scale.frame_rate and len(steps) and abs(float(np.median(steps)) * scale.frame_rate - 1) > _DIFFERENT:
+    scale = scale_of(result) if scale is None else scale
+    there = result.finished
+    stamps, numbers = result.time_ns[there], result.number[there]
+    if (stamps == UNKNOWN_TIME).any():
+        rate = scale.frame_rate or result.provenance.get("frame_rate")
+        seconds = numbers / rate if rate else None
+    else:
+        seconds = stamps * 1e-9
+        _compare(seconds, numbers, scale.frame_rate)
+    if seconds is None:
+        return None
+    times = np.full(len(result), np.nan)
+    times[there] = seconds
+    return times
+
+
+def _compare(seconds: FloatArray, numbers: FloatArray, stated: float | None) -> None:
+    """Tell where a stated frame rate is not that of the stamps."""
+    if stated and len(seconds) > 1:
+        own = float(np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)))
+        if abs(own / stated - 1) > _DIFFERENT:
             logger.warning(
-                "scale.frame_rate states %g frames per second, the frames' own times %g: these are taken",
-                scale.frame_rate,
-                1 / float(np.median(steps)),
+                "scale.frame_rate states %g frames per second, the frames' own times %.6g: these are taken", stated, own
             )
-        return times
-    return np.asarray(result.number / rate) if rate and finished.all() else None
+
+
+def exposure(result: Result) -> float | None:
+    """Time in seconds that each frame collects light; None where the files do not tell it."""
+    told = result.provenance.get("exposure_ns")
+    return None if told is None else float(told) * 1e-9
 
 
 def reference_frames(result: Result) -> BoolArray:
@@ -60,7 +85,3 @@ def reference_frames(result: Result) -> BoolArray:
 def shared_part(result: Result) -> float:
     """Share of every frame's variance that the reference puts into all alike (`rgbmidic.fields.differences`)."""
     return reference_share(len(result.setting("frames", "reference", [0])))
-
-
-def _scale(result: Result) -> ScaleSettings:
-    return ScaleSettings(**result.provenance.get("settings", {}).get("scale", {}))
