@@ -41,7 +41,8 @@ WhiteLevel = Annotated[float | None, typer.Option("--white-level", help="Smalles
 Shape = Annotated[str, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")]
 Dtype = Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")]
 Told = Annotated[
-    Path | None, typer.Option("--test", help="TEST.toml whose [scale] and [setup] count instead of those kept.")
+    Path | None,
+    typer.Option("--test", help="TEST.toml whose [scale], [setup] and [probes] count instead of those kept."),
 ]
 Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")]
 

@@ -12,12 +12,13 @@ import numpy as np
 from rgbmidic.report import figures
 from rgbmidic.report.courses import course_figure, status_figure, uncertainty_figure
 from rgbmidic.report.facts import Course, NoiseFloor, noise_floor
+from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
 from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
 from rgbmidic.report.style import embedded
-from rgbmidic.results import QUANTITIES, Physical, Result
+from rgbmidic.results import QUANTITIES, Physical, Result, probes_of, read_histories
 from rgbmidic.results.files import check_file, write_complete
-from rgbmidic.settings import SetupSettings, TestSettings, read_section
+from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,7 +52,7 @@ def write_report(
     out
         HTML file to write; it appears once it is complete.
     settings
-        Of which ``[setup]`` and ``[scale]`` stand in place of those that were kept; None: those kept.
+        Of which ``[setup]``, ``[scale]`` and ``[probes]`` stand in place of those that were kept; None: those kept.
     frames
         Indices of the frames of which maps are shown; None: three deformed ones, evenly spaced, the last one included,
         and the one that has moved farthest.
@@ -69,8 +70,9 @@ def write_report(
     check_file(out, overwrite=overwrite)
     kept = result.provenance.get("settings", {}).get("setup", {})
     setup = read_section(SetupSettings, "setup", kept) if settings is None else settings.setup
+    probes = probes_of(result) if settings is None else settings.probes
     told = Physical.of(result, None if settings is None else settings.scale)
-    text = _Report.of(told, setup, frames).page().html
+    text = _Report.of(told, setup, probes, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))
 
 
@@ -80,18 +82,19 @@ class _Report:
 
     told: Physical
     setup: SetupSettings
+    probes: ProbeSettings
     course: Course
     floor: NoiseFloor | None
     shown: tuple[int, ...]
 
     @classmethod
-    def of(cls, told: Physical, setup: SetupSettings, frames: Sequence[int] | None) -> _Report:
+    def of(cls, told: Physical, setup: SetupSettings, probes: ProbeSettings, frames: Sequence[int] | None) -> _Report:
         deformed = figures.shown_frames(told.result)
         for frame in frames or ():
             told.result.frame(frame)  # what is wrong with one is told before the long work
         course = Course.of(told, figures.spread(deformed, _MOST))
         shown = tuple(sorted({*figures.spread(deformed, _KEY), course.farthest})) if frames is None else tuple(frames)
-        return cls(told=told, setup=setup, course=course, floor=noise_floor(told), shown=shown)
+        return cls(told=told, setup=setup, probes=probes, course=course, floor=noise_floor(told), shown=shown)
 
     def page(self) -> Page:
         """The page, section by section."""
@@ -104,6 +107,7 @@ class _Report:
         page.table(("set-up", ""), list(hardware_rows(self.told, self.setup)))
         page.table(("analysis", ""), list(analysis_rows(self.told, self.floor)))
         self._fields(page)
+        self._probes(page)
         self._uncertainty(page)
         self._lights(page)
         self._quality(page)
@@ -184,6 +188,19 @@ class _Report:
         caption = "over the test: median of the nodes (line) and 5 to 95 % of them (band)"
         self._show(page, course_figure(told, self.course), f"displacement and strain {caption}")
 
+    def _probes(self, page: Page) -> None:
+        """What the probes of the settings read."""
+        if not self.probes.places:
+            return
+        page.heading("Probes")
+        page.table(("probe", "place in px"), [(kind, _numbers(place)) for kind, place in self.probes.places])
+        histories = read_histories(self.told.result, self.probes, scale=self.told.scale)
+        self._show(
+            page, history_figure(histories), "what the probes read; the bands are two standard uncertainties wide"
+        )
+        if histories.remarks:
+            page.bullets(histories.remarks)
+
     def _uncertainty(self, page: Page) -> None:
         told, length = self.told, self.told.units.length
         page.heading("Uncertainty")
@@ -256,3 +273,7 @@ class _Report:
     @staticmethod
     def _show(page: Page, figure: Figure, caption: str) -> None:
         page.picture(embedded(figure), caption)
+
+
+def _numbers(place: Sequence[float]) -> str:
+    return ", ".join(f"{number:g}" for number in place)

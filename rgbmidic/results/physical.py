@@ -13,7 +13,7 @@ import numpy as np
 
 from rgbmidic.fields import MEASURES, NodalCovariance, Strain, StrainGauges, Units, strain_of_gradient
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.measures import frame_times, units_of
+from rgbmidic.results.measures import frame_times, scale_of, units_of
 from rgbmidic.results.quantities import QUANTITIES, Quantity
 from rgbmidic.results.record import FrameRecord
 from rgbmidic.results.result import Result
@@ -52,6 +52,8 @@ class Physical:
     ----------
     result
         The result.
+    scale
+        Its ``[scale]``, or what stands in place of it.
     units
         Of lengths and times.
     times : ndarray, shape (T,)
@@ -61,6 +63,7 @@ class Physical:
     """
 
     result: Result
+    scale: ScaleSettings
     units: Units
     times: FloatArray
     mesh: Tri3Mesh
@@ -68,11 +71,12 @@ class Physical:
     @classmethod
     def of(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """With the scale and the times that the result knows, or with another ``[scale]`` in place of its own."""
+        scale = scale_of(result) if scale is None else scale
         times, units = frame_times(result, scale), units_of(result, scale)
         mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
         if times is None or not (np.diff(times) > 0).all():
             times, units = np.arange(len(result), dtype=np.float64), replace(units, timed=False)
-        return cls(result=result, units=units, times=times, mesh=mesh)
+        return cls(result=result, scale=scale, units=units, times=times, mesh=mesh)
 
     @cached_property
     def gauges(self) -> StrainGauges:
