@@ -81,7 +81,7 @@ def status_figure(told: Physical, course: Course) -> Figure:
         axes[0].legend(loc="lower left", frameon=True)
         finish_plot(axes[0], unit, "share of the nodes", whole=not told.units.timed)
 
-    return draw_figure(draw, count=1, aspect=0.5, beside=GAP)
+    return draw_figure(draw, count=1, aspect=0.35, beside=GAP)
 
 
 def _times(told: Physical, course: Course) -> tuple[FloatArray, str]:

@@ -146,7 +146,7 @@ class _Report:
         if lost > _LOST:
             yield f"{lost:.0%} of the nodes are not measured"
         if gaps := result.provenance.get("lost_frames"):
-            yield f"{gaps} frames are missing between those that the camera kept"
+            yield f"frames that the camera lost between those it kept: {gaps}"
         yield from self._doubts()
         if told.units.mm_per_pixel is None:
             yield "no image scale is stated (`scale.mm_per_pixel`): lengths are in px"
@@ -205,6 +205,10 @@ class _Report:
         told, length = self.told, self.told.units.length
         page.heading("Uncertainty")
         page.text(f"Noise floor: {noise_words(told, self.floor)}.")
+        if told.units.mm_per_pixel_std:
+            page.text(
+                "The uncertainty of the image scale is part of that of every length in mm, the same in all of them."
+            )
         names = [*(f"{name}_std" for name in ("u", "v", "exx", "eyy", "exy"))]
         rows = [(name, length if name[0] in "uv" else "1", *self._spread_words(name)) for name in names]
         page.table(("standard uncertainty", "unit", "5 % of the nodes below", "median", "95 % below"), rows)
@@ -250,7 +254,10 @@ class _Report:
             page.table(("frame", "what befell it"), reasons[:_LISTED])
             if len(odd) > _LISTED:
                 page.text(f"And {len(odd) - _LISTED} more.")
-        self._show(page, status_figure(self.told, self.course), "how the nodes ended")
+        if self.course.shares[:, 0].min() < 1:
+            self._show(page, status_figure(self.told, self.course), "how the nodes ended")
+        else:
+            page.text("Every node is measured in every frame.")
         self._show(page, figures.convergence_figure(result), "convergence: largest motion of a node in each iteration")
         self._show(page, figures.map_figure(result, frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
 

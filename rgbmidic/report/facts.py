@@ -156,7 +156,9 @@ def _half_width(picture: FloatArray) -> float | None:
     reach = min(int(2 * _BACKGROUND), *(side - 1 for side in texture.shape))
     lag = np.arange(-reach, reach + 1)
     distance = np.hypot(lag[:, None], lag).round().astype(int).ravel()
-    profile = np.bincount(distance, weights=product[np.ix_(lag, lag)].ravel()) / np.bincount(distance) / product[0, 0]
+    pairs = np.multiply.outer(*(1 - np.abs(lag) / side for side in texture.shape))
+    mean = product[np.ix_(lag, lag)] / pairs / product[0, 0]
+    profile = np.bincount(distance, weights=mean.ravel()) / np.bincount(distance)
     below = np.flatnonzero(profile < 0.5)
     if not below.size:
         return None

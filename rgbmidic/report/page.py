@@ -14,10 +14,10 @@ h1{line-height:1.2}h2{margin-top:2.2rem;border-bottom:1px solid #ccc}
 .table{overflow-x:auto}table{border-collapse:collapse;font-size:13px;margin:1rem 0}
 td,th{border:1px solid #ccc;padding:.25rem .5rem;text-align:left;vertical-align:top;overflow-wrap:anywhere}
 td:first-child,th{overflow-wrap:normal}th{background:#f3f3f3}
-img{max-width:100%}figcaption{color:#555;font-size:13px}figure{margin:1rem 0}
+img{max-width:100%;max-height:54rem}figcaption{color:#555;font-size:13px}figure{margin:1rem 0}
 @media print{@page{size:A4;margin:14mm}body{font-size:10pt;max-width:none;margin:0;padding:0}table{font-size:8.5pt}
 figure,tr,li{break-inside:avoid}h1,h2{break-after:avoid}thead{display:table-header-group}
-img{max-height:235mm;width:auto}.table{overflow:visible}}"""
+img{max-height:112mm}.table{overflow:visible}}"""
 
 
 class Page:

@@ -130,10 +130,11 @@ def noise_words(told: Physical, floor: NoiseFloor | None) -> str:
 
 
 def settings_rows(settings: Mapping[str, Mapping[str, Any]]) -> Rows:
-    """Every key of the settings with its value."""
+    """Every key of the settings that says something, with its value; the words of ``[setup]`` stand elsewhere."""
     for section, keys in settings.items():
         for key, value in keys.items():
-            yield f"{section}.{key}", _short(value)
+            if section != "setup" and value != []:
+                yield f"{section}.{key}", _short(value)
 
 
 def _short(value: Any) -> str:
