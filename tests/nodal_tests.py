@@ -35,7 +35,7 @@ COVARIANCE = NodalCovariance.from_mesh(MESH)
 
 def nodal_noise(random: np.random.Generator, frames: int) -> FloatArray:
     """Errors (T, N, 2) of unit standard deviation, independent between frames."""
-    return np.einsum("ij,tjc->tic", _ROOT, random.normal(size=(frames, len(MESH.nodes), 2)))
+    return np.asarray(_ROOT @ random.normal(size=(frames, len(MESH.nodes), 2)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -138,7 +138,7 @@ class Mean:
     def _over(cls, covariance: NodalCovariance, name: str, grid: FloatArray) -> Mean:
         places = Places.of(covariance.mesh, grid)
         if places.inside.mean() < _LEAST:
-            replace(places, inside=np.zeros(len(grid), dtype=bool)).check(name)
+            raise InputError(f"half or more of {name} is outside {places.where}")
         return cls._of(name, covariance, places, _LEAST)
 
     def histories(self, nodal: Nodal) -> list[History]:

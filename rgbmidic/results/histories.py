@@ -137,6 +137,8 @@ def read_histories(
     there = np.flatnonzero(result.finished)
     if not len(there):
         raise InputError(f"no frame of {result.path} is measured yet")
+    if probes.window > len(there):
+        raise InputError(f"rates over a window of {probes.window} frames need as many; {len(there)} are measured")
     times = None if times is None else times[there]
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=result.nodes, elements=result.elements))
     made = _made(covariance, probes)
