@@ -146,8 +146,8 @@ def test_motion_within_the_exposure_is_told_where_it_blurs(tmp_path: Path) -> No
 
 
 def test_the_rigid_part_is_told_and_taken_off(result: Result) -> None:
-    probes = ProbeSettings(gauges=((20, 15, 90, 60),), points=(PLACE,), rigid="remove")
-    found, plain = (read_histories(result, replace(probes, rigid=rigid)) for rigid in ("remove", "none"))
+    probes = ProbeSettings(gauges=((20, 15, 90, 60),), points=(PLACE,), rigid_motion="remove")
+    found, plain = (read_histories(result, replace(probes, rigid_motion=rigid)) for rigid in ("remove", "none"))
     middle = MESH.nodes[:, 0].mean() - 10
     expected = [0.05 * (2 * n + 0.01 * (n / 10) ** 2 * middle) for n in NUMBERS]
     np.testing.assert_allclose(np.delete(found["rigid_u"].values, 5), np.delete(expected, 5))
