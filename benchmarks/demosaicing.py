@@ -1,18 +1,19 @@
 """What each demosaicing method costs in displacement error, with and without reflections, on scenes with exact truth.
 
-    python benchmarks/demosaicing.py [--study main] [--seeds 11 12 13] [--wrinkles 0.025] [--plates-only]
-    python benchmarks/demosaicing.py --study shifts|phases|blur|aberration|coloured
-    python benchmarks/demosaicing.py --speckles 3 4.2 6 8 --plates-only --figure docs/figures/demosaicing.png
+    python benchmarks/demosaicing.py [--study main] [--seeds 11 12 13] [--wrinkles 0.025 0.05 0.1] [--plates-only]
+    python benchmarks/demosaicing.py --study shifts --wrinkles 0.05 --seeds 31 --only "0.25 px" "0.5 px"
+    python benchmarks/demosaicing.py --study phases|blur|aberration|coloured
     python benchmarks/demosaicing.py --study speed
 
 Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, crosstalk 10 to 16 % between neighbours,
 specular peak 1.5 times an ideal white. Three lights are solved together with the true crosstalk, TRI3 of 25 px started
-within half a pixel of the truth; errors over the field without its border element. The paint's wrinkles are 25 um
-apart; 50 or 100 um make its reflection sparkle at the scale of the pixel. Each is traced with as many rays as its
-reflection needs.
+within half a pixel of the truth; errors over the pixels of the field without its border element. Wrinkles of the paint
+25 um apart give a smooth reflection, 50 um one that sparkles at the scale of the pixel, 100 um one with coarser spots.
+Each is traced with as many rays as its reflection needs.
 
 The 3-CCD camera is the ideal: all three colours at every pixel, the same solve. One sample instead of three costs a
-factor of sqrt(3) in noise; what is above that is the demosaicing's doing. The studies vary one thing at a time: the
+factor of sqrt(3) in noise; what is above that is the demosaicing's doing, and each cell ends with the ratio to it. The
+studies vary one thing at a time: the
 shift, the Bayer phase, the lens blur, the lens's lateral colour aberration (calibrated, and undone after the
 separation), and a specimen whose colours show partly or wholly different textures.
 """
@@ -24,7 +25,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from scipy.ndimage import map_coordinates
 
 from rgbmidic._kernels.threads import threads
 from rgbmidic.correlation import correlate
+from rgbmidic.fields import at_pixels
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
@@ -159,14 +161,17 @@ class Error:
         missing = max(e.unmeasured for e in errors)
         return cls((float(x), float(y)), float(scatter), float(rms), missing, float(image))
 
-    def text(self, case: Case) -> str:
-        """As in the table: bias x/y, scatter for plates, rms for spheres."""
+    def size(self, case: Case) -> float:
+        """What a case is judged by: scatter for plates, rms for spheres."""
+        return self.scatter if case.is_plate else self.rms
+
+    def text(self, case: Case, ideal: float) -> str:
+        """As in the table: bias x/y, scatter for plates, rms for spheres; over the ideal."""
         flag = "" if self.unmeasured < 0.001 else f" ({self.unmeasured:.1%} not measured)"
         if case.coloured:
             flag += f"; image {self.image:.1%}"
-        if case.is_plate:
-            return f"{self.bias[0]:+.4f}/{self.bias[1]:+.4f}, {self.scatter:.4f}{flag}"
-        return f"{self.rms:.4f}{flag}"
+        bias = f"{self.bias[0]:+.4f}/{self.bias[1]:+.4f}, " if case.is_plate else ""
+        return f"{bias}{self.size(case):.4f}, {self.size(case) / ideal:.2f}{flag}"
 
 
 def painted(scene: Scene, wrinkles: float) -> Scene:
@@ -243,48 +248,33 @@ def measured(study: str, index: int, contender: Contender, *, wrinkles: float, s
         normalise=contender.normalise,
         statistics=not contender.masks,
     )
-    error = field_error(solution.nodes, solution.elements, solution.displacement, exact, (margin + 25, far - 25))
-    return replace(error, image=float(np.sqrt(np.nanmean(image**2))))
-
-
-def field_error(
-    nodes: FloatArray, elements: Any, displacement: FloatArray, exact: FloatArray, inside: tuple[int, int]
-) -> Error:
-    """Error at ten points of every element that lies inside the square."""
-    corners = nodes[elements]
-    kept = ((corners >= inside[0] - 1e-6) & (corners <= inside[1] + 1e-6)).all(axis=(1, 2))
-    shares = np.array([(a, b, 4 - a - b) for a in range(5) for b in range(5 - a)]) / 4
-    shares = shares * 0.9 + 0.1 / 3
-    points = np.einsum("sn,enc->esc", shares, corners[kept])
-    found = np.einsum("sn,enc->esc", shares, displacement[elements[kept]])
-    y, x = points[..., 1].ravel(), points[..., 0].ravel()
-    wanted = np.stack([map_coordinates(one, (y, x), order=1) for one in exact], axis=1)
-    error = found.reshape(-1, 2) - wanted
-    bias = np.nanmean(error, axis=0)
-    missing = float(np.isnan(error).any(axis=1).mean())
-    scatter, rms = np.sqrt(np.nanmean((error - bias) ** 2)), np.sqrt(np.nanmean(error**2))
-    return Error((float(bias[0]), float(bias[1])), float(scatter), float(rms), missing, 0.0)
+    mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
+    inside = np.s_[:, margin + 25 : far - 24, margin + 25 : far - 24]
+    error = (at_pixels(mesh, solution.displacement, (size, size)) - exact)[inside].reshape(2, -1)
+    bias = np.nanmean(error, axis=1)
+    scatter, rms = np.sqrt(np.nanmean((error - bias[:, None]) ** 2)), np.sqrt(np.nanmean(error**2))
+    missing, of_image = float(np.isnan(error).any(axis=0).mean()), float(np.sqrt(np.nanmean(image**2)))
+    return Error((float(bias[0]), float(bias[1])), float(scatter), float(rms), missing, of_image)
 
 
 def table(
-    study: str, wrinkles: float, seeds: list[int], speckle: float, contenders: list[Contender]
-) -> list[list[Error]]:
-    """Print the table of one study, paint and speckle; errors by case and contender."""
+    study: str, wrinkles: float, seeds: list[int], speckle: float, contenders: list[Contender], only: list[str]
+) -> None:
+    """Print the table of one study, paint and speckle, of the cases with a part of their name among `only`."""
     print(f"\n{study}: wrinkles {1000 * wrinkles:g} um, speckle {speckle:g} px, seeds {seeds}\n")
     print("| scene | " + " | ".join(c.name for c in contenders) + " | 3-CCD × √3 |")
     print("|---" * (len(contenders) + 2) + "|")
-    rows = []
     for index, case in enumerate(STUDIES[study]):
+        if not any(part in case.name for part in only):
+            continue
         row = [
             Error.mean([measured(study, index, c, wrinkles=wrinkles, seed=seed, speckle=speckle) for seed in seeds])
             for c in contenders
         ]
-        ideal = row[-1].scatter if case.is_plate else row[-1].rms
-        cells = [error.text(case) for error in row]
-        print(f"| {case.name} | " + " | ".join(cells) + f" | {ideal * 3**0.5:.4f} |", flush=True)
-        rows.append(row)
+        ideal = row[-1].size(case) * 3**0.5
+        cells = [error.text(case, ideal) for error in row]
+        print(f"| {case.name} | " + " | ".join(cells) + f" | {ideal:.4f} |", flush=True)
         rendered.cache_clear()
-    return rows
 
 
 def speed(sizes: tuple[int, ...] = (1024, 2048), repeats: int = 5) -> None:
@@ -317,48 +307,16 @@ def speed(sizes: tuple[int, ...] = (1024, 2048), repeats: int = 5) -> None:
         print(f"| {size} | " + " | ".join(f"{ns:.0f}" for ns in best) + " |", flush=True)
 
 
-def figure(path: Path, results: dict[float, list[list[Error]]], contenders: list[Contender]) -> None:
-    """Bias and scatter of each method over the size of the speckle, with and without reflection."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    sizes = sorted(results)
-    panels = [(-1, "without reflection"), (0, "in green's reflection")]
-    fig, axes = plt.subplots(2, 2, figsize=(9, 6.5), sharex=True, sharey="row", layout="constrained")
-    for column, (index, title) in enumerate(panels):
-        for n, contender in enumerate(contenders):
-            errors = [results[size][index][n] for size in sizes]
-            style: dict[str, Any] = (
-                {"lw": 2.5, "color": "black"} if contender.method == "reflection-aware" else {"lw": 1.2}
-            )
-            style |= {"ls": "--", "color": "grey"} if contender.method == "3-CCD" else {}
-            bias = [float(np.abs(e.bias).max()) for e in errors]
-            label = contender.name if column == 0 else None
-            axes[0, column].plot(sizes, bias, marker="o", label=label, **style)
-            axes[1, column].plot(sizes, [e.scatter for e in errors], marker="o", **style)
-        axes[0, column].set_title(f"plate {title}")
-        axes[1, column].set_xlabel("speckle, px")
-    for axis, label in zip(axes[:, 0], ("largest |bias|, px", "scatter, px"), strict=True):
-        axis.set_ylabel(label)
-    for axis in axes.flat:
-        axis.set_yscale("log")
-        axis.grid(alpha=0.3)
-    fig.legend(loc="outside lower center", ncols=4, fontsize=8)
-    fig.savefig(path, dpi=110)
-
-
 def main() -> None:
-    """Read the command line, print the tables, write the figure."""
+    """Read the command line, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--study", choices=(*STUDIES, "speed"), default="main")
     parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12, 13])
-    parser.add_argument("--wrinkles", type=float, default=0.025, help="their spacing in mm")
+    parser.add_argument("--wrinkles", type=float, nargs="+", default=[0.025], help="their spacing in mm")
     parser.add_argument("--speckles", type=float, nargs="+", default=[4.2])
     parser.add_argument("--plates-only", action="store_true", help="leave the spheres out")
     parser.add_argument("--methods", nargs="+", help="of CONTENDERS; the ideal 3-CCD is always there")
-    parser.add_argument("--figure", type=Path)
+    parser.add_argument("--only", nargs="+", default=[""], help="cases by a part of their name")
     arguments = parser.parse_args()
     if arguments.study == "speed":
         speed()
@@ -366,11 +324,8 @@ def main() -> None:
     if arguments.plates_only:
         STUDIES[arguments.study] = [case for case in STUDIES[arguments.study] if case.is_plate]
     chosen = [c for c in CONTENDERS if not arguments.methods or c.method in (*arguments.methods, "3-CCD")]
-    results = {
-        size: table(arguments.study, arguments.wrinkles, arguments.seeds, size, chosen) for size in arguments.speckles
-    }
-    if arguments.figure:
-        figure(arguments.figure, results, chosen)
+    for wrinkles, speckle in product(arguments.wrinkles, arguments.speckles):
+        table(arguments.study, wrinkles, arguments.seeds, speckle, chosen, arguments.only)
 
 
 if __name__ == "__main__":

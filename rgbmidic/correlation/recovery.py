@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
+from rgbmidic._kernels.correlation import curvature_deviation, interpolate_nodal
 from rgbmidic.correlation.assembly import factorise
 from rgbmidic.mesh import PixelMap, Tri3Mesh
-from rgbmidic.mesh.quadratic_fit import curved, quadratic_fit
+from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["Recovery", "linear_fit_offset", "mass_matrix"]
@@ -70,7 +71,12 @@ class Recovery:
         carried = sum(
             part[:, None] * (operator @ fitted) for part, operator in zip(offset.T, self.curvature, strict=True)
         )
-        return curved(mesh, pixels, -np.asarray(carried), self.curvature, fitted)
+        second = np.stack([operator @ fitted for operator in self.curvature], axis=-1)
+        geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+        linear, bent = np.empty((2, 2, pixels.rows.size), dtype=np.float32)
+        interpolate_nodal(np.asarray(carried), mesh.elements, *geometry, linear)
+        curvature_deviation(mesh.nodes, mesh.elements, second, *geometry, bent)
+        return np.asarray(bent - linear)
 
 
 def linear_fit_offset(mesh: Tri3Mesh) -> FloatArray:

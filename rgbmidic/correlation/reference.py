@@ -119,7 +119,9 @@ class Reference:
             colouring=NodeColouring.from_mesh(mesh),
             material=mesh,
             linear_offset=linear_fit_offset(mesh),
-            unfitted=unfitted_share(pixels, assembly, samples[1] * used, samples[2] * used, block_side(mesh.size)),
+            unfitted=unfitted_share(
+                pixels, assembly, samples[1] * used, samples[2] * used, block_side(pixels, mesh.size)
+            ),
             images=ready,
             weights=usable,
             values=samples[0],

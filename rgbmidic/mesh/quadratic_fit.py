@@ -11,12 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from rgbmidic._kernels.correlation import curvature_deviation, interpolate_nodal
 from rgbmidic.mesh.pixel_map import PixelMap
 from rgbmidic.mesh.tri3 import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["TERMS", "curved", "quadratic_fit"]
+__all__ = ["TERMS", "blended", "quadratic_fit"]
 
 Index = npt.NDArray[np.intp]
 
@@ -78,16 +77,23 @@ def quadratic_fit(
     return tuple(operators)
 
 
-def curved(
-    mesh: Tri3Mesh, pixels: PixelMap, values: FloatArray, curvature: Sequence[sp.csr_matrix], of: FloatArray
-) -> FloatImage:
-    """Nodal values (N, 2) between the nodes, as curved as the `curvature` operators say `of` (N, 2) is; (2, P)."""
-    second = np.stack([operator @ of for operator in curvature], axis=-1)
-    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
-    linear, bent = np.empty((2, 2, pixels.rows.size), dtype=np.float32)
-    interpolate_nodal(values, mesh.elements, *geometry, linear)
-    curvature_deviation(mesh.nodes, mesh.elements, second, *geometry, bent)
-    return np.asarray(linear + bent)
+def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray]) -> FloatImage:
+    """The nodes' polynomials at the owned pixels, each counting as its shape function does; continuous, (C, P).
+
+    `polynomials` are the values (N, C) of each of `TERMS`.
+    """
+    value, x, y, xx, xy, yy = polynomials
+    element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
+    out = np.zeros((value.shape[1], pixels.rows.size), dtype=np.float32)
+    for corner in range(3):
+        node = mesh.elements[element, corner]
+        constant, slope_x, slope_y = pixels.barycentric[element, corner].T
+        share = constant + slope_x * pixels.local_x + slope_y * pixels.local_y
+        dx, dy = pixels.columns - mesh.nodes[node, 0], pixels.rows - mesh.nodes[node, 1]
+        for c in range(len(out)):
+            bent = xx[node, c] * dx * dx / 2 + xy[node, c] * dx * dy + yy[node, c] * dy * dy / 2
+            out[c] += share * (value[node, c] + x[node, c] * dx + y[node, c] * dy + bent)
+    return out
 
 
 def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:

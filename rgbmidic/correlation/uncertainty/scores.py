@@ -43,7 +43,7 @@ def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
     """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P)."""
     reference = residual.reference
     used = np.asarray(weights.any(axis=0), dtype=np.float32)
-    side = block_side(reference.mesh.size)
+    side = block_side(reference.pixels, reference.mesh.size)
     x, y, information, _ = _score_sums(residual, weights, side).sum(axis=0)
     index, shape = reference.pixels.blocks(side)
     count = np.zeros((1, information.size), dtype=np.float32)
