@@ -271,7 +271,7 @@ def history(
     stated = probes_of(result) if settings is None else settings.probes
     histories = read_histories(
         result,
-        _with_probes(stated, given, measure=measure, window=window, rigid=rigid),
+        _with_probes(stated, given, measure=measure, window=window, rigid_motion=rigid),
         scale=None if settings is None else settings.scale,
         channels=None if channels is None else Channels.read(channels),
         offset=offset,

@@ -310,7 +310,7 @@ class ProbeSettings:
         Strain measure of the strain gauges.
     window
         Frames that velocities, accelerations and strain rates are taken over; 0: none are.
-    rigid
+    rigid_motion
         ``"tell"``: shift and rotation of the measured field as a whole are told beside the probes; ``"remove"``: they
         are also taken off the displacements.
     """
@@ -324,7 +324,7 @@ class ProbeSettings:
     strain_gauges: _Place3 = ()
     measure: Literal["green-lagrange", "hencky", "biot", "engineering"] = "green-lagrange"
     window: int = _bounded(0, at_least=0)
-    rigid: Literal["none", "tell", "remove"] = "none"
+    rigid_motion: Literal["none", "tell", "remove"] = "none"
 
     def __post_init__(self) -> None:
         _check_bounds(self, "probes")
@@ -340,7 +340,7 @@ class ProbeSettings:
         return [
             (entry.name[:-1], place)
             for entry in fields(self)
-            if entry.name not in ("measure", "window", "rigid")
+            if entry.name not in ("measure", "window", "rigid_motion")
             for place in getattr(self, entry.name)
         ]
 

@@ -70,11 +70,13 @@ class Places:
         """
         if not self.inside.all():
             x, y = self.points[~self.inside][0]
-            (left, top), (right, bottom) = self.mesh.nodes.min(axis=0), self.mesh.nodes.max(axis=0)
-            raise InputError(
-                f"{what} at ({x:g}, {y:g}) px is outside the region that was measured, which lies within x {left:g} to "
-                f"{right:g}, y {top:g} to {bottom:g}"
-            )
+            raise InputError(f"{what} at ({x:g}, {y:g}) px is outside {self.where}")
+
+    @property
+    def where(self) -> str:
+        """The region and its bounds, in words."""
+        (left, top), (right, bottom) = self.mesh.nodes.min(axis=0), self.mesh.nodes.max(axis=0)
+        return f"the region that was measured, which lies within x {left:g} to {right:g}, y {top:g} to {bottom:g}"
 
     def mean(self) -> FloatArray:
         """Weight (N,) of every node in the mean over the points that are inside."""

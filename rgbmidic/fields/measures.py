@@ -152,7 +152,7 @@ def _told(measure: str, tensor: FloatArray, covariance: FloatArray, shape: tuple
         "equivalent": equivalent,
         "equivalent_std": equivalent_std,
     }
-    return Strain(measure=measure, **{name: part.reshape(*shape, *part.shape[1:]) for name, part in parts.items()})
+    return Strain(measure=measure, **{name: part.reshape((*shape, *part.shape[1:])) for name, part in parts.items()})
 
 
 def _deviation(direction: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.fields.covariance import NodalCovariance
 from rgbmidic.fields.locate import Places
-from rgbmidic.fields.measures import MEASURES
+from rgbmidic.fields.measures import MEASURES, strain_of_gradient
 from rgbmidic.fields.strain import StrainGauges
 from rgbmidic.typing import FloatArray
 
@@ -138,7 +138,7 @@ class Mean:
     def _over(cls, covariance: NodalCovariance, name: str, grid: FloatArray) -> Mean:
         places = Places.of(covariance.mesh, grid)
         if places.inside.mean() < _LEAST:
-            replace(places, inside=np.zeros(len(grid), dtype=bool)).check(name)
+            raise InputError(f"half or more of {name} is outside {places.where}")
         return cls._of(name, covariance, places, _LEAST)
 
     def histories(self, nodal: Nodal) -> list[History]:
@@ -272,22 +272,14 @@ class StrainGauge:
     def histories(self, nodal: Nodal) -> list[History]:
         """exx, eyy, exy, e1, e2, the direction of e1 and the von Mises equivalent."""
         rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
-        strains = [self.gauges.strain(*row, measure=self.measure) for row in rows]
-        names = ("exx", "eyy", "exy", "e1", "e2", "direction", "equivalent")
-        values, std = (
-            np.array([np.concatenate([part[0] for part in parts]) for parts in ends], dtype=np.float64)
-            for ends in (
-                [(s.components, s.principal, s.direction_deg[:, None], s.equivalent[:, None]) for s in strains],
-                [
-                    (s.components_std, s.principal_std, s.direction_std_deg[:, None], s.equivalent_std[:, None])
-                    for s in strains
-                ],
-            )
-        )
-        units = ["deg" if name == "direction" else "" for name in names]
+        gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
+        s = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
+        values = [*s.components.T, *s.principal.T, s.direction_deg, s.equivalent]
+        stds = [*s.components_std.T, *s.principal_std.T, s.direction_std_deg, s.equivalent_std]
+        units = {"exx": "", "eyy": "", "exy": "", "e1": "", "e2": "", "direction": "deg", "equivalent": ""}
         return [
-            History(name=f"{self.name}_{name}", unit=unit, values=values[:, i], std=std[:, i])
-            for i, (name, unit) in enumerate(zip(names, units, strict=True))
+            History(name=f"{self.name}_{name}", unit=unit, values=value, std=std)
+            for (name, unit), value, std in zip(units.items(), values, stds, strict=True)
         ]
 
 

@@ -123,13 +123,14 @@ def _fit(
         usable = (known.sum(axis=0) > degree + 1) & _within(seen)
     scale = float(np.abs(shift).max())
     basis = (shift / scale)[:, None] ** np.arange(degree + 1)
-    normal = np.einsum("ti,tj,tn->nij", basis, basis, known * 1.0)
+    pairs = (basis[:, :, None] * basis[:, None]).reshape(len(shift), -1)
+    normal = (known.T @ pairs).reshape(-1, degree + 1, degree + 1)
     normal[~usable] = np.eye(degree + 1)
-    weights = np.einsum("nij,tj,tn->nit", np.linalg.inv(normal)[:, :3], basis, known * 1.0)
+    weights = np.linalg.inv(normal)[:, :3] @ basis.T * known.T[:, None]
     weights *= (np.array([1, 1, 2]) / scale ** np.arange(3))[:, None]
-    covariance = frame_covariance(np.where(known, std, 0), share, references)
-    found = np.einsum("nit,tn->in", weights, np.where(known, values, 0))
-    variance = np.einsum("nit,tsn,nis->in", weights, covariance, weights)
+    covariance = np.moveaxis(frame_covariance(np.where(known, std, 0), share, references), -1, 0)
+    found = (weights @ np.where(known, values, 0).T[:, :, None])[..., 0].T
+    variance = ((weights @ covariance) * weights).sum(axis=-1).T
     both = np.stack([found, np.sqrt(np.maximum(variance, 0))], axis=1)
     both[:, :, ~usable] = np.nan
     return both

@@ -129,7 +129,7 @@ def read_histories(
         A probe is outside the region, or measured in no frame; a window longer than the test; channels without a time
         of the frames, or none in common.
     """
-    if not probes.places and probes.rigid == "none":
+    if not probes.places and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
     scale = scale_of(result) if scale is None else scale
     times = frame_times(result, scale)
@@ -137,11 +137,13 @@ def read_histories(
     there = np.flatnonzero(result.finished)
     if not len(there):
         raise InputError(f"no frame of {result.path} is measured yet")
+    if probes.window > len(there):
+        raise InputError(f"rates over a window of {probes.window} frames need as many; {len(there)} are measured")
     times = None if times is None else times[there]
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=result.nodes, elements=result.elements))
     made = _made(covariance, probes)
     clock = result.number[there].astype(np.float64) if times is None else times
-    nodal, rigid, speed = _read(result, there, covariance, made, probes.rigid, clock)
+    nodal, rigid, speed = _read(result, there, covariance, made, probes.rigid_motion, clock)
     own = {probe.name: _checked(probe, part, result) for probe, part in zip(made, nodal, strict=True)}
     read = [*rigid, *(history for part in own.values() for history in part)]
     references = reference_frames(result)[there]

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
@@ -89,6 +90,8 @@ def still(index: int, noise: float, **values: Any) -> FrameRecord:
 
 def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(document, "embedded", lambda figure: style.embedded(figure, dpi=40))  # coarse: for the time
+    for name in ("brightness", "convergence", "map", "residual", "share"):  # have tests of their own
+        monkeypatch.setattr(document.figures, f"{name}_figure", lambda *_: Figure(facecolor="red"))
     image = np.random.default_rng(0).normal(1000, 100, (3, 80, 120))
     probes = ProbeSettings(points=((60.0, 40.0),))
     records = [still(index, 0.01) for index in range(3)]
