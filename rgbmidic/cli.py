@@ -147,9 +147,10 @@ def finish(
 
 def _conclude(result: Result, started: float, *, draw: bool) -> None:
     """Draw a finished result and tell what became of its frames; a failure where none of them is measured."""
-    from rgbmidic.report import remove_figures, write_figures
+    from rgbmidic.report import remove_figures, remove_report, write_figures
 
     remove_figures(result.path / "figures")
+    remove_report(result.path)
     if draw:
         write_figures(result, result.path / "figures")
     _print_summary(result, time.perf_counter() - started)
@@ -218,11 +219,11 @@ def report(
     partial: Partial = False,
 ) -> None:
     """Write the report of a test: one HTML page, to be read in any browser and printed."""
-    from rgbmidic.report import write_report
+    from rgbmidic.report import REPORT, write_report
     from rgbmidic.results import Result
     from rgbmidic.settings import read_test
 
-    file, settings = out or result / "report.html", None if test is None else read_test(test)
+    file, settings = out or result / REPORT, None if test is None else read_test(test)
     chosen = _whole_numbers(frames, "--frames") if frames else None
     opened = Result.open(result, partial=partial)
     write_report(opened, file, settings=settings, frames=chosen, overwrite=overwrite)

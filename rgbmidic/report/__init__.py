@@ -1,6 +1,6 @@
 """What is made of a finished result: figures, the pictures beside it, pages of text and pictures."""
 
-from rgbmidic.report.document import write_report
+from rgbmidic.report.document import REPORT, remove_report, write_report
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -18,6 +18,7 @@ from rgbmidic.report.style import save_figure
 
 __all__ = [
     "MAPS",
+    "REPORT",
     "Page",
     "brightness_figure",
     "convergence_figure",
@@ -26,6 +27,7 @@ __all__ = [
     "mask_figure",
     "reflection_figure",
     "remove_figures",
+    "remove_report",
     "residual_figure",
     "save_figure",
     "share_figure",

@@ -17,13 +17,16 @@ from rgbmidic.report.page import Page
 from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
 from rgbmidic.report.style import embedded
 from rgbmidic.results import QUANTITIES, Physical, Result, probes_of, read_histories
-from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.files import check_file, write_complete, writing
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["write_report"]
+__all__ = ["REPORT", "remove_report", "write_report"]
+
+REPORT = "report.html"
+"""Name of the report that lies in a result's folder."""
 
 _MOST = 400
 """Frames that the course of a test is drawn from at most: more lie closer than the dots of a page."""
@@ -74,6 +77,18 @@ def write_report(
     told = Physical.of(result, None if settings is None else settings.scale)
     text = _Report.of(told, setup, probes, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))
+
+
+def remove_report(folder: Path | str) -> None:
+    """Remove the report in the folder of a result that was measured anew: it would show another one.
+
+    Raises
+    ------
+    ResultError
+        It cannot be removed.
+    """
+    with writing(Path(folder) / REPORT):
+        (Path(folder) / REPORT).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

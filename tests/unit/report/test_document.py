@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.report import document, facts, style, write_report
+from rgbmidic.report import document, facts, remove_report, style, write_report
 from rgbmidic.results import FrameRecord, Physical, Result, ResultStore
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SetupSettings, TestSettings
 
@@ -192,6 +192,14 @@ def test_nothing_is_overwritten_or_left_behind(tmp_path: Path) -> None:
         write_report(result, tmp_path / "b.html", frames=[9])
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.html", "r"]
     assert page.read_text() == "mine"
+
+
+def test_the_report_of_an_earlier_run_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    for name in ("report.html", "mine.html"):
+        (tmp_path / name).touch()
+    remove_report(tmp_path)
+    remove_report(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.html"]
 
 
 @pytest.mark.parametrize("count", [5, 30])
