@@ -99,6 +99,7 @@ def run(
     ] = "",
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
+    timings: Annotated[bool, typer.Option("--timings", help="Keep and tell the time of each stage.")] = False,
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
@@ -120,6 +121,7 @@ def run(
             frames=chosen,
             workers=workers or None,
             scheduler=scheduler,
+            timings=timings,
             progress=progress,
         )
     if chosen is None:
@@ -551,8 +553,22 @@ def _print_summary(result: Result, seconds: float) -> None:
     for light, share in zip(result.lights, result.mean_share[deformed].T, strict=True):
         known = share[share == share]
         rows[light] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
+    if measured and (stages := _stages(result, deformed)):
+        rows["frame"] = stages
     for name, text in {**rows, "time": f"{seconds:.1f} s", "result": result.path}.items():
         print(f"{name:<8}{text}")
+
+
+def _stages(result: Result, frames: Sequence[int]) -> str:
+    """The mean time of a frame and what each stage takes of it; empty where nobody asked for it."""
+    from rgbmidic.timing import STAGES
+
+    known = [seconds for seconds in result.each("seconds", frames) if seconds[0] == seconds[0]]
+    if not known:
+        return ""
+    mean = sum(known) / len(known)
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in zip(STAGES, mean / mean.sum(), strict=True))
+    return f"{mean.sum():.2f} s: {shares}"
 
 
 if __name__ == "__main__":

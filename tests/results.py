@@ -9,6 +9,7 @@ import numpy as np
 
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import QUANTITIES, FrameRecord, Origin, Result, ResultStore
+from rgbmidic.timing import STAGES
 
 __all__ = ["LIGHTS", "MESH", "NODES", "make_origin", "make_result", "random_record"]
 
@@ -47,6 +48,7 @@ def random_record(seed: int) -> FrameRecord:
         "residual": random.uniform(10, 20, 3),
         "weight_share": random.uniform(0.5, 1, 3),
         "brightness": random.uniform(0.9, 1.1, (3, 2)),
+        "seconds": random.uniform(0, 1, len(STAGES)),
         "rigid": random.normal(0, 1, (3, seed % 3)),
         "weights_thumbnail": pictures[0],
         "reflection_thumbnail": pictures[1],

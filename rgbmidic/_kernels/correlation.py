@@ -15,61 +15,69 @@ from rgbmidic._kernels.interpolation import _FAST, PAD
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = [
+    "BLOCK",
+    "bring_back",
     "curvature_deviation",
     "element_hessian",
     "element_moments",
     "element_right_side",
     "element_vector",
     "interpolate_nodal",
-    "pull_back",
-    "warp",
 ]
 
 _SIXTH = np.float32(1.0 / 6.0)
+_HALF = np.float32(0.5)
+_TWO_THIRDS = np.float32(2.0 / 3.0)
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
+_LEVEL = np.float32(1e-7)
+BLOCK = 8
+"""Side (px) of the blocks of which `bring_back` is told whether all their weights are 1."""
+_LANES = 8
+"""Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
 
 @helper(forceinline=True, fastmath=_FAST)
-def _spline(coefficients, row, column, tx, ty):
-    """Cubic B-spline value at pixel (row, column) plus the fraction (tx, ty); `coefficients` carry the padding."""
+def _spline(k0, k1, k2, k3, i, tx, ty):
+    """Cubic B-spline value from the i-th to the third next coefficient of four rows, at the fraction (tx, ty)."""
     t2 = tx * tx
     t3 = t2 * tx
     x3 = t3 * _SIXTH
-    x0 = _SIXTH - np.float32(0.5) * (tx - t2) - x3
-    x1 = np.float32(2.0 / 3.0) - t2 + np.float32(0.5) * t3
+    x0 = _SIXTH - _HALF * (tx - t2) - x3
+    x1 = _TWO_THIRDS - t2 + _HALF * t3
     x2 = _ONE - x0 - x1 - x3
     t2 = ty * ty
     t3 = t2 * ty
     y3 = t3 * _SIXTH
-    y0 = _SIXTH - np.float32(0.5) * (ty - t2) - y3
-    y1 = np.float32(2.0 / 3.0) - t2 + np.float32(0.5) * t3
+    y0 = _SIXTH - _HALF * (ty - t2) - y3
+    y1 = _TWO_THIRDS - t2 + _HALF * t3
     y2 = _ONE - y0 - y1 - y3
-    r0 = np.uint64(row + (PAD - 1))
-    c0 = np.uint64(column + (PAD - 1))
-    r1, r2, r3 = r0 + np.uint64(1), r0 + np.uint64(2), r0 + np.uint64(3)
-    c1, c2, c3 = c0 + np.uint64(1), c0 + np.uint64(2), c0 + np.uint64(3)
-    k = coefficients
+    j, k, m = i + np.uint32(1), i + np.uint32(2), i + np.uint32(3)
     return (
-        y0 * (x0 * k[r0, c0] + x1 * k[r0, c1] + x2 * k[r0, c2] + x3 * k[r0, c3])
-        + y1 * (x0 * k[r1, c0] + x1 * k[r1, c1] + x2 * k[r1, c2] + x3 * k[r1, c3])
-        + y2 * (x0 * k[r2, c0] + x1 * k[r2, c1] + x2 * k[r2, c2] + x3 * k[r2, c3])
-        + y3 * (x0 * k[r3, c0] + x1 * k[r3, c1] + x2 * k[r3, c2] + x3 * k[r3, c3])
+        y0 * (x0 * k0[i] + x1 * k0[j] + x2 * k0[k] + x3 * k0[m])
+        + y1 * (x0 * k1[i] + x1 * k1[j] + x2 * k1[k] + x3 * k1[m])
+        + y2 * (x0 * k2[i] + x1 * k2[j] + x2 * k2[k] + x3 * k2[m])
+        + y3 * (x0 * k3[i] + x1 * k3[j] + x2 * k3[k] + x3 * k3[m])
     )
 
 
 @helper(forceinline=True)
-def _place(px, py, base_x, base_y, height, width):
-    """Pixel (column, row) and fraction of a local position, and whether it lies outside the image."""
-    cx = np.floor(px)
-    cy = np.floor(py)
-    column = base_x + np.int64(cx)
-    row = base_y + np.int64(cy)
-    tx = px - cx
-    ty = py - cy
-    beyond_x = column < 0 or column > width - 1 or (column == width - 1 and tx > _ZERO)
-    beyond_y = row < 0 or row > height - 1 or (row == height - 1 and ty > _ZERO)
-    return column, row, tx, ty, beyond_x or beyond_y
+def _steady(fraction, drift, most):
+    """How many of `most` pixels from one on lie between the same two rows (or move on by one column each), its
+    `fraction` changing by `drift` from pixel to pixel."""
+    if drift > _LEVEL:
+        return np.int64(min((_ONE - fraction) / drift, most)) + 1
+    if drift < -_LEVEL:
+        return np.int64(min(-fraction / drift, most)) + 1
+    return np.int64(most)
+
+
+@helper(forceinline=True)
+def _span(left, tx, ty, fxx, fyx, column, width):
+    """How many of `left` pixels lie side by side in the deformed image, too."""
+    most = np.float32(left)
+    side_by_side = min(_steady(tx, fxx - _ONE, most), _steady(ty, fyx, most))
+    return max(min(left, side_by_side, width - 1 - column), 1)
 
 
 @helper(forceinline=True)
@@ -103,70 +111,72 @@ def _element_motion(displacement, elements, barycentric, origin, e):
 @over_ranges("elements")
 @compiled(fastmath=_FAST)
 def element_right_side(
-    start, stop, coefficients, reference, gradient_x, gradient_y, weight, local_x, local_y, offsets, origin, elements,
+    start, stop, coefficients, reference, gradient_x, gradient_y, weight, runs, run_offsets, origin, elements,
     barycentric, displacement, out, sums,
 ):  # fmt: skip
     """Right-hand side of one light, element by element.
 
-    `coefficients` of the deformed image; `reference`, `gradient_x`, `gradient_y`, `weight` (P,) float32 and `local_x`,
-    `local_y` (P,) float32 per owned pixel; `origin` (E, 2) int64; `barycentric` (E, 3, 3) float64 with the shape
-    function ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2) float64.
-    `out` (E, 3, 2) receives ``sum w (f - g(x + u)) grad f phi``; `sums` (E, 3) receives ``sum w r^2``, ``sum w`` and
-    the number of pixels with weight whose position has left the image.
+    `coefficients` of the deformed image; `reference`, `gradient_x`, `gradient_y`, `weight` (P,) float32 per owned
+    pixel; `runs` (R, 4) int32, `run_offsets` (E + 1,) and `origin` (E, 2) as in `rgbmidic.mesh.PixelMap`; `barycentric`
+    (E, 3, 3) float64 with the shape function ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2)
+    float64. `out` (E, 3, 2) receives ``sum w (f - g(x + u)) grad f phi``; `sums` (E, 3) receives ``sum w r^2``,
+    ``sum w`` and the number of pixels with weight whose position has left the image.
     """
-    height = coefficients.shape[0] - 2 * PAD
-    width = coefficients.shape[1] - 2 * PAD
+    height, width = coefficients.shape[0] - 2 * PAD, coefficients.shape[1] - 2 * PAD
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
-        low_x = np.float32(-base_x)
-        low_y = np.float32(-base_y)
-        high_x = np.float32(width - 1 - base_x)
-        high_y = np.float32(height - 1 - base_y)
-        b00 = np.float32(barycentric[e, 0, 0])
-        b01 = np.float32(barycentric[e, 0, 1])
-        b02 = np.float32(barycentric[e, 0, 2])
-        b10 = np.float32(barycentric[e, 1, 0])
-        b11 = np.float32(barycentric[e, 1, 1])
-        b12 = np.float32(barycentric[e, 1, 2])
-        s00 = s01 = s02 = s10 = s11 = s12 = _ZERO
-        rest = total = lost = _ZERO
-        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-            lx = local_x[i]
-            ly = local_y[i]
-            px = ux + fxx * lx + fxy * ly
-            py = uy + fyx * lx + fyy * ly
-            w = weight[i]
-            inside = (px >= low_x) & (px <= high_x) & (py >= low_y) & (py <= high_y)
-            lost += _ZERO if inside or w == _ZERO else _ONE
-            w = w if inside else _ZERO
-            px = min(max(px, low_x), high_x)
-            py = min(max(py, low_y), high_y)
-            cx = np.floor(px)
-            cy = np.floor(py)
-            g = _spline(coefficients, base_y + np.int64(cy), base_x + np.int64(cx), px - cx, py - cy)
-            r = reference[i] - g
-            wr = w * r
-            rest += wr * r
-            total += w
-            wx = wr * gradient_x[i]
-            wy = wr * gradient_y[i]
-            l0 = b00 + b01 * lx + b02 * ly
-            l1 = b10 + b11 * lx + b12 * ly
-            s00 += wx * l0
-            s10 += wy * l0
-            s01 += wx * l1
-            s11 += wy * l1
-            s02 += wx
-            s12 += wy
-        out[e, 0, 0] = s00
-        out[e, 0, 1] = s10
-        out[e, 1, 0] = s01
-        out[e, 1, 1] = s11
-        out[e, 2, 0] = s02 - s00 - s01
-        out[e, 2, 1] = s12 - s10 - s11
-        sums[e, 0] = rest
-        sums[e, 1] = total
-        sums[e, 2] = lost
+        low_x, low_y = np.float32(-base_x), np.float32(-base_y)
+        high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
+        sx = sxx = sxy = sy = syx = syy = rest = total = lost = _ZERO
+        for run in range(run_offsets[e], run_offsets[e + 1]):
+            slot, left = np.int64(runs[run, 0]), np.int64(runs[run, 1])
+            x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
+            while left > 0:
+                px = ux + fxx * x + fxy * y
+                py = uy + fyx * x + fyy * y
+                if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
+                    lost += _ONE if weight[slot] != _ZERO else _ZERO
+                    slot, left, x = slot + 1, left - 1, x + _ONE
+                    continue
+                cx, cy = np.floor(px), np.floor(py)
+                column, row = base_x + np.int64(cx), base_y + np.int64(cy)
+                tx, ty = px - cx, py - cy
+                n = _span(left, tx, ty, fxx, fyx, column, width)
+                # whole vectors, the rest of the last one without weight, where memory goes on so far
+                filled = (n + _LANES - 1) // _LANES * _LANES
+                if slot + filled > reference.size or column + filled + 3 > width + 2 * PAD:
+                    filled = n
+                i0, r, c = np.uint64(slot), np.uint64(row + PAD - 1), np.uint64(column + PAD - 1)
+                k0, k1 = coefficients[r, c:], coefficients[r + np.uint64(1), c:]
+                k2, k3 = coefficients[r + np.uint64(2), c:], coefficients[r + np.uint64(3), c:]
+                pull_x = pull_y = turn_x = turn_y = _ZERO
+                for i in range(np.uint32(filled)):
+                    t = np.float32(np.int32(i))
+                    own = np.int32(i) < np.int32(n)
+                    g = _spline(k0, k1, k2, k3, i, tx + (fxx - _ONE) * t, ty + fyx * t)
+                    difference = reference[i0 + i] - g if own else _ZERO
+                    w = weight[i0 + i] if own else _ZERO
+                    pull = w * difference
+                    rest += pull * difference
+                    total += w
+                    along = pull * gradient_x[i0 + i]
+                    across = pull * gradient_y[i0 + i]
+                    pull_x += along
+                    pull_y += across
+                    turn_x += along * t
+                    turn_y += across * t
+                sx += pull_x
+                sy += pull_y
+                sxx += pull_x * x + turn_x
+                syx += pull_y * x + turn_y
+                sxy += pull_x * y
+                syy += pull_y * y
+                slot, left, x = slot + n, left - n, x + np.float32(n)
+        for a in range(3):
+            b0, b1, b2 = barycentric[e, a, 0], barycentric[e, a, 1], barycentric[e, a, 2]
+            out[e, a, 0] = b0 * sx + b1 * sxx + b2 * sxy
+            out[e, a, 1] = b0 * sy + b1 * syx + b2 * syy
+        sums[e, 0], sums[e, 1], sums[e, 2] = rest, total, lost
 
 
 @over_ranges("out")
@@ -233,21 +243,94 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
 
 
 @over_ranges("elements")
-@compiled()
-def warp(start, stop, coefficients, local_x, local_y, offsets, origin, elements, barycentric, displacement, out):
-    """Deformed image brought back to the reference: ``out`` (P,) float32 receives g(x + u), NaN outside the image."""
-    height = coefficients.shape[0] - 2 * PAD
-    width = coefficients.shape[1] - 2 * PAD
+@compiled(fastmath=_FAST)
+def bring_back(
+    start, stop, coefficients, deformed_weight, partial, reference_weight, runs, run_offsets, origin, elements,
+    barycentric, displacement, out, weight,
+):  # fmt: skip
+    """Deformed image and weights of one light brought back to the reference at the owned pixels.
+
+    `out` (P,) float32 receives g(x + u), NaN outside the image; `weight` (P,) float32 the `reference_weight` (P,) times
+    the `deformed_weight` (H, W) at the displaced position (bilinear), 0 outside and beside excluded pixels. `partial`
+    (h + 1, w + 1) int32 tells where that is other than 1: how many such blocks of `BLOCK` px lie above and to the left.
+    """
+    height, width = deformed_weight.shape
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
-        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-            px = ux + fxx * local_x[i] + fxy * local_y[i]
-            py = uy + fyx * local_x[i] + fyy * local_y[i]
-            column, row, tx, ty, outside = _place(px, py, base_x, base_y, height, width)
-            if outside:
-                out[i] = np.nan
-            else:
-                out[i] = _spline(coefficients, row, column, tx, ty)
+        low_x, low_y = np.float32(-base_x), np.float32(-base_y)
+        high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
+        left_x = top_y = np.float32(np.inf)
+        right_x = bottom_y = -np.float32(np.inf)
+        for run in range(run_offsets[e], run_offsets[e + 1]):
+            slot, left = np.int64(runs[run, 0]), np.int64(runs[run, 1])
+            x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
+            while left > 0:
+                px = ux + fxx * x + fxy * y
+                py = uy + fyx * x + fyy * y
+                left_x, right_x = min(left_x, px), max(right_x, px)
+                top_y, bottom_y = min(top_y, py), max(bottom_y, py)
+                if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
+                    out[slot] = np.nan
+                    slot, left, x = slot + 1, left - 1, x + _ONE
+                    continue
+                cx, cy = np.floor(px), np.floor(py)
+                column, row = base_x + np.int64(cx), base_y + np.int64(cy)
+                tx, ty = px - cx, py - cy
+                n = _span(left, tx, ty, fxx, fyx, column, width)
+                filled = (n + _LANES - 1) // _LANES * _LANES  # as in `element_right_side`
+                if slot + filled > out.size or column + filled + 3 > width + 2 * PAD:
+                    filled = n
+                i0, r, c = np.uint64(slot), np.uint64(row + PAD - 1), np.uint64(column + PAD - 1)
+                k0, k1 = coefficients[r, c:], coefficients[r + np.uint64(1), c:]
+                k2, k3 = coefficients[r + np.uint64(2), c:], coefficients[r + np.uint64(3), c:]
+                for i in range(np.uint32(filled)):
+                    t = np.float32(np.int32(i))
+                    g = _spline(k0, k1, k2, k3, i, tx + (fxx - _ONE) * t, ty + fyx * t)
+                    if np.int32(i) < np.int32(n):
+                        out[i0 + i] = g
+                right_x = max(right_x, px + fxx * np.float32(n))
+                top_y, bottom_y = min(top_y, py + fyx * np.float32(n)), max(bottom_y, py + fyx * np.float32(n))
+                slot, left, x = slot + n, left - n, x + np.float32(n)
+        if run_offsets[e] == run_offsets[e + 1]:
+            continue
+        first, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
+        inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
+        if inside and not _any_partial(partial, base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y):
+            for i in range(np.uint64(first), np.uint64(end)):
+                weight[i] = reference_weight[i]
+            continue
+        for run in range(run_offsets[e], run_offsets[e + 1]):
+            x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
+            for i in range(runs[run, 0], runs[run, 0] + runs[run, 1]):
+                px = ux + fxx * x + fxy * y
+                py = uy + fyx * x + fyy * y
+                within = px >= low_x and py >= low_y and px <= high_x and py <= high_y
+                mean = _beside(deformed_weight, base_x, base_y, px, py) if within else _ZERO
+                weight[i] = reference_weight[i] * mean
+                x += _ONE
+
+
+@helper()
+def _any_partial(partial, left, top, right, bottom):
+    """Whether a block is partial that holds a pixel of this rectangle, or the next one on the right or below."""
+    a, b = np.int64(left) // BLOCK, np.int64(top) // BLOCK
+    c = min((np.int64(right) + 1) // BLOCK + 1, partial.shape[1] - 1)
+    d = min((np.int64(bottom) + 1) // BLOCK + 1, partial.shape[0] - 1)
+    return partial[d, c] - partial[b, c] - partial[d, a] + partial[b, a] > 0
+
+
+@helper()
+def _beside(weight, base_x, base_y, px, py):
+    """Bilinear mean of a weight (H, W) at a position inside; 0 next to an excluded pixel, which would lend to it."""
+    cx, cy = np.floor(px), np.floor(py)
+    column, row = base_x + np.int64(cx), base_y + np.int64(cy)
+    tx, ty = px - cx, py - cy
+    right, below = min(column + 1, weight.shape[1] - 1), min(row + 1, weight.shape[0] - 1)
+    a, b = weight[row, column], weight[row, right]
+    c, d = weight[below, column], weight[below, right]
+    if min(a, b, c, d) <= _ZERO:
+        return _ZERO
+    return (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
 
 
 @over_ranges("out")
@@ -270,35 +353,6 @@ def element_moments(start, stop, reference, warped, weight, offsets, out):
             fg += w * f * g
             g2 += w * g * g
         out[e, 0], out[e, 1], out[e, 2], out[e, 3], out[e, 4], out[e, 5] = total, f1, g1, f2, fg, g2
-
-
-@over_ranges("elements")
-@compiled()
-def pull_back(start, stop, deformed_weight, reference_weight, local_x, local_y, offsets, origin, elements, barycentric,
-              displacement, out):  # fmt: skip
-    """Weight of each owned pixel: the reference's times the deformed image's at the displaced position (bilinear).
-
-    `deformed_weight` (H, W) float32, `reference_weight` (P,) float32; positions outside the image give 0.
-    """
-    height, width = deformed_weight.shape
-    for e in range(start, stop):
-        base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
-        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-            px = ux + fxx * local_x[i] + fxy * local_y[i]
-            py = uy + fyx * local_x[i] + fyy * local_y[i]
-            column, row, tx, ty, outside = _place(px, py, base_x, base_y, height, width)
-            if outside:
-                out[i] = _ZERO
-                continue
-            right = min(column + 1, width - 1)
-            below = min(row + 1, height - 1)
-            a = deformed_weight[row, column]
-            b = deformed_weight[row, right]
-            c = deformed_weight[below, column]
-            d = deformed_weight[below, right]
-            value = (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
-            # a pixel next to an excluded one would borrow from it through the interpolation
-            out[i] = reference_weight[i] * value if min(a, b, c, d) > _ZERO else _ZERO
 
 
 @over_ranges("out")

@@ -8,7 +8,7 @@ import numpy as np
 from rgbmidic._kernels.compilation import compiled
 from rgbmidic._kernels.threads import over_ranges
 
-__all__ = ["block_index", "block_sums", "grid_at_pixels", "score_sums"]
+__all__ = ["block_index", "block_sums", "from_image", "score_sums", "to_image"]
 
 _SLAB = 16384
 """Ranges of pixels start at multiples of it."""
@@ -51,19 +51,25 @@ def score_sums(start, stop, residual, weight, gradient_x, gradient_y, index, out
                 out[j, 3, b] += 1.0
 
 
-@over_ranges("out", grain=_SLAB)
+@over_ranges("runs")
 @compiled()
-def grid_at_pixels(start, stop, grid, rows, columns, top, left, block, out):
-    """A grid of blocks interpolated linearly between their centres, level beyond the outer ones: ``out`` (P,)."""
-    height, width = grid.shape
-    scale = np.float32(1.0 / block)
-    shift = np.float32(0.5 * scale - 0.5)
-    for i in range(np.uint64(start), np.uint64(stop)):
-        y = min(max((rows[i] - top) * scale + shift, np.float32(0)), np.float32(height - 1))
-        x = min(max((columns[i] - left) * scale + shift, np.float32(0)), np.float32(width - 1))
-        a, b = int(y), int(x)
-        c, d = min(a + 1, height - 1), min(b + 1, width - 1)
-        ty, tx = y - a, x - b
-        above = grid[a, b] + (grid[a, d] - grid[a, b]) * tx
-        below = grid[c, b] + (grid[c, d] - grid[c, b]) * tx
-        out[i] = above + (below - above) * ty
+def to_image(start, stop, runs, rows, columns, top, left, values, out):
+    """Fields (n, P) float32 of the owned pixels as images: ``out`` (n, h, w), whose first pixel is (top, left)."""
+    for n in range(values.shape[0]):
+        for run in range(start, stop):
+            slot, length = np.uint64(runs[run, 0]), np.uint64(runs[run, 1])
+            line = out[n, rows[slot] - top, columns[slot] - left :]
+            for i in range(length):
+                line[i] = values[n, slot + i]
+
+
+@over_ranges("runs")
+@compiled()
+def from_image(start, stop, runs, rows, columns, top, left, image, out):
+    """The way back: ``out`` (n, P) from images (n, h, w)."""
+    for n in range(image.shape[0]):
+        for run in range(start, stop):
+            slot, length = np.uint64(runs[run, 0]), np.uint64(runs[run, 1])
+            line = image[n, rows[slot] - top, columns[slot] - left :]
+            for i in range(length):
+                out[n, slot + i] = line[i]

@@ -21,6 +21,8 @@ _FAST = {"reassoc", "contract", "arcp", "nsz"}  # keeps the meaning of NaN and i
 
 _BLOCK = 64
 """Columns filtered together: a cache line of each row."""
+_TOGETHER = 8
+"""Rows filtered together: each waits for its own last sample only."""
 
 
 def bspline_coefficients(image: FloatImage, out: FloatImage) -> None:
@@ -72,29 +74,35 @@ def _filter_columns(start, stop, values):
 def _filter_rows(start, stop, rows):
     """The same along each of `rows` (H, W + 2 PAD), whose ends then mirror what lies inside."""
     n = rows.shape[1] - 2 * PAD
-    for r in range(start, stop):
-        line = rows[r, PAD:]
+    for top in range(start, stop, _TOGETHER):
+        end = min(top + _TOGETHER, stop)
         if n > 1:
-            _filter_line(line, n)
-        for p in range(1, PAD + 1):
-            rows[r, PAD - p] = line[min(p, n - 1)]
-            line[n - 1 + p] = line[max(n - 1 - p, 0)]
+            _filter_lines(rows[:, PAD:], top, end, n)
+        for r in range(top, end):
+            line = rows[r, PAD:]
+            for p in range(1, PAD + 1):
+                rows[r, PAD - p] = line[min(p, n - 1)]
+                line[n - 1 + p] = line[max(n - 1 - p, 0)]
 
 
 @helper()
-def _filter_line(line, n):
+def _filter_lines(lines, top, end, n):
     z = _POLE
-    first = line[0]
-    power = z
-    for i in range(1, _HORIZON):
-        first += power * line[_mirrored(i, n)]
-        power *= z
-    line[0] = first * _GAIN
-    for i in range(1, n):
-        line[i] = line[i] * _GAIN + z * line[i - 1]
-    line[n - 1] = z / (z * z - np.float32(1.0)) * (line[n - 1] + z * line[n - 2])
+    for r in range(top, end):
+        first = lines[r, 0]
+        power = z
+        for i in range(1, _HORIZON):
+            first += power * lines[r, _mirrored(i, n)]
+            power *= z
+        lines[r, 0] = first * _GAIN
+    for i in range(np.uint64(1), np.uint64(n)):
+        for r in range(np.uint64(top), np.uint64(end)):
+            lines[r, i] = lines[r, i] * _GAIN + z * lines[r, i - np.uint64(1)]
+    for r in range(top, end):
+        lines[r, n - 1] = z / (z * z - np.float32(1.0)) * (lines[r, n - 1] + z * lines[r, n - 2])
     for i in range(n - 2, -1, -1):
-        line[i] = z * (line[i + 1] - line[i])
+        for r in range(np.uint64(top), np.uint64(end)):
+            lines[r, np.uint64(i)] = z * (lines[r, np.uint64(i + 1)] - lines[r, np.uint64(i)])
 
 
 @helper()

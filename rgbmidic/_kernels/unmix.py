@@ -28,9 +28,11 @@ def unmix(start, stop, channels, valid, matrix, needed, out, out_valid):
                 values[p], ok[p] = 0.0, True
             for colour in range(colours):
                 factor, counts = matrix[light, colour], needed[light, colour]
+                given, known = channels[colour, first:last], valid[colour, first:last]
                 for p in range(last - first):
-                    value = channels[colour, first + p]
-                    values[p] += factor * value if np.isfinite(value) else np.float32(0.0)
-                    ok[p] &= valid[colour, first + p] or not counts
+                    values[p] += factor * given[p] if np.isfinite(given[p]) else np.float32(0.0)
+                if counts:
+                    for p in range(last - first):
+                        ok[p] &= known[p]
             for p in range(last - first):
                 values[p] = values[p] if ok[p] else np.float32(np.nan)

@@ -29,7 +29,9 @@ class Assembly:
     indices, indptr : ndarray
         Structure of the assembled matrix (compressed columns).
     smoothness : csc_matrix, shape (2 N, 2 N)
-        Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal.
+        Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal; in that structure.
+    diagonal : ndarray
+        The unit matrix's data in it.
     nodal_area : ndarray, shape (N,), float64
         A third of the area of the elements around each node, square px.
     """
@@ -39,6 +41,7 @@ class Assembly:
     indices: npt.NDArray[np.int32]
     indptr: npt.NDArray[np.int32]
     smoothness: sp.csc_matrix
+    diagonal: FloatArray
     nodal_area: FloatArray
 
     @classmethod
@@ -50,12 +53,16 @@ class Assembly:
         columns = np.tile(unknowns, 6).ravel()
         keys, slots = np.unique(columns * size + rows, return_inverse=True)
         indptr = np.searchsorted(keys, np.arange(size + 1) * size)
+        structure = (keys % size).astype(np.int32), indptr.astype(np.int32)
+        laplacian, data = sp.coo_matrix(_laplacian(mesh)), np.zeros(len(keys))
+        data[np.searchsorted(keys, laplacian.col.astype(np.int64) * size + laplacian.row)] = laplacian.data
         return cls(
             unknowns=unknowns,
             slots=slots.ravel(),
-            indices=(keys % size).astype(np.int32),
-            indptr=indptr.astype(np.int32),
-            smoothness=_laplacian(mesh),
+            indices=structure[0],
+            indptr=structure[1],
+            smoothness=sp.csc_matrix((data, *structure), shape=(size, size)),
+            diagonal=(keys % size == keys // size).astype(np.float64),
             nodal_area=mesh.to_nodes(mesh.areas / 3),
         )
 
@@ -67,8 +74,16 @@ class Assembly:
     def matrix(self, blocks: FloatArray) -> sp.csc_matrix:
         """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N)."""
         full = blocks[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
-        data = np.bincount(self.slots, weights=full.ravel(), minlength=len(self.indices))
+        return self.with_structure(np.bincount(self.slots, weights=full.ravel(), minlength=len(self.indices)))
+
+    def with_structure(self, data: FloatArray) -> sp.csc_matrix:
+        """The matrix of these data in the structure of the assembled ones."""
         return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
+
+    def node_blocks(self, blocks: FloatArray) -> FloatArray:
+        """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""
+        corners, own = self.unknowns[:, ::2].ravel() // 2, np.einsum("eaad->dea", blocks).reshape(3, -1)
+        return np.stack([np.bincount(corners, weights=part, minlength=self.size // 2) for part in own])
 
     def vector(self, parts: FloatArray) -> FloatArray:
         """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""

@@ -12,7 +12,7 @@ from rgbmidic.correlation.assembly import factorise
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["SEEN", "Equations", "node_blocks", "rigid_functions"]
+__all__ = ["SEEN", "Equations", "rigid_functions"]
 
 
 _RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
@@ -51,6 +51,8 @@ class Equations:
     functions : ndarray, shape (2 N, m)
         The rigid functions in the axes of the reference.
     hessian, smoothness : csc_matrix, shape (2 N, 2 N)
+    node_blocks : ndarray, shape (3, N)
+        Entries xx, xy and yy of the nodes' own blocks of the Hessian.
     solve
         Solves ``(hessian + smoothness) x = b``.
     border, border_solved : ndarray, shape (2 N, (k - 1) m)
@@ -67,6 +69,7 @@ class Equations:
     rotation: FloatArray
     functions: FloatArray
     hessian: sp.csc_matrix
+    node_blocks: FloatArray
     smoothness: sp.csc_matrix
     solve: Callable[[FloatArray], FloatArray]
     border: FloatArray
@@ -92,15 +95,16 @@ class Equations:
         rotation = _rotation(reference.mesh.nodal_gradient(displacement))
         functions = _turned_back(rotation, functions)
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
-        hessian = assembly.matrix(np.sum(per_light, axis=0))
-        textured, scale = _observability(hessian, assembly.nodal_area, SEEN if given is None else _INFORMED)
+        blocks = np.sum(per_light, axis=0)
+        hessian, own = assembly.matrix(blocks), assembly.node_blocks(blocks)
+        textured, scale = _observability(own, assembly.nodal_area, SEEN if given is None else _INFORMED)
         if given is not None:
             texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
-            textured &= _observability(assembly.matrix(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
-        smoothness = sp.csc_matrix((_SMOOTHNESS * scale) * assembly.smoothness)
+            textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
+        smoothness = assembly.with_structure(_SMOOTHNESS * scale * assembly.smoothness.data)
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
-        anchor = 1e-9 * scale * sp.eye(assembly.size, format="csc")
-        solve = factorise(sp.csc_matrix(hessian + smoothness + anchor))
+        anchor = 1e-9 * scale * assembly.diagonal
+        solve = factorise(assembly.with_structure(hessian.data + smoothness.data + anchor))
         border, corner = _border([assembly.matrix(blocks) for blocks in per_light[1:]], functions)
         solved = solve(border) if border.shape[1] else border
         return cls(
@@ -108,6 +112,7 @@ class Equations:
             rotation=rotation,
             functions=functions,
             hessian=hessian,
+            node_blocks=own,
             smoothness=smoothness,
             solve=solve,
             border=border,
@@ -159,27 +164,18 @@ def _border(hessians: list[sp.csc_matrix], functions: FloatArray) -> tuple[Float
 
 
 def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArray:
-    corners = reference.mesh.elements.ravel()
-    count = len(reference.mesh.nodes)
-    own = [np.einsum("eaad->ead", blocks)[..., [0, 2]].sum(axis=-1).ravel() for blocks in per_light]
-    light = np.stack([np.bincount(corners, weights=part, minlength=count) for part in own], axis=1)
+    own = [reference.assembly.node_blocks(blocks) for blocks in per_light]
+    light = np.stack([xx + yy for xx, _, yy in own], axis=1)
     total = light.sum(axis=1, keepdims=True)
     return np.asarray(light / np.where(total > 0, total, 1.0))
 
 
-def node_blocks(matrix: sp.csc_matrix) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Entries (xx, xy, yy) of the nodes' own 2 x 2 blocks."""
-    diagonal = matrix.diagonal().reshape(-1, 2)
-    nodes = np.arange(len(diagonal))
-    return diagonal[:, 0], np.asarray(matrix[2 * nodes, 2 * nodes + 1]).ravel(), diagonal[:, 1]
-
-
-def _observability(hessian: sp.csc_matrix, area: FloatArray, least: float) -> tuple[BoolArray, float]:
+def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[BoolArray, float]:
     """Which nodes see at least that share of the median texture, and the typical diagonal entry of the Hessian.
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
     """
-    xx, xy, yy = node_blocks(hessian)
+    xx, xy, yy = own
     half = (xx + yy) / 2
     smallest = half - np.hypot((xx - yy) / 2, xy)
     smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only

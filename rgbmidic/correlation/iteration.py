@@ -10,6 +10,7 @@ from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.settings import SolverSettings
+from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["Estimate", "Problem", "UnsolvableError", "compare", "iterate"]
@@ -83,6 +84,7 @@ def compare(problem: Problem, values: FloatImage, estimate: Estimate) -> Residua
     return Residual.at(problem.reference, problem.deformed, values, _light_displacements(problem, estimate))
 
 
+@stage("iteration")
 def iterate(
     problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, tolerance: float
 ) -> Estimate:

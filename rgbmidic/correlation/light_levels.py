@@ -11,10 +11,10 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 __all__ = ["brightness_change"]
 
 
-_EVERY = 4
-"""Only every so many pixels are looked at."""
 _LEAST = 12
 """Pixels of an element that must be known in both states."""
+_ENOUGH = 36
+"""Pixels of an element that are looked at, about."""
 
 
 def brightness_change(
@@ -41,9 +41,10 @@ def brightness_change(
     """
     mesh, pixels = reference.mesh, reference.pixels
     motion = displacement[mesh.elements].mean(axis=1)
-    owner = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))[::_EVERY]
+    every = slice(None, None, max(1, pixels.rows.size // (_ENOUGH * len(mesh.elements))))
+    owner = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))[every]
     step = np.round(np.nan_to_num(motion)).astype(np.int64)[owner]
-    rows, columns = pixels.rows[::_EVERY], pixels.columns[::_EVERY]
+    rows, columns = pixels.rows[every], pixels.columns[every]
     there = rows + step[:, 1], columns + step[:, 0]
     height, width = first.shape[1:]
     inside = (there[0] >= 0) & (there[0] < height) & (there[1] >= 0) & (there[1] < width)

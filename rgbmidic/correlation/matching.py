@@ -40,9 +40,12 @@ def matching_elements(
     coefficient = np.minimum(own, np.median(around[mesh.elements], axis=1))
     if least is not None:
         return np.asarray(coefficient >= least)
-    typical = _median_around(mesh, coefficient, ff > 0)
-    limits = _MATCHED if precision is None else _MATCHED_PRECISE
-    return np.asarray(coefficient >= np.clip(1 - _WORSE * (1 - typical), *limits))
+    poor, good = _MATCHED if precision is None else _MATCHED_PRECISE
+    matched = np.asarray(coefficient >= good)
+    between = ~matched & (coefficient >= poor)
+    typical = _median_around(mesh, coefficient, ff > 0, between)
+    matched[between] = coefficient[between] >= 1 - _WORSE * (1 - typical)
+    return matched
 
 
 def correlation_around(residual: Residual) -> FloatArray:
@@ -53,13 +56,14 @@ def correlation_around(residual: Residual) -> FloatArray:
     return np.where(ff > 1e-9 * ff.max(initial=0.0), correlation(fg, ff, gg), np.nan)
 
 
-def _median_around(mesh: Tri3Mesh, values: FloatArray, textured: BoolArray) -> FloatArray:
-    """Median (E,) of the values of the nearest textured elements around each element; 1 where there is none."""
-    if not textured.any():
-        return np.ones_like(values)
+def _median_around(mesh: Tri3Mesh, values: FloatArray, textured: BoolArray, chosen: BoolArray) -> FloatArray:
+    """Median of the values of the nearest textured elements around each of the `chosen` elements (E,); 1 where there is
+    none."""
+    if not textured.any() or not chosen.any():
+        return np.ones(int(chosen.sum()))
     centre = mesh.nodes[mesh.elements].mean(axis=1)
     count = min(_AROUND, int(textured.sum()))
-    nearest = cKDTree(centre[textured]).query(centre, k=[*range(1, count + 1)])[1]
+    nearest = cKDTree(centre[textured]).query(centre[chosen], k=[*range(1, count + 1)])[1]
     return np.asarray(np.median(values[textured][nearest], axis=1))
 
 
@@ -78,9 +82,9 @@ def misfit(residual: Residual, weights: FloatImage, measured: BoolArray) -> Floa
     `weights` (k, P) are those of the solve, in units of the inverse variance of the residual.
     """
     mesh, pixels = residual.reference.mesh, residual.reference.pixels
-    square, count = (
-        mesh.to_nodes(pixels.by_element(part.sum(axis=0))) for part in (weights * residual.difference**2, weights > 0)
-    )
+    lights = zip(weights, residual.difference, strict=True)
+    sums = [(pixels.by_element(own * difference**2), pixels.by_element(own > 0)) for own, difference in lights]
+    square, count = (mesh.to_nodes(np.sum(part, axis=0)) for part in zip(*sums, strict=True))
     around = square / np.maximum(count, 1.0)
     typical = float(np.median(around[measured])) if measured.any() else 0.0
     return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation.equations import Equations, node_blocks
+from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
@@ -120,29 +120,31 @@ def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray, one_sided
 
 def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:
     """Nodes (N,) whose texture runs in one direction only: along the other, the gradient is that of the noise."""
-    xx, xy, yy = node_blocks(equations.hessian)
+    xx, xy, yy = equations.node_blocks
     half, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     weak = half - difference
-    one_sided = equations.textured & (weak < _ONE_SIDED * (half + difference))
+    one_sided = np.asarray(equations.textured & (weak < _ONE_SIDED * (half + difference)))
     if not one_sided.any():
         return one_sided
     angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2  # of the weaker direction
     x, y = np.cos(angle), np.sin(angle)
-    noise = residual.reference.assembly.matrix(_noise_hessian(residual, equations.weights))
-    noise_xx, noise_xy, noise_yy = node_blocks(noise)
+    noise_xx, noise_xy, noise_yy = _noise_blocks(residual, equations.weights, one_sided)
     along = noise_xx * x * x + 2 * noise_xy * x * y + noise_yy * y * y
     return np.asarray(one_sided & (along > _NOISY * weak))
 
 
-def _noise_hessian(residual: Residual, weights: FloatImage) -> FloatArray:
-    """Element blocks (E, 3, 3, 3) of the Hessian that noise alone has: what the residual, which holds the noise of
-    both images, differs by from pixel to pixel."""
-    reference = residual.reference
-    pixels = reference.pixels
+def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> FloatArray:
+    """Entries xx, xy, yy (3, N) of the own blocks of the chosen `nodes` (N,) in the Hessian that noise alone has: what
+    the residual, which holds the noise of both images, differs by from pixel to pixel."""
+    reference, pixels = residual.reference, residual.reference.pixels
+    around = np.repeat(nodes[reference.mesh.elements].any(axis=1), np.diff(pixels.offsets))
     top, left, _, _ = pixels.bounds
+    row, column = pixels.rows[around] - top, pixels.columns[around] - left
     total = np.zeros((len(reference.mesh.elements), 3, 3, 3))
-    for weight, difference in zip(weights, residual.difference, strict=True):
-        window = pixels.window(difference) / np.float32(np.sqrt(2))
-        slopes = [np.diff(window, axis=axis, append=0)[pixels.rows - top, pixels.columns - left] for axis in (1, 0)]
-        total += reference.blocks(weight, *slopes)
-    return total
+    slope_x, slope_y = np.zeros((2, around.size), dtype=np.float32)
+    for weight, window in zip(weights, pixels.window(residual.difference / np.float32(np.sqrt(2))), strict=True):
+        image = np.pad(window, ((0, 1), (0, 1)))
+        here = image[row, column]
+        slope_x[around], slope_y[around] = image[row, column + 1] - here, image[row + 1, column] - here
+        total += reference.blocks(weight, slope_x, slope_y)
+    return reference.assembly.node_blocks(total)

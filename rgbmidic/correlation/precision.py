@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -43,8 +43,10 @@ class Precision:
 
     def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
         """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less than they say."""
-        parts = weights, weights * self.bend
-        total, bent = (reference.mesh.to_nodes(reference.pixels.by_element(part.sum(axis=0))) for part in parts)
+        whole = weights.sum(axis=0)
+        total, bent = (
+            reference.mesh.to_nodes(reference.pixels.by_element(part)) for part in (whole, whole * self.bend)
+        )
         return np.divide(total, np.maximum(bent, _LEAST_BEND * total), out=np.ones_like(total), where=total > 0)
 
 
@@ -61,29 +63,25 @@ def learn_precision(residual: Residual) -> Precision:
     """
     pixels, weighted = residual.reference.pixels, residual.weights > 0
     variance = window_means(pixels, residual.difference**2, residual.weights)
-    typical = _typical(spread(pixels, variance), weighted)
-    if typical <= 0:
+    typical = float(np.median(variance[variance > 0])) if variance.any() else 0.0
+    if typical <= 0 or not weighted.any():
         return Precision(factor=np.ones_like(residual.weights), bend=np.ones_like(residual.weights[0]))
-    contrast = float(np.var(residual.values[weighted], dtype=np.float64))
+    contrast = float(np.var(_some(residual.values, weighted), dtype=np.float64))
     floor = np.float32(max(0.1 * typical, 1e-6 * contrast))
     share = _best_mean(residual, np.maximum(variance, floor), weighted)
-    whole = _of_mean(residual, share)
-    used, square = share.max(axis=0) > 0, whole.difference[:1] ** 2
+    used, mean = share.max(axis=0) > 0, np.einsum("kp,kp->p", share, residual.difference)
+    square = mean[None] ** 2
     around = spread(pixels, window_means(pixels, square, used[None].astype(np.float32)))[0]
-    around = np.maximum(around, floor / len(share))
-    ratio = square[0] / around
-    displacing = around * displacing_share(whole, np.broadcast_to(around, share.shape)).max(axis=0)
-    trusted = (_typical(displacing, used) / displacing) ** _TRUST
-    factor = share * (trusted * (_FREEDOM + 1) / (_FREEDOM + ratio))
-    bend = (_FREEDOM - ratio) / (_FREEDOM + ratio)
-    return Precision(factor=np.asarray(factor, dtype=np.float32), bend=np.asarray(bend, dtype=np.float32))
-
-
-def _of_mean(residual: Residual, share: FloatImage) -> Residual:
-    """The same with the lights' mean residual in place of each light's own, for their `share` (k, P) in it."""
-    mean = (share * residual.difference).sum(axis=0)
-    everywhere = np.repeat(mean[None], len(share), axis=0)
-    return replace(residual, values=everywhere, warped=np.zeros_like(everywhere), weights=share)
+    np.maximum(around, floor / len(share), out=around)
+    trusted = displacing_share(residual.reference, mean, share > 0, around) * around
+    unit = np.median(_some(trusted, used)) if used.any() else np.float32(0)
+    np.divide(unit, trusted, out=trusted)
+    np.power(trusted, np.float32(_TRUST), out=trusted)
+    ratio = np.divide(square[0], around, out=square[0])
+    bend = (np.float32(_FREEDOM) - ratio) / (np.float32(_FREEDOM) + ratio)
+    trusted *= np.float32(_FREEDOM + 1) / (np.float32(_FREEDOM) + ratio)
+    share *= trusted
+    return Precision(factor=share, bend=bend)
 
 
 def _best_mean(residual: Residual, variance: FloatImage, weighted: BoolArray) -> FloatImage:
@@ -92,24 +90,33 @@ def _best_mean(residual: Residual, variance: FloatImage, weighted: BoolArray) ->
     `variance` (k, h, w) is the residuals' on the grid of `window_means`.
     """
     lights = len(variance)
-    covariance = np.zeros((*variance.shape[1:], lights, lights))
-    covariance[..., range(lights), range(lights)] = np.moveaxis(variance, 0, -1)
+    covariance = np.zeros((lights, lights, *variance.shape[1:]))
+    covariance[range(lights), range(lights)] = variance
     for a, b in combinations(range(lights), 2):
         both = np.sqrt(residual.weights[a] * residual.weights[b])[None]
         product = (residual.difference[a] * residual.difference[b])[None]
         shared = window_means(residual.reference.pixels, product, both)[0]
         most = (1 - _OWN) * np.sqrt(variance[a] * variance[b])
-        covariance[..., a, b] = covariance[..., b, a] = np.clip((1 - _OWN) * shared, -most, most)
-    inverse = np.linalg.inv(covariance).sum(axis=-1)
-    weights = (
-        np.maximum(spread(residual.reference.pixels, np.moveaxis(inverse, -1, 0).astype(np.float32)), 0) * weighted
-    )
+        covariance[a, b] = covariance[b, a] = np.clip((1 - _OWN) * shared, -most, most)
+    weights = np.maximum(spread(residual.reference.pixels, _solved_for_ones(covariance)), 0) * weighted
     total = weights.sum(axis=0)
     return np.asarray(weights / np.where(total > 0, total, np.float32(1)))
 
 
-def _typical(variance: FloatImage, weighted: BoolArray) -> float:
-    """Median where `weighted`, from about 100 000 values."""
-    if not weighted.any():
-        return 0.0
-    return float(np.median(variance[weighted][:: max(1, int(weighted.sum()) // 100_000)]))
+def _solved_for_ones(matrices: FloatArray) -> FloatImage:
+    """The x (k, h, w) of ``C x = 1`` for symmetric positive definite matrices (k, k, h, w), by elimination."""
+    left, right = matrices.copy(), np.ones_like(matrices[0])
+    for pivot in range(len(right)):
+        for row in range(len(right)):
+            if row != pivot:
+                factor = left[row, pivot] / left[pivot, pivot]
+                left[row, pivot:] -= factor * left[pivot, pivot:]
+                right[row] -= factor * right[pivot]
+    return np.asarray(right / left[range(len(right)), range(len(right))], dtype=np.float32)
+
+
+def _some(values: FloatImage, chosen: BoolArray) -> FloatImage:
+    """About 100 000 of the `chosen` values (..., P)."""
+    every = slice(None, None, max(1, values.size // 100_000))
+    some = values[..., every][chosen[..., every]]
+    return np.asarray(some if some.size else values[chosen])

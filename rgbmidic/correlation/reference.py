@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from rgbmidic._kernels.correlation import element_hessian, element_right_side, pull_back, warp
-from rgbmidic._kernels.interpolation import sample_with_gradient
+from rgbmidic._kernels.correlation import BLOCK, bring_back, element_hessian, element_right_side
+from rgbmidic._kernels.interpolation import PAD
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
 from rgbmidic.correlation.recovery import linear_fit_offset
@@ -34,11 +35,17 @@ class Deformed:
         Cubic B-spline coefficients of `images`.
     weights : ndarray, shape (k, H, W), float32
         0 where a pixel is excluded or must not be interpolated.
+    partial : ndarray, shape (k, h + 1, w + 1), int32
+        Number of blocks of `BLOCK` px, above and to the left, with a weight other than 1.
     """
 
     images: FloatImage
     coefficients: FloatImage
     weights: FloatImage
+    partial: npt.NDArray[np.int32] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
 
     @classmethod
     def prepare(cls, images: FloatImage, weights: FloatImage | None = None, *, prefilter: str = "none") -> Deformed:
@@ -144,17 +151,18 @@ class Reference:
         """Element blocks of a light's Hessian with the pixel weights (P,)."""
         return self.blocks(weight, self.gradient_x[light], self.gradient_y[light])
 
-    def warp(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatImage:
-        """A light's deformed image brought back by a nodal displacement (N, 2): g(x + u) at the owned pixels (P,)."""
-        out = np.empty(self.pixels.rows.size, dtype=np.float32)
-        warp(deformed.coefficients[light], *self._geometry(), displacement, out)
-        return out
-
-    def pull_back(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatImage:
-        """A light's weight (P,): the reference's times the deformed image's at the displaced pixels."""
-        out = np.empty(self.pixels.rows.size, dtype=np.float32)
-        pull_back(deformed.weights[light], self.pixel_weights[light], *self._geometry(), displacement, out)
-        return out
+    def bring_back(
+        self, deformed: Deformed, light: int, displacement: FloatArray, out: FloatImage, weight: FloatImage
+    ) -> None:
+        """A light's deformed image brought back by a nodal displacement (N, 2), g(x + u) at the owned pixels, into
+        `out` (P,), and its weight, the reference's times the deformed image's there, into `weight` (P,)."""
+        images = (
+            deformed.coefficients[light],
+            deformed.weights[light],
+            deformed.partial[light],
+            self.pixel_weights[light],
+        )
+        bring_back(*images, *self._geometry(), displacement, out, weight)
 
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
@@ -176,12 +184,11 @@ class Reference:
         )
         return self.assembly.vector(parts), np.asarray(sums.sum(axis=0))
 
-    def _geometry(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray, AnyArray, AnyArray]:
+    def _geometry(self) -> tuple[AnyArray, ...]:
         pixels = self.pixels
         return (
-            pixels.local_x,
-            pixels.local_y,
-            pixels.offsets,
+            pixels.runs,
+            pixels.run_offsets,
             pixels.origin,
             self.mesh.elements,
             pixels.barycentric,
@@ -198,6 +205,16 @@ def _prepare(images: FloatImage, weights: FloatImage | None, prefilter: str) -> 
     return ready, usable if weights is None else usable * weights
 
 
+def _partial_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
+    """See `Deformed.partial`, for one weight (H, W)."""
+    partial = np.where(weight == 1, np.uint8(0), np.uint8(255))
+    below, right = (-side % BLOCK for side in weight.shape)
+    whole = cv2.copyMakeBorder(partial, 0, below, 0, right, cv2.BORDER_REPLICATE)
+    size = whole.shape[1] // BLOCK, whole.shape[0] // BLOCK
+    blocks = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA)) > 0  # one of 64 pixels gives 4 of 255
+    return np.asarray(cv2.integral(blocks.astype(np.uint8)), dtype=np.int32)
+
+
 def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
     """Pixels (H, W) under lines with the ends (C, 2, 2) in px."""
     image = np.zeros(shape, dtype=np.uint8)
@@ -209,10 +226,11 @@ def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
 def _values_and_gradient(image: FloatImage, pixels: PixelMap) -> FloatImage:
     """Value and spline gradient (3, P) of an image at the owned pixels."""
     coefficients = spline_coefficients(image)
-    out = np.empty((3, pixels.rows.size), dtype=np.float32)
-    x, y = pixels.columns.astype(np.float64), pixels.rows.astype(np.float64)
-    sample_with_gradient(coefficients, x, y, out[0], out[1], out[2])
-    return out
+    slope, mean = np.array([-0.5, 0, 0.5], dtype=np.float32), np.array([1, 4, 1], dtype=np.float32) / 6
+    gradient = [cv2.sepFilter2D(coefficients, -1, *taps)[PAD:-PAD, PAD:-PAD] for taps in ((slope, mean), (mean, slope))]
+    top, left, height, width = pixels.bounds
+    part = slice(top, top + height), slice(left, left + width)
+    return pixels.from_window(np.stack([image[part], *(component[part] for component in gradient)]))
 
 
 def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap) -> FloatImage:

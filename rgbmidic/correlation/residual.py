@@ -38,21 +38,19 @@ class Residual:
     difference: FloatImage = field(init=False)
 
     def __post_init__(self) -> None:
-        difference = np.nan_to_num(self.values - self.warped, nan=0.0)
-        object.__setattr__(self, "difference", np.asarray(difference, dtype=np.float32))
+        difference = self.values - self.warped
+        difference[np.isnan(difference)] = 0
+        object.__setattr__(self, "difference", difference)
 
     @classmethod
     def at(
         cls, reference: Reference, deformed: Deformed, values: FloatImage, displacements: Sequence[FloatArray]
     ) -> Residual:
         """At one nodal displacement (N, 2) per light, for reference grey levels `values` (k, P)."""
-        lights = list(enumerate(displacements))
-        return cls(
-            reference=reference,
-            values=values,
-            warped=np.stack([reference.warp(deformed, light, u) for light, u in lights]),
-            weights=np.stack([reference.pull_back(deformed, light, u) for light, u in lights]),
-        )
+        warped, weights = np.empty_like(values), np.empty_like(values)
+        for light, displacement in enumerate(displacements):
+            reference.bring_back(deformed, light, displacement, warped[light], weights[light])
+        return cls(reference=reference, values=values, warped=warped, weights=weights)
 
     def without(self, deviation: FloatImage) -> Residual:
         """The same, less what a displacement known to be missing (2, P), in px, leaves in it."""

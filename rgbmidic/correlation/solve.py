@@ -35,6 +35,7 @@ from rgbmidic.correlation.weighting import (
 )
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
+from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["solve"]
@@ -100,7 +101,7 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
     weighting = first_weighting(problem, estimate)
     equations: Equations | None = None
     for number in range(_PASSES):
-        if equations is not None and settled(weighting, equations) and not refining(problem, weighting, number):
+        if equations is not None and not refining(problem, weighting, number) and settled(weighting, equations):
             break
         equations = _equations(problem, weighting, estimate)
         reached = max(tolerance, FIRST_PASS) if number == 0 else tolerance
@@ -113,6 +114,7 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
     return estimate, equations, weighting
 
 
+@stage("equations")
 def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Equations:
     """The equations of the next pass.
 
@@ -148,6 +150,7 @@ def _nothing_left(weighting: Weighting) -> str:
     return "the images have no texture in the region"
 
 
+@stage("conclusion")
 def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
     """The solution: what counts, how certain it is, in which unit."""
     reference, options, mesh = problem.reference, problem.options, problem.reference.mesh

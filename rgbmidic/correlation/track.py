@@ -13,6 +13,7 @@ from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import FoundStart, find_starts
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import SolverSettings
+from rgbmidic.timing import each
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["LARGEST_TURN", "Start", "track"]
@@ -90,7 +91,7 @@ def track(
     best: Solution | None = None
     surest = 0.0
     last = [] if start.displacement is None else [FoundStart(displacement=start.displacement, confidence=np.nan)]
-    for number, found in enumerate(chain(last, find_starts(reference, deformed, start.displacement))):
+    for number, found in enumerate(chain(last, each("search", find_starts(reference, deformed, start.displacement)))):
         surest = float(np.fmax(surest, found.confidence))
         if found.confidence < NEEDED:
             continue

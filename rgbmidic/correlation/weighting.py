@@ -15,6 +15,7 @@ from rgbmidic.correlation.precision import Precision, learn_precision
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.nodal import nodal_std
+from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = [
@@ -67,6 +68,8 @@ class Weighting:
     @property
     def given(self) -> FloatImage:
         """Pixel weights (k, P) without the precision of the lights."""
+        if self.matched.all():
+            return self.residual.weights
         return self.residual.weights * np.repeat(self.matched, np.diff(self.residual.reference.pixels.offsets))
 
     @property
@@ -75,6 +78,7 @@ class Weighting:
         return self.given if self.precision is None else self.given * self.precision.factor
 
 
+@stage("weights")
 def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
     residual = compare(problem, problem.reference.values, estimate)
     return Weighting(
@@ -84,6 +88,7 @@ def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
     )
 
 
+@stage("weights")
 def next_weighting(
     problem: Problem, last: Weighting, equations: Equations, estimate: Estimate, number: int
 ) -> Weighting:
@@ -113,7 +118,8 @@ def next_weighting(
 
 def settled(weighting: Weighting, equations: Equations) -> bool:
     weights = weighting.weights
-    return bool(np.abs(weights - equations.weights).sum() <= _SETTLED * weights.sum()) and bool(weights.any())
+    total = float(weights.sum())
+    return total > 0 and float(np.abs(weights - equations.weights).sum()) <= _SETTLED * total
 
 
 def refining(problem: Problem, weighting: Weighting, number: int) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.grid import block_sums
 from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import FloatImage
 
@@ -19,17 +18,14 @@ _COARSE = 4
 
 def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
     """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
-    index, shape = pixels.blocks(_COARSE)
-    sums = np.zeros((2, len(fields), shape[0] * shape[1]), dtype=np.float32)
-    for total, values in zip(sums, (fields * weights, weights), strict=True):
-        block_sums(np.ascontiguousarray(values, dtype=np.float32), index, total)
-    total, share = (np.stack([_blur(grid.reshape(shape)) for grid in one]) for one in sums)
-    return np.asarray(total / np.maximum(share, np.float32(1e-6)))
+    total = [_blur(grid) for grid in pixels.block_means(fields * weights, _COARSE)]
+    share = [_blur(grid) for grid in pixels.block_means(weights, _COARSE)]
+    return np.asarray(np.stack(total) / np.maximum(share, np.float32(1e-6 / _COARSE**2)))
 
 
 def spread(pixels: PixelMap, grids: FloatImage) -> FloatImage:
     """Such means (n, h, w) at the pixels (n, P)."""
-    return np.stack([pixels.from_blocks(np.ascontiguousarray(grid, dtype=np.float32), _COARSE) for grid in grids])
+    return pixels.from_blocks(grids, _COARSE)
 
 
 def _blur(grid: FloatImage) -> FloatImage:

@@ -133,7 +133,8 @@ def _colour_cell(raw: rawpy.RawPy, path: Path) -> AnyArray:
         )
     if raw.num_colors == 1:
         return np.zeros((2, 2), dtype=np.intp)
-    cell = raw.raw_colors_visible[:2, :2].copy()
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin  # `raw_colors_visible` would fill the whole frame
+    cell = np.array([[raw.raw_color(top + row, left + column) for column in (0, 1)] for row in (0, 1)])
     if pattern.shape != (2, 2) or _names(raw, cell) not in BAYER_PATTERNS:
         rows, columns = pattern.shape
         raise _not_bayer(path, f"of {rows}x{columns} pixels with the colours {_names(raw, pattern)}")

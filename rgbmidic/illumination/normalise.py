@@ -17,6 +17,10 @@ __all__ = ["DARK", "local_mean", "normalise"]
 
 DARK = 0.01
 """A light whose local mean is below this share of the full scale does not see the surface there."""
+_WIDE = 4.0
+"""Standard deviation (px) from which the mean is taken in an image of half the size."""
+_RESIZED = 1 / 4 + 2 / 3
+"""Variance (square px) that the mean of two pixels and the interpolation between such means add."""
 
 
 def normalise(images: FloatImage, sigma: float, full_scale: float) -> FloatImage:
@@ -59,4 +63,15 @@ def local_mean(image: FloatImage, sigma: float) -> FloatImage:
 
 
 def _blur(image: FloatImage, sigma: float) -> FloatImage:
+    """Gaussian mean of an image (H, W); of one of half the size where that is as good, at a sixth of the time."""
+    if sigma < _WIDE:
+        return _gaussian(image, sigma)
+    height, width = image.shape
+    even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    half = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    blurred = _gaussian(np.asarray(half), np.sqrt(sigma**2 - _RESIZED) / 2)
+    return np.asarray(cv2.resize(blurred, even.shape[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width])
+
+
+def _gaussian(image: FloatImage, sigma: float) -> FloatImage:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.grid import block_index, grid_at_pixels
+from rgbmidic._kernels.grid import block_index, from_image, to_image
 from rgbmidic._kernels.mesh import claim_pixels, list_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
@@ -21,7 +22,7 @@ _RIM = 3.0
 """Farthest (px) that a pixel of the region may lie from the element that owns it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PixelMap:
     """The P owned pixels, element after element.
 
@@ -39,6 +40,10 @@ class PixelMap:
         Shape function a of element e at a local position: ``b[e, a, 0] + b[e, a, 1] x + b[e, a, 2] y``.
     shape : tuple of int
         Image size (H, W).
+    runs : ndarray, shape (R, 4), int32
+        First slot, number of pixels and local position (x, y) of the first, of every row of pixels of an element.
+    run_offsets : ndarray, shape (E + 1,), int64
+        Element e owns the runs ``run_offsets[e]:run_offsets[e + 1]``.
     bounds : tuple of int
         First row, first column, height and width of the smallest rectangle around the owned pixels.
     """
@@ -51,12 +56,19 @@ class PixelMap:
     local_y: FloatImage
     barycentric: FloatArray
     shape: tuple[int, int]
+    runs: npt.NDArray[np.int32] = field(init=False)
+    run_offsets: npt.NDArray[np.int64] = field(init=False)
     bounds: tuple[int, int, int, int] = field(init=False)
 
     def __post_init__(self) -> None:
         top, left = int(self.rows.min()), int(self.columns.min())
         size = int(self.rows.max()) - top + 1, int(self.columns.max()) - left + 1
         object.__setattr__(self, "bounds", (top, left, *size))
+        first = _run_starts(self.rows, self.columns, self.offsets)
+        length = np.diff(first, append=self.rows.size)
+        runs = np.stack([first, length, self.local_x[first], self.local_y[first]], axis=1).astype(np.int32)
+        object.__setattr__(self, "runs", runs)
+        object.__setattr__(self, "run_offsets", np.searchsorted(first, self.offsets).astype(np.int64))
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
@@ -96,41 +108,73 @@ class PixelMap:
 
     def gather(self, image: FloatImage) -> FloatImage:
         """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
-        return np.ascontiguousarray(image[..., self.rows, self.columns])
+        place = self.rows.astype(np.int64) * self.shape[1] + self.columns
+        return np.take(image.reshape(*image.shape[:-2], -1), place, axis=-1)
 
     def by_element(self, values: FloatImage) -> FloatArray:
         """Sum of values (P,) over the pixels of each element, shape (E,)."""
-        owner = np.repeat(np.arange(len(self.origin)), np.diff(self.offsets))
-        return np.bincount(owner, weights=values, minlength=len(self.origin)).astype(np.float64)
+        sums = np.zeros(len(self.origin))
+        filled = self.offsets[:-1] < self.offsets[1:]
+        sums[filled] = np.add.reduceat(values, self.offsets[:-1][filled], dtype=np.float64)
+        return sums
 
     def blocks(self, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
         """Number of the block of `side` px in which each owned pixel lies (P,), and the grid of blocks (rows,
         columns) over `bounds`."""
-        top, left, height, width = self.bounds
-        grid = -(-height // side), -(-width // side)
-        index = np.empty(self.rows.size, dtype=np.int32)
-        block_index(self.rows, self.columns, top, left, side, grid[1], index)
-        return index, grid
+        return _blocks(self, side)
 
-    def from_blocks(self, grid: FloatImage, side: int) -> FloatImage:
-        """A grid of such blocks interpolated at the owned pixels (P,)."""
+    def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
+        """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
+        size = grids.shape[2] * side, grids.shape[1] * side
+        images = [cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR) for grid in grids.astype(np.float32)]
+        return self.from_window(np.stack(images))
+
+    def window(self, values: FloatImage, side: int = 1) -> FloatImage:
+        """`values` (n, P) as images of the rectangle `bounds`, grown to whole blocks of `side` px on the right and
+        below; 0 where no pixel is owned."""
+        top, left, height, width = self.bounds
+        images = np.zeros((len(values), -(-height // side) * side, -(-width // side) * side), dtype=np.float32)
+        to_image(self.runs, self.rows, self.columns, top, left, values, images)
+        return images
+
+    def from_window(self, images: FloatImage) -> FloatImage:
+        """Such images (n, h, w) at the owned pixels (n, P)."""
         top, left, _, _ = self.bounds
-        out = np.empty(self.rows.size, dtype=np.float32)
-        grid_at_pixels(np.ascontiguousarray(grid, dtype=np.float32), self.rows, self.columns, top, left, side, out)
+        out = np.empty((len(images), self.rows.size), dtype=np.float32)
+        from_image(self.runs, self.rows, self.columns, top, left, images, out)
         return out
 
-    def window(self, values: FloatImage) -> FloatImage:
-        """`values` (P,) as an image of the rectangle `bounds`, 0 where no pixel is owned."""
-        top, left, height, width = self.bounds
-        image = np.zeros((height, width), dtype=np.float32)
-        image[self.rows - top, self.columns - left] = values
-        return image
+    def block_means(self, values: FloatImage, side: int) -> FloatImage:
+        """Sums of `values` (n, P) over such blocks, over the pixels of a block, shape (n, rows, columns)."""
+        images = self.window(values, side)
+        size = images.shape[2] // side, images.shape[1] // side
+        return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
 
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
         """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""
         image = np.full(self.shape, fill, dtype=np.float32)
         image[self.rows, self.columns] = values
         return image
+
+
+@lru_cache(maxsize=2)
+def _blocks(pixels: PixelMap, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
+    """Kept for the two sides that every frame of a test needs."""
+    top, left, height, width = pixels.bounds
+    grid = -(-height // side), -(-width // side)
+    index = np.empty(pixels.rows.size, dtype=np.int32)
+    block_index(pixels.rows, pixels.columns, top, left, side, grid[1], index)
+    return index, grid
+
+
+def _run_starts(
+    rows: npt.NDArray[np.int32], columns: npt.NDArray[np.int32], offsets: npt.NDArray[np.int64]
+) -> npt.NDArray[np.intp]:
+    """Slots at which the pixel before is not the neighbour on the left, or belongs to another element."""
+    begins = np.ones(rows.size, dtype=bool)
+    begins[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1] + 1)
+    begins[offsets[:-1][np.diff(offsets) > 0]] = True
+    return np.flatnonzero(begins)
 
 
 def _claim_rim(owner: npt.NDArray[np.int32], counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

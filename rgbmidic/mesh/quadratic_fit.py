@@ -6,6 +6,7 @@ The recovery of Zhang and Naga (SIAM J. Sci. Comput. 26, 2005), with weights tha
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -55,8 +56,7 @@ def quadratic_fit(
     offset : ndarray, shape (N, 3), optional
         What the given values have beyond a field whose second derivative xx, xy or yy is 1, square px; 0 without.
     """
-    share = _surrounded(mesh, used)
-    node, other, start = _pairs(mesh, used, share)
+    share, node, other, start = _window(mesh, used.tobytes())
     basis = _basis(mesh, node, other, offset)
     square = _WIDTH**2 / share[node]  # at an edge the window holds as much of the mesh as inside
     weight = np.exp(-(basis[1] ** 2 + basis[2] ** 2) / (2 * square))
@@ -94,6 +94,14 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
             bent = xx[node, c] * dx * dx / 2 + xy[node, c] * dx * dy + yy[node, c] * dy * dy / 2
             out[c] += share * (value[node, c] + x[node, c] * dx + y[node, c] * dy + bent)
     return out
+
+
+@lru_cache(maxsize=1)
+def _window(mesh: Tri3Mesh, used: bytes) -> tuple[FloatArray, Index, Index, Index]:
+    """The share of the full angle around each node, and the pairs of nodes: kept, for most frames use all elements."""
+    elements = np.frombuffer(used, dtype=bool)
+    share = _surrounded(mesh, elements)
+    return share, *_pairs(mesh, elements, share)
 
 
 def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:

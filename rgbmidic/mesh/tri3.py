@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ NARROW = 10
 serve the filters only."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tri3Mesh:
     """Triangles on the reference image.
 
@@ -34,10 +34,13 @@ class Tri3Mesh:
         Positions (x, y) in px.
     elements : ndarray, shape (E, 3), int32
         Node indices, ordered so that ``(p1 - p0) x (p2 - p0) > 0`` in (x, y).
+    areas : ndarray, shape (E,), float64
+        Area of each element in square px.
     """
 
     nodes: FloatArray
     elements: npt.NDArray[np.int32]
+    areas: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         nodes = np.ascontiguousarray(self.nodes, dtype=np.float64)
@@ -54,6 +57,7 @@ class Tri3Mesh:
         elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
         object.__setattr__(self, "nodes", nodes)
         object.__setattr__(self, "elements", elements)
+        object.__setattr__(self, "areas", np.abs(area))
 
     @classmethod
     def from_region(cls, region: Region, element_size: float, cracks: Sequence[npt.ArrayLike] = ()) -> Tri3Mesh:
@@ -93,11 +97,6 @@ class Tri3Mesh:
             return cls(nodes=nodes, elements=elements)
         nodes, elements = outline_mesh(region.mask, element_size, cracks)
         return cls(nodes=nodes, elements=elements)
-
-    @property
-    def areas(self) -> FloatArray:
-        """Area of each element in square px, shape (E,)."""
-        return _signed_area(self.nodes, self.elements)
 
     @property
     def size(self) -> float:
@@ -178,9 +177,14 @@ class Tri3Mesh:
 
     def _boundary_edges(self) -> npt.NDArray[np.int32]:
         """Edges (B, 2) that belong to one element only."""
-        edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
-        pairs, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+        pairs, count = self._edges()
         return np.asarray(pairs[count == 1])
+
+    def _edges(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.intp]]:
+        """Every edge once (M, 2), and the number of elements that share it (M,)."""
+        edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
+        keys, count = np.unique(edge_keys(edges, len(self.nodes)), return_counts=True)
+        return np.stack(np.divmod(keys, len(self.nodes)), axis=1).astype(np.int32), count
 
     @property
     def crack_edges(self) -> npt.NDArray[np.int32]:
@@ -193,8 +197,7 @@ class Tri3Mesh:
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes joined by an edge, shape (M, 2), each pair once."""
-        edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
-        return np.unique(np.sort(edges, axis=1), axis=0)
+        return self._edges()[0]
 
 
 def _signed_area(nodes: FloatArray, elements: npt.NDArray[np.int32]) -> FloatArray:

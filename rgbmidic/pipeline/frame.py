@@ -10,6 +10,7 @@ import logging
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,7 @@ from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.raw_samples import exposure_fault
 from rgbmidic.pipeline.separation import correlated
 from rgbmidic.results import FrameRecord
+from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["failed_frame", "measure_frame"]
@@ -53,7 +55,9 @@ def measure_frame(plan: Plan, index: int, start: Start, renewed: Sequence[tuple[
         Index and solution of the last two of ``start.renewals``: all that the reference depends on that they make.
     """
     try:
-        return _measure(plan, index, start, _renewal(plan, renewed))
+        with timed(plan.timings) as seconds:
+            values = _measure(plan, index, start, _renewal(plan, renewed))
+        return FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
     except RgbmidicError as error:
         reason = str(error)
         logger.warning("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
@@ -74,14 +78,18 @@ def failed_frame(plan: Plan, index: int, reason: str) -> FrameRecord:
     )
 
 
-def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> FrameRecord:
+def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str, Any]:
+    """What `FrameRecord.from_solution` is given."""
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
-    state = plan.series.read(index)
-    images = plan.separation(state)
+    with stage("reading"):
+        state = plan.series.read(index)
+    with stage("separation"):
+        images = plan.separation(state)
     if images.values.shape != reference.images.shape:
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
-    weights = plan.weights.deformed(images, index)
-    deformed = Deformed.prepare(correlated(images, settings.illumination), weights, prefilter=settings.solver.prefilter)
+    with stage("preparation"):
+        weights, ready = plan.weights.deformed(images, index), correlated(images, settings.illumination)
+        deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
     statistics = settings.weights.method == "statistics"
@@ -94,18 +102,18 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> FrameRec
     brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
     _tell_dark(name, images.names, brightness)
     match, best, renewals = _compared(plan, index, start, renewal, deformed, solution)
-    return FrameRecord.from_solution(
-        kept,
-        number=plan.series.numbers[index],
-        time_ns=plan.series.time_ns(index),
-        brightness=brightness,
-        match=match,
-        best_match=best,
-        renewals=renewals,
-        weights_thumbnail=_thumbnail(weights),
-        reflection_thumbnail=None if images.reflection_index is None else _thumbnail(images.reflection_index),
-        inputs=plan.series.inputs(index),
-    )
+    return {
+        "solution": kept,
+        "number": plan.series.numbers[index],
+        "time_ns": plan.series.time_ns(index),
+        "brightness": brightness,
+        "match": match,
+        "best_match": best,
+        "renewals": renewals,
+        "weights_thumbnail": _thumbnail(weights),
+        "reflection_thumbnail": None if images.reflection_index is None else _thumbnail(images.reflection_index),
+        "inputs": plan.series.inputs(index),
+    }
 
 
 _Known = tuple[Plan, tuple[int, ...], Renewal]

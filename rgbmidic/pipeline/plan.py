@@ -42,6 +42,8 @@ class Plan:
         Images of the reference state, in grey levels.
     reference
         The reference state as the solve needs it, with the mesh.
+    timings
+        Whether to tell the time that each stage of a frame takes.
     """
 
     settings: TestSettings
@@ -51,6 +53,7 @@ class Plan:
     weights: LightWeights
     images: IlluminationImages
     reference: Reference
+    timings: bool = False
 
     @classmethod
     def from_settings(cls, settings: TestSettings) -> Plan:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from rgbmidic._kernels import are_compiled
@@ -30,6 +31,7 @@ def measure(
     frames: range | None = None,
     workers: int | None = 1,
     scheduler: str | None = None,
+    timings: bool = False,
     progress: Progress | None = None,
 ) -> Result:
     """Measure a test: displacement of every frame against the reference.
@@ -56,6 +58,8 @@ def measure(
         ``if __name__ == "__main__"``.
     scheduler
         Address of the scheduler of a Dask cluster, instead of processes of this machine.
+    timings
+        Keep the seconds that each stage of a frame takes (`seconds` of a result): they differ from run to run.
     progress
         Called after every frame with the number of frames done, their total and a line about the last one.
 
@@ -70,7 +74,7 @@ def measure(
         The settings, the calibration, the region or the reference frames are not usable, the result cannot be written,
         or what is in `out` is another test's.
     """
-    plan = Plan.from_settings(settings)
+    plan = replace(Plan.from_settings(settings), timings=timings)
     places = _places(plan.series.chosen, frames)
     if workers is None:
         workers = max(min(available_cores(), len(places) // FRAMES_A_WORKER), 1)

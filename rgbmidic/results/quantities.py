@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.timing import STAGES
 
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
@@ -109,6 +110,7 @@ _RENEWALS = (
 )
 _RIGID = "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad)"
 _REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not tell it"
+_SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
@@ -151,6 +153,7 @@ _TABLE = (
     Quantity("weight_share", _LIGHT, "", "weight_share", _WEIGHT),
     Quantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
     Quantity("rigid", ("light", "function"), "", "rigid", _RIGID),
+    Quantity("seconds", (len(STAGES),), "s", "", _SECONDS),
     Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
     Quantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
 )

@@ -55,8 +55,8 @@ def unfitted_share(
     """
     if not gradient_x.any() and not gradient_y.any():
         return 1.0
-    products = [(gx * gx, gx * gy, gy * gy) for gx, gy in zip(gradient_x, gradient_y, strict=True)]
-    xx, xy, yy = (np.sum(part, axis=0) for part in zip(*products, strict=True))
+    pairs = (gradient_x, gradient_x), (gradient_x, gradient_y), (gradient_y, gradient_y)
+    xx, xy, yy = (np.einsum("kp,kp->p", *pair) for pair in pairs)
     geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
     hessian = np.zeros((len(pixels.origin), 3, 3, 3))
     for gx, gy in zip(gradient_x, gradient_y, strict=True):
@@ -74,8 +74,9 @@ def unfitted_share(
     total = fitted = 0.0
     parts = np.zeros((len(pixels.origin), 3, 2))
     for number in range(0, _APART**2, 1 if group.size < _MANY else 4):
-        chosen = np.where(group == number, sign, 0.0)[index].astype(np.float32)
-        total += float(((xx + yy) * np.abs(chosen)).sum(dtype=np.float64))
+        chosen = np.where(group == number, sign, 0.0).astype(np.float32)[index]
+        held = np.abs(chosen)
+        total += float((xx * held).sum(dtype=np.float64) + (yy * held).sum(dtype=np.float64))
         for first, second in ((xx, xy), (xy, yy)):
             element_vector(first * chosen, second * chosen, *geometry, parts)
             column = assembly.vector(parts)

@@ -60,13 +60,13 @@ class NodeColouring:
 
 
 def _greedy_colours(indptr: npt.NDArray[np.int32], indices: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-    colour = np.full(len(indptr) - 1, -1, dtype=np.int64)
-    for node in range(len(colour)):
-        taken = np.unique(colour[indices[indptr[node] : indptr[node + 1]]])
-        taken = taken[taken >= 0]
-        gaps = np.flatnonzero(taken != np.arange(len(taken)))
-        colour[node] = gaps[0] if len(gaps) else len(taken)
-    return colour
+    starts, neighbours, bits = indptr.tolist(), indices.tolist(), [0] * (len(indptr) - 1)
+    for node in range(len(bits)):
+        taken = 0
+        for other in neighbours[starts[node] : starts[node + 1]]:
+            taken |= bits[other]
+        bits[node] = ~taken & (taken + 1)  # the lowest bit that is free
+    return np.array([bit.bit_length() - 1 for bit in bits], dtype=np.int64)
 
 
 def functional_std(
@@ -93,10 +93,12 @@ def functional_std(
         reaches far and would spoil those of its colour.
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
-    members = sp.csr_matrix((nodes * 1.0, (np.arange(count), colouring.colour)), shape=(count, colours))
     variance = np.empty((count, len(functionals)))
     for i, functional in enumerate(functionals):
-        columns = solve((functional.T @ members).toarray())
+        row = np.repeat(np.arange(count), np.diff(functional.indptr))
+        place = functional.indices.astype(np.int64) * colours + colouring.colour[row]
+        columns = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
+        columns = solve(columns.reshape(2 * count, colours))
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
         variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
     return np.sqrt(np.maximum(variance, 0))

@@ -13,7 +13,7 @@ from rgbmidic._kernels.grid import block_sums, score_sums
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.blocks import BLOCK, block_side
-from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 __all__ = ["displacing_share", "score_covariance"]
 
@@ -31,12 +31,16 @@ _PRIOR = 0.1
 """Blocks for which the region's typical score counts in that window: beside a hole few blocks speak."""
 
 
-def displacing_share(residual: Residual, variance: FloatImage) -> FloatImage:
-    """Variance of each light's scores over what white noise of that `variance` (k, P) would give, (k, P)."""
-    pixels = residual.reference.pixels
-    sums = _score_sums(residual, np.asarray((residual.weights > 0) / variance, dtype=np.float32), BLOCK)
-    ratios = [_score_ratios(x, y, part, count, BLOCK) for x, y, part, count in sums]
-    return np.stack([pixels.from_blocks(np.maximum(r[0] + r[2], _LEAST_RATIO), BLOCK) for r in ratios])
+def displacing_share(reference: Reference, difference: FloatImage, used: BoolArray, variance: FloatImage) -> FloatImage:
+    """Variance of the scores of a residual `difference` (P,) over what white noise of that `variance` (P,) would give:
+    with the gradient of that of the lights, where `used` (k, P), that gives most; (P,)."""
+    most = np.full(variance.size, _LEAST_RATIO, dtype=np.float32)
+    for light, own in enumerate(used):
+        weight = np.divide(own, variance, dtype=np.float32)
+        x, y, part, count = _score_sums(reference, difference[None], weight[None], BLOCK, light)[0]
+        ratios = _score_ratios(x, y, part, count, BLOCK)
+        np.maximum(most, reference.pixels.from_blocks((ratios[0] + ratios[2])[None], BLOCK)[0], out=most)
+    return most
 
 
 def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
@@ -44,7 +48,7 @@ def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
     reference = residual.reference
     used = np.asarray(weights.any(axis=0), dtype=np.float32)
     side = block_side(reference.pixels, reference.mesh.size)
-    x, y, information, _ = _score_sums(residual, weights, side).sum(axis=0)
+    x, y, information, _ = _score_sums(reference, residual.difference, weights, side).sum(axis=0)
     index, shape = reference.pixels.blocks(side)
     count = np.zeros((1, information.size), dtype=np.float32)
     block_sums(used[None], index, count)
@@ -66,12 +70,15 @@ def _share_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
     return np.asarray(np.clip(share, _LEAST_SHARE, 1 - _LEAST_SHARE))
 
 
-def _score_sums(residual: Residual, weights: FloatImage, side: int) -> FloatArray:
-    """Sums (k, 4, rows, columns) over blocks of the lights' scores in x and y, their information, and pixels."""
-    reference = residual.reference
+def _score_sums(
+    reference: Reference, difference: FloatImage, weights: FloatImage, side: int, first: int = 0
+) -> FloatArray:
+    """Sums (n, 4, rows, columns) over blocks of the scores in x and y of n lights from the `first`, their information,
+    and pixels."""
     index, shape = reference.pixels.blocks(side)
     sums = np.zeros((len(weights), 4, shape[0] * shape[1]))
-    score_sums(residual.difference, weights, reference.gradient_x, reference.gradient_y, index, sums)
+    lights = slice(first, first + len(weights))
+    score_sums(difference, weights, reference.gradient_x[lights], reference.gradient_y[lights], index, sums)
     return sums.reshape(len(weights), 4, *shape)
 
 

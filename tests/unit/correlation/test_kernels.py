@@ -11,6 +11,7 @@ import pytest
 from rgbmidic._kernels import correlation as kernels
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic._kernels.threads import set_threads, threads
+from rgbmidic.correlation.reference import _partial_blocks
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 SHAPE = (31, 38)
@@ -56,7 +57,14 @@ def close(found, expected, scale=None):
 
 def moved(case):
     """The arguments that describe pixels moved by a displacement."""
-    return (*case.on_map, case.pixels.origin, case.mesh.elements, case.pixels.barycentric, case.displacement)
+    return (
+        case.pixels.runs,
+        case.pixels.run_offsets,
+        case.pixels.origin,
+        case.mesh.elements,
+        case.pixels.barycentric,
+        case.displacement,
+    )
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (9, 31), (64, 65), (130, 71), (3, 200)])
@@ -130,26 +138,33 @@ def test_hessian_equals_the_naive_twin(outlined):
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_warp_equals_the_naive_twin(motion):
+def test_what_is_brought_back_equals_the_naive_twins(motion):
     case = scene(6, motion)
     case.coefficients[9 + PAD, 20 + PAD] = np.nan
-    out = np.full(case.pixels.rows.size, 7, dtype=np.float32)
-    kernels.warp(case.coefficients, *moved(case), out)
+    given = case.random.uniform(0.2, 1, SHAPE).astype(np.float32)
+    given[case.random.random(SHAPE) < 0.1] = 0
+    given[4:25, 5:30] = 1
+    out, weight = np.full((2, case.pixels.rows.size), 7, dtype=np.float32)
+    kernels.bring_back(case.coefficients, given, _partial_blocks(given), case.weight, *moved(case), out, weight)
     expected = naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement)
     np.testing.assert_allclose(out, expected, atol=0.02)
+    expected = naive.pull_back(given, case.weight, case.pixels, case.mesh, case.displacement)
+    np.testing.assert_allclose(weight, expected, atol=1e-4)
     assert np.isnan(out).all() == (motion == "far outside")
+    assert (weight == 0).all() == (motion == "far outside")
 
 
-def test_warp_without_motion_gives_the_image_up_to_its_last_row_and_column():
+def test_without_motion_the_image_comes_back_up_to_its_last_row_and_column():
     region = Region.from_rectangle((0, 0, SHAPE[1] - 1, SHAPE[0] - 1), SHAPE)
     mesh = Tri3Mesh.from_region(region, 9)
     pixels = PixelMap.from_mesh(mesh, region)
     case = scene(7)
-    case.pixels, case.mesh = pixels, mesh
-    case.on_map, case.displacement = (pixels.local_x, pixels.local_y, pixels.offsets), np.zeros(mesh.nodes.shape)
-    out = np.empty(pixels.rows.size, dtype=np.float32)
-    kernels.warp(case.coefficients, *moved(case), out)
+    case.pixels, case.mesh, case.displacement = pixels, mesh, np.zeros(mesh.nodes.shape)
+    out, weight = np.empty((2, pixels.rows.size), dtype=np.float32)
+    given = np.ones(SHAPE, dtype=np.float32)
+    kernels.bring_back(case.coefficients, given, _partial_blocks(given), np.ones_like(out), *moved(case), out, weight)
     np.testing.assert_allclose(out, pixels.gather(case.image), atol=2e-3)
+    np.testing.assert_array_equal(weight, 1)
 
 
 def test_moments_equal_the_naive_twin_and_leave_out_what_is_unknown():
@@ -160,18 +175,6 @@ def test_moments_equal_the_naive_twin_and_leave_out_what_is_unknown():
     kernels.element_moments(case.reference, warped, case.weight, case.pixels.offsets, out)
     expected = naive.element_moments(case.reference, warped, case.weight, case.pixels)
     np.testing.assert_allclose(out, expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_pulled_back_weights_equal_the_naive_twin(motion):
-    case = scene(9, motion)
-    weight = case.random.uniform(0.2, 1, SHAPE).astype(np.float32)
-    weight[case.random.random(SHAPE) < 0.1] = 0
-    out = np.full(case.weight.size, 7, dtype=np.float32)
-    kernels.pull_back(weight, case.weight, *moved(case), out)
-    expected = naive.pull_back(weight, case.weight, case.pixels, case.mesh, case.displacement)
-    np.testing.assert_allclose(out, expected, atol=1e-4)
-    assert (out == 0).all() == (motion == "far outside")
 
 
 def test_projection_and_interpolation_of_pixel_fields_equal_their_naive_twins():
@@ -207,9 +210,10 @@ def all_outputs(number):
         case.coefficients, case.reference, *case.gradient, case.weight, *moved(case), right, sums
     )
     kernels.element_hessian(*case.gradient, case.weight, *case.on_map, case.pixels.barycentric, hessian)
-    kernels.warp(case.coefficients, *moved(case), warped)
+    kernels.bring_back(
+        case.coefficients, case.image, _partial_blocks(case.image), case.weight, *moved(case), warped, weights
+    )
     kernels.element_moments(case.reference, warped, case.weight, case.pixels.offsets, moments)
-    kernels.pull_back(case.image, case.weight, *moved(case), weights)
     kernels.element_vector(*case.gradient, *case.on_map, case.pixels.barycentric, vector)
     kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     deviation, bend = np.empty((2, count), np.float32), case.random.normal(size=(len(case.mesh.nodes), 2, 3))

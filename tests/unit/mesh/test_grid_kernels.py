@@ -60,4 +60,4 @@ def test_a_grid_of_blocks_is_interpolated_between_their_centres(pixels):
     plane = (3 + 0.2 * y[:, None] - 0.1 * x).astype(np.float32)
     row = np.clip(pixels.rows - top, y[0], y[-1])
     column = np.clip(pixels.columns - left, x[0], x[-1])
-    np.testing.assert_allclose(pixels.from_blocks(plane, side), 3 + 0.2 * row - 0.1 * column, atol=1e-4)
+    np.testing.assert_allclose(pixels.from_blocks(plane[None], side)[0], 3 + 0.2 * row - 0.1 * column, atol=1e-4)
