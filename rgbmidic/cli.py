@@ -261,8 +261,9 @@ def history(
     Places are in px on the reference; each option may be given several times.
     """
     from rgbmidic.report import history_figure, save_figure
-    from rgbmidic.results import Channels, Result, history_rows, probes_of, read_histories, write_histories
+    from rgbmidic.results import Channels, Result, history_rows, probes_of, write_histories
     from rgbmidic.results.files import check_file
+    from rgbmidic.results.probing import read_histories
     from rgbmidic.settings import read_test
 
     picture = out.with_suffix(".png")

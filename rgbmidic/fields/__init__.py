@@ -4,10 +4,13 @@ from rgbmidic.fields.covariance import NodalCovariance
 from rgbmidic.fields.differences import difference_std, frame_covariance, reference_share
 from rgbmidic.fields.evaluate import at_nodes, at_pixels, field_rms
 from rgbmidic.fields.fill import fill
+from rgbmidic.fields.gauges import Gauge, StrainGauge
 from rgbmidic.fields.high_pass import SIGMA, high_pass
+from rgbmidic.fields.history import History, Nodal, Probe
 from rgbmidic.fields.locate import Places
+from rgbmidic.fields.means import Mean
 from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
-from rgbmidic.fields.probes import PROBES, Gauge, History, Mean, Nodal, Probe, StrainGauge, make_probe
+from rgbmidic.fields.probes import PROBES, make_probe
 from rgbmidic.fields.rates import Rates, rates
 from rgbmidic.fields.rigid import RigidMotion
 from rgbmidic.fields.strain import StrainGauges, shortest_gauge, strain_of

@@ -3,7 +3,8 @@
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.histories import Histories, Told, history_rows, read_histories, write_histories
+from rgbmidic.results.histories import Histories, Told
+from rgbmidic.results.history_table import history_rows, write_histories
 from rgbmidic.results.measures import (
     exposure,
     frame_times,
@@ -40,7 +41,6 @@ __all__ = [
     "frame_times",
     "history_rows",
     "probes_of",
-    "read_histories",
     "reference_frames",
     "scale_of",
     "shared_part",

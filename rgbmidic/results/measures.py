@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rgbmidic.fields.differences import reference_share
-from rgbmidic.fields.units import Units
 from rgbmidic.results.quantities import UNKNOWN_TIME
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section
 from rgbmidic.typing import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from rgbmidic.fields.units import Units
 
 __all__ = ["exposure", "frame_times", "probes_of", "reference_frames", "scale_of", "shared_part", "units_of"]
 
@@ -33,6 +35,8 @@ def probes_of(result: Result) -> ProbeSettings:
 
 def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
     """The units of a result, with its own ``[scale]`` or another one in its place."""
+    from rgbmidic.fields.units import Units
+
     scale = scale_of(result) if scale is None else scale
     return Units.of(scale, timed=frame_times(result, scale) is not None)
 
@@ -84,4 +88,6 @@ def reference_frames(result: Result) -> BoolArray:
 
 def shared_part(result: Result) -> float:
     """Share of every frame's variance that the reference puts into all alike (`rgbmidic.fields.differences`)."""
+    from rgbmidic.fields.differences import reference_share
+
     return reference_share(len(result.setting("frames", "reference", [0])))

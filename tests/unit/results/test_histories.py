@@ -23,9 +23,9 @@ from rgbmidic.results import (
     Result,
     ResultStore,
     probes_of,
-    read_histories,
     write_histories,
 )
+from rgbmidic.results.probing import read_histories
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
 
 NUMBERS = (0, 1, 2, 4, 5, 6, 7, 8)
