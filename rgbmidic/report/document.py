@@ -16,8 +16,9 @@ from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
 from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
 from rgbmidic.report.style import embedded
-from rgbmidic.results import QUANTITIES, Physical, Result, probes_of, read_histories
+from rgbmidic.results import QUANTITIES, Physical, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete, writing
+from rgbmidic.results.probing import read_histories
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
