@@ -94,7 +94,7 @@ class Verdict:
     def of(cls, solution: Solution, pair: Pair) -> Verdict:
         """Error of the field without its border element, errors and ratios (N, ...) at the nodes."""
         low, high = square(pair.size)
-        field = field_error(solution.nodes, solution.elements, solution.displacement, pair.exact, (low + 25, high - 25))
+        field = field_error(solution, pair.exact, (low + 25, high - 25))
         error = solution.displacement - at_nodes(pair.exact, solution.nodes)
         strain = solution.strain - true_strain(pair, solution.nodes)
         return cls(
