@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
@@ -44,8 +45,6 @@ class NodalCovariance:
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh) -> Self:
         """Of the linear fit (the inverse mass matrix), carried through the recovery of the nodal values."""
-        from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
-
         mass = mass_matrix(mesh)
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
         inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale), _RINGS) @ scale

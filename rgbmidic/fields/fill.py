@@ -9,16 +9,13 @@ a random walk.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 
+from rgbmidic.correlation import NodeStatus, Solution
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    from rgbmidic.correlation import Solution
 
 __all__ = ["fill"]
 
@@ -28,8 +25,6 @@ def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
 
     Filled nodes get `NodeStatus.FILLED` and a larger `displacement_std`; strains are left as they are.
     """
-    from rgbmidic.correlation import NodeStatus
-
     measured = solution.measured
     if measured.all() or measured.sum() < 6:
         return solution

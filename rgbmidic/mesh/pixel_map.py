@@ -1,7 +1,4 @@
-"""The pixel map: each pixel of the region is owned by exactly one element, and stored with its element.
-
-Kernels are loaded where they are called: who reads a result needs the mesh and no compiler.
-"""
+"""The pixel map: each pixel of the region is owned by exactly one element, and stored with its element."""
 
 from __future__ import annotations
 
@@ -12,6 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.grid import block_index, from_image, to_image
+from rgbmidic._kernels.mesh import claim_pixels, list_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
@@ -82,8 +81,6 @@ class PixelMap:
         RegionError
             No pixel of the region lies in the mesh.
         """
-        from rgbmidic._kernels.mesh import claim_pixels, list_pixels
-
         owner = np.where(region.mask, np.int32(-1), np.int32(-2))
         counts = np.zeros(len(mesh.elements), dtype=np.int64)
         claim_pixels(mesh.nodes, mesh.elements, owner, counts)
@@ -135,8 +132,6 @@ class PixelMap:
     def window(self, values: FloatImage, side: int = 1) -> FloatImage:
         """`values` (n, P) as images of the rectangle `bounds`, grown to whole blocks of `side` px on the right and
         below; 0 where no pixel is owned."""
-        from rgbmidic._kernels.grid import to_image
-
         top, left, height, width = self.bounds
         images = np.zeros((len(values), -(-height // side) * side, -(-width // side) * side), dtype=np.float32)
         to_image(self.runs, self.rows, self.columns, top, left, values, images)
@@ -144,8 +139,6 @@ class PixelMap:
 
     def from_window(self, images: FloatImage) -> FloatImage:
         """Such images (n, h, w) at the owned pixels (n, P)."""
-        from rgbmidic._kernels.grid import from_image
-
         top, left, _, _ = self.bounds
         out = np.empty((len(images), self.rows.size), dtype=np.float32)
         from_image(self.runs, self.rows, self.columns, top, left, images, out)
@@ -167,8 +160,6 @@ class PixelMap:
 @lru_cache(maxsize=2)
 def _blocks(pixels: PixelMap, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
     """Kept for the two sides that every frame of a test needs."""
-    from rgbmidic._kernels.grid import block_index
-
     top, left, height, width = pixels.bounds
     grid = -(-height // side), -(-width // side)
     index = np.empty(pixels.rows.size, dtype=np.int32)
