@@ -32,7 +32,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rgbmidic._kernels.threads import threads
-from rgbmidic.correlation import Solution, correlate
+from rgbmidic.correlation import correlate
 from rgbmidic.fields import at_pixels
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.images import IlluminationImages
@@ -248,18 +248,12 @@ def measured(study: str, index: int, contender: Contender, *, wrinkles: float, s
         normalise=contender.normalise,
         statistics=not contender.masks,
     )
-    error = field_error(solution, exact, (margin + 25, far - 25))
-    return replace(error, image=float(np.sqrt(np.nanmean(image**2))))
-
-
-def field_error(solution: Solution, exact: FloatArray, inside: tuple[int, int]) -> Error:
-    """Error over the pixels of a square, both ends in it."""
-    mesh, part = Tri3Mesh(nodes=solution.nodes, elements=solution.elements), slice(inside[0], inside[1] + 1)
-    error = (at_pixels(mesh, solution.displacement, exact.shape[1:]) - exact)[:, part, part].reshape(2, -1)
+    mesh, inside = Tri3Mesh(nodes=solution.nodes, elements=solution.elements), slice(margin + 25, far - 24)
+    error = (at_pixels(mesh, solution.displacement, (size, size)) - exact)[:, inside, inside].reshape(2, -1)
     bias = np.nanmean(error, axis=1)
     scatter, rms = np.sqrt(np.nanmean((error - bias[:, None]) ** 2)), np.sqrt(np.nanmean(error**2))
-    missing = float(np.isnan(error).any(axis=0).mean())
-    return Error((float(bias[0]), float(bias[1])), float(scatter), float(rms), missing, 0.0)
+    missing, of_image = float(np.isnan(error).any(axis=0).mean()), float(np.sqrt(np.nanmean(image**2)))
+    return Error((float(bias[0]), float(bias[1])), float(scatter), float(rms), missing, of_image)
 
 
 def table(
