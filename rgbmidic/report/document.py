@@ -30,7 +30,7 @@ __all__ = ["REPORT", "remove_report", "write_report"]
 REPORT = "report.html"
 """Name of the report that lies in a result's folder."""
 
-_MOST = 400
+_MOST = 200
 """Frames that the course of a test is drawn from at most: more lie closer than the dots of a page."""
 _KEY = 3
 _LISTED = 20
