@@ -165,7 +165,7 @@ class _Report:
         if lost > _LOST:
             yield f"{lost:.0%} of the nodes are not measured"
         if gaps := result.provenance.get("lost_frames"):
-            yield f"frames that the camera lost between those it kept: {gaps}"
+            yield f"frames missing between those that are there, by number or time: {gaps}"
         yield from self._doubts()
         if told.units.mm_per_pixel is None:
             yield "no image scale is stated (`scale.mm_per_pixel`): lengths are in px"

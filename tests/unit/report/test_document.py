@@ -135,7 +135,7 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["virtual strain gauge"] == f"{3 * MESH.size:.4g} px ({0.15 * MESH.size:.3g} mm), at every node"
     assert page.rows["image filter"].startswith("[1 2 1]")
     assert page.rows["u_std"].startswith("mm | ")
-    assert "lost between those it kept: 2" in page.words
+    assert "by number or time: 2" in page.words
     assert "no image scale" not in page.words
 
 
