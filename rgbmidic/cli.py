@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,9 +19,12 @@ from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
     from rgbmidic.results import Result
+    from rgbmidic.settings import ProbeSettings
 
 __all__ = ["app", "main"]
 
+_WIDE = 400
+"""Columns that a table may take: where the terminal has fewer it breaks the lines, and nothing is cut off."""
 _CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -36,7 +40,32 @@ BlackLevel = Annotated[float | None, typer.Option("--black-level", help="Grey le
 WhiteLevel = Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level.")]
 Shape = Annotated[str, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")]
 Dtype = Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")]
+Told = Annotated[
+    Path | None,
+    typer.Option("--test", help="TEST.toml whose [scale], [setup] and [probes] count instead of those kept."),
+]
 Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")]
+
+_PLACES = {
+    "points": ("--point", "X,Y"),
+    "lines": ("--line", "X0,Y0:X1,Y1"),
+    "circles": ("--circle", "X,Y:R"),
+    "regions": ("--region", "X0,Y0:X1,Y1"),
+    "gauges": ("--gauge", "X0,Y0:X1,Y1"),
+    "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1"),
+    "strain_gauges": ("--strain-gauge", "X,Y:LENGTH"),
+}
+"""Keys of ``[probes]`` with the option and the form of a place."""
+_Texts = list[str] | None
+Points = Annotated[_Texts, typer.Option("--point", metavar="X,Y", help="Displacement there.")]
+Lines = Annotated[_Texts, typer.Option("--line", metavar="X0,Y0:X1,Y1", help="Mean displacement along it.")]
+Circles = Annotated[_Texts, typer.Option("--circle", metavar="X,Y:R", help="Mean displacement over it.")]
+Regions = Annotated[_Texts, typer.Option("--region", metavar="X0,Y0:X1,Y1", help="Mean displacement over it.")]
+Gauges = Annotated[_Texts, typer.Option("--gauge", metavar="X0,Y0:X1,Y1", help="Between two points that move.")]
+StraightGauges = Annotated[
+    _Texts, typer.Option("--straight-gauge", metavar="X0,Y0:X1,Y1", help="Along the line as it was.")
+]
+StrainGauges = Annotated[_Texts, typer.Option("--strain-gauge", metavar="X,Y:LENGTH", help="Virtual strain gauge.")]
 
 
 def main() -> None:
@@ -120,9 +149,10 @@ def finish(
 
 def _conclude(result: Result, started: float, *, draw: bool) -> None:
     """Draw a finished result and tell what became of its frames; a failure where none of them is measured."""
-    from rgbmidic.report import remove_figures, write_figures
+    from rgbmidic.report import remove_figures, remove_report, write_figures
 
     remove_figures(result.path / "figures")
+    remove_report(result.path)
     if draw:
         write_figures(result, result.path / "figures")
     _print_summary(result, time.perf_counter() - started)
@@ -168,14 +198,118 @@ def figures(
 def export(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="File to write.")],
-    to: Annotated[str, typer.Option("--to", help="Format: npz or csv.")] = "npz",
+    to: Annotated[str, typer.Option("--to", help="Format: npz, csv or hdf5.")] = "npz",
+    test: Told = None,
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
-    """Write a result into one file for another program."""
+    """Write a result into one file for another program: ParaView, MATLAB, xarray, a spreadsheet."""
     from rgbmidic.results import Result, export_result
+    from rgbmidic.settings import read_test
 
-    export_result(Result.open(result, partial=partial), to, out, overwrite=overwrite)
+    scale = None if test is None else read_test(test).scale
+    export_result(Result.open(result, partial=partial), to, out, scale=scale, overwrite=overwrite)
+
+
+@app.command()
+def report(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    out: Annotated[Path | None, typer.Option("--out", help="HTML file; by default RESULT/report.html.")] = None,
+    test: Told = None,
+    frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10, of which maps are shown.")] = "",
+    overwrite: Overwrite = False,
+    partial: Partial = False,
+) -> None:
+    """Write the report of a test: one HTML page, to be read in any browser and printed."""
+    from rgbmidic.report import REPORT, write_report
+    from rgbmidic.results import Result
+    from rgbmidic.settings import read_test
+
+    file, settings = out or result / REPORT, None if test is None else read_test(test)
+    chosen = _whole_numbers(frames, "--frames") if frames else None
+    opened = Result.open(result, partial=partial)
+    write_report(opened, file, settings=settings, frames=chosen, overwrite=overwrite)
+    print(file)
+
+
+@app.command()
+def history(
+    folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
+    points: Points = None,
+    lines: Lines = None,
+    circles: Circles = None,
+    regions: Regions = None,
+    gauges: Gauges = None,
+    straight_gauges: StraightGauges = None,
+    strain_gauges: StrainGauges = None,
+    measure: Annotated[
+        str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")
+    ] = None,
+    window: Annotated[int | None, typer.Option("--window", help="Frames for rates, 4 or more; 0: no rates.")] = None,
+    rigid: Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")] = None,
+    channels: Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then a column each.")] = None,
+    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
+    area: Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")] = None,
+    force: Annotated[str | None, typer.Option("--force", help="Channel with the force (_N or _kN).")] = None,
+    test: Annotated[Path | None, typer.Option("--test", help="TEST.toml whose [scale] and [probes] count now.")] = None,
+    overwrite: Overwrite = False,
+    partial: Partial = False,
+) -> None:
+    """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
+
+    Places are in px on the reference; each option may be given several times.
+    """
+    from rgbmidic.report import history_figure, save_figure
+    from rgbmidic.results import Channels, Result, history_rows, probes_of, write_histories
+    from rgbmidic.results.files import check_file
+    from rgbmidic.results.probing import read_histories
+    from rgbmidic.settings import read_test
+
+    picture = out.with_suffix(".png")
+    for file in (out, picture):
+        check_file(file, overwrite=overwrite)
+    result = Result.open(folder, partial=partial)
+    settings = None if test is None else read_test(test)
+    given = (points, lines, circles, regions, gauges, straight_gauges, strain_gauges)
+    stated = probes_of(result) if settings is None else settings.probes
+    histories = read_histories(
+        result,
+        _with_probes(stated, given, measure=measure, window=window, rigid_motion=rigid),
+        scale=None if settings is None else settings.scale,
+        channels=None if channels is None else Channels.read(channels),
+        offset=offset,
+        area=area,
+        force=force,
+    )
+    write_histories(histories, out, overwrite=overwrite)
+    save_figure(history_figure(histories), picture)
+    for remark in histories.remarks:
+        _messages.print(f"note: {remark}", soft_wrap=True, markup=False, highlight=False)
+    _print_table(f"{len(histories.frames)} frames", *history_rows(histories))
+    print(f"table: {out}   picture: {picture}")
+
+
+def _with_probes(stated: ProbeSettings, given: Sequence[list[str] | None], **changes: Any) -> ProbeSettings:
+    """The probes of the settings and, after them, those of the command line, in the order of `_PLACES`."""
+    for (key, (option, form)), texts in zip(_PLACES.items(), given, strict=True):
+        changes[key] = (*getattr(stated, key), *(command.read_place(text, option, form) for text in texts or ()))
+    return replace(stated, **{key: value for key, value in changes.items() if value is not None})
+
+
+@app.command()
+def scale(
+    points: Annotated[str, typer.Argument(metavar="X0,Y0:X1,Y1", help="Two points of a known distance, px.")],
+    length: Annotated[float, typer.Option("--length", metavar="MM", help="Their distance in mm.")],
+    length_std: Annotated[float, typer.Option("--length-std", metavar="MM", help="Its standard uncertainty.")] = 0.0,
+    point_std: Annotated[float, typer.Option("--point-std", metavar="PX", help="Of each point, px.")] = 0.5,
+) -> None:
+    """Millimetres per pixel, with its uncertainty, from two points on an image and their distance."""
+    from rgbmidic.fields import Units
+
+    x0, y0, x1, y1 = command.read_place(points, "the points", "X0,Y0:X1,Y1")
+    units = Units.from_points([[x0, y0], [x1, y1]], length, length_std=length_std, point_std=point_std)
+    print(f"[scale]\nmm_per_pixel = {units.mm_per_pixel:.6g}\nmm_per_pixel_std = {units.mm_per_pixel_std:.2g}")
 
 
 @app.command()
@@ -367,7 +501,7 @@ def _print_table(
     for row in rows:
         table.add_row(*row)
     print(title)
-    Console(soft_wrap=True).print(table)
+    Console(soft_wrap=True, width=_WIDE).print(table)
     for heading, meaning in (words or {}).items():
         print(f"  {heading}: {meaning}")
     print()

@@ -13,7 +13,7 @@ from rgbmidic.errors import InputError, RgbmidicError
 if TYPE_CHECKING:
     import typer
 
-__all__ = ["FAILURE", "execute", "fail", "help_where_alone", "main", "read_shape"]
+__all__ = ["FAILURE", "execute", "fail", "help_where_alone", "main", "read_place", "read_shape"]
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 
@@ -65,6 +65,27 @@ def help_where_alone(context: typer.Context) -> None:
     """Print the help of a group of commands where none of them is named."""
     if context.invoked_subcommand is None:
         print(context.get_help())
+
+
+def read_place(text: str, option: str, form: str) -> tuple[float, ...]:
+    """The numbers of a place that is stated in a `form` such as ``"X0,Y0:X1,Y1"``.
+
+    Raises
+    ------
+    InputError
+        It is not of that form.
+    """
+    groups = [part.split(",") for part in text.split(":")]
+    try:
+        numbers = [[float(number) for number in group] for group in groups]
+    except ValueError:
+        numbers = []
+    if [len(group) for group in numbers] != [len(group.split(",")) for group in form.split(":")]:
+        raise InputError(f"{option} is {form} in px, such as {_EXAMPLES[form]}, not {text!r}")
+    return tuple(number for group in numbers for number in group)
+
+
+_EXAMPLES = {"X,Y": "120,85.5", "X0,Y0:X1,Y1": "40,60:200,60", "X,Y:R": "120,85:30", "X,Y:LENGTH": "120,85:75"}
 
 
 def read_shape(text: str | None) -> tuple[int, int] | None:

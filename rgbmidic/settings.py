@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from rgbmidic.errors import ConfigurationError
 
@@ -24,18 +24,22 @@ __all__ = [
     "FrameKind",
     "FrameSettings",
     "IlluminationSettings",
+    "ProbeSettings",
     "RegionSettings",
     "ScaleSettings",
+    "SetupSettings",
     "SolverSettings",
     "TestSettings",
     "WeightSettings",
     "check_names",
     "convert_value",
     "read_range",
+    "read_section",
     "read_test",
     "read_toml",
 ]
 
+_Section = TypeVar("_Section")
 FrameKind = Literal["bayer", "rgb", "monochrome"]
 
 ELEMENT_SIZE = 25.0
@@ -253,13 +257,131 @@ class SolverSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleSettings:
-    """Physical units (``[scale]``): millimetres per pixel, frames per second; None where not known."""
+    """Physical units (``[scale]``); they change nothing of what is measured, only how it is told.
+
+    Attributes
+    ----------
+    mm_per_pixel
+        Millimetres on the specimen for a pixel; None: lengths are told in px.
+    mm_per_pixel_std
+        Its standard uncertainty.
+    frame_rate
+        Frames per second, for files that do not tell when their frames were taken.
+    """
 
     mm_per_pixel: float | None = _bounded(None, above=0)
+    mm_per_pixel_std: float = _bounded(0.0, at_least=0)
     frame_rate: float | None = _bounded(None, above=0)
 
     def __post_init__(self) -> None:
         _check_bounds(self, "scale")
+        if self.mm_per_pixel_std and self.mm_per_pixel is None:
+            raise ConfigurationError(
+                "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing"
+            )
+
+
+_Place2 = tuple[tuple[float, float], ...]
+_Place3 = tuple[tuple[float, float, float], ...]
+_Place4 = tuple[tuple[float, float, float, float], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbeSettings:
+    """What `rgbmidic history` reads off a result (``[probes]``); nothing of what is measured depends on it.
+
+    All places and lengths are in px on the reference.
+
+    Attributes
+    ----------
+    points
+        (x, y).
+    lines, regions
+        (x0, y0, x1, y1): both ends of a line, two corners of a rectangle, for the mean displacement.
+    circles
+        (x, y, radius), for the mean displacement.
+    gauges
+        (x0, y0, x1, y1): extensometers between two points, along the line between them as they move.
+    straight_gauges
+        The same, along the line as it was on the reference.
+    strain_gauges
+        (x, y, length): virtual strain gauges.
+    measure
+        Strain measure of the strain gauges.
+    window
+        Frames that velocities, accelerations and strain rates are taken over; 0: none are.
+    rigid_motion
+        ``"tell"``: shift and rotation of the measured field as a whole are told beside the probes; ``"remove"``: they
+        are also taken off the displacements.
+    """
+
+    points: _Place2 = ()
+    lines: _Place4 = ()
+    circles: _Place3 = ()
+    regions: _Place4 = ()
+    gauges: _Place4 = ()
+    straight_gauges: _Place4 = ()
+    strain_gauges: _Place3 = ()
+    measure: Literal["green-lagrange", "hencky", "biot", "engineering"] = "green-lagrange"
+    window: int = _bounded(0, at_least=0)
+    rigid_motion: Literal["none", "tell", "remove"] = "none"
+
+    def __post_init__(self) -> None:
+        _check_bounds(self, "probes")
+        if 0 < self.window < 4:
+            raise ConfigurationError(f"probes.window must be 0 or at least 4 frames, not {self.window}")
+        for key in ("circles", "strain_gauges"):
+            if any(place[2] <= 0 for place in getattr(self, key)):
+                raise ConfigurationError(f"probes.{key} are [x, y, size] with a size above 0")
+
+    @property
+    def places(self) -> list[tuple[str, tuple[float, ...]]]:
+        """Kind, such as ``"straight_gauge"``, and place of every probe."""
+        return [
+            (entry.name[:-1], place)
+            for entry in fields(self)
+            if entry.name not in ("measure", "window", "rigid_motion")
+            for place in getattr(self, entry.name)
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetupSettings:
+    """What only the person in the laboratory knows (``[setup]``), in words for `rgbmidic report`; None: not stated.
+
+    The good-practice guide of the International Digital Image Correlation Society asks for these (section 5 and
+    appendix; doi:10.32720/idics/gpg.ed1).
+
+    Attributes
+    ----------
+    camera
+        Maker and model of camera and sensor.
+    lens, aperture
+        Maker, model and focal length; f-number.
+    stand_off
+        Distance from the lens to the specimen.
+    lamps
+        Kind, colours and places of the lamps, filters and polarisers.
+    pattern
+        How the speckle was made.
+    specimen, loading
+        What was tested, and how.
+    operator
+        Who tested.
+    notes
+        Anything else.
+    """
+
+    camera: str | None = None
+    lens: str | None = None
+    aperture: str | None = None
+    stand_off: str | None = None
+    lamps: str | None = None
+    pattern: str | None = None
+    specimen: str | None = None
+    loading: str | None = None
+    operator: str | None = None
+    notes: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,7 +390,7 @@ class TestSettings:
 
     Attributes
     ----------
-    frames, region, illumination, weights, solver, scale
+    frames, region, illumination, weights, solver, scale, setup, probes
         The sections of the same name.
     calibration_file
         ``file`` in ``[calibration]``; needed for colour frames.
@@ -291,6 +413,8 @@ class TestSettings:
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
     scale: ScaleSettings = field(default_factory=ScaleSettings)
+    setup: SetupSettings = field(default_factory=SetupSettings)
+    probes: ProbeSettings = field(default_factory=ProbeSettings)
     base: Path = field(default_factory=Path, metadata={"key": ""})
 
     def __post_init__(self) -> None:
@@ -352,6 +476,13 @@ class TestSettings:
             elif section and value is not None:
                 document.setdefault(section, {})[key] = _plain(value)
         return document
+
+
+def read_section(kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".") -> _Section:
+    """One section of the settings from its keys and plain values; errors as `TestSettings.from_mapping`."""
+    hints = get_type_hints(kind)
+    check_names(content, hints, "key", f"[{name}]")
+    return kind(**{key: convert_value(content[key], hints[key], f"{name}.{key}", Path(base)) for key in content})
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

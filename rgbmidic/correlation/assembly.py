@@ -74,7 +74,8 @@ class Assembly:
     def matrix(self, blocks: FloatArray) -> sp.csc_matrix:
         """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N)."""
         full = blocks[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
-        return self.with_structure(np.bincount(self.slots, weights=full.ravel(), minlength=len(self.indices)))
+        sums = np.bincount(self.slots, weights=full.ravel(), minlength=len(self.indices))
+        return self.with_structure(sums.astype(np.float64, copy=False))
 
     def with_structure(self, data: FloatArray) -> sp.csc_matrix:
         """The matrix of these data in the structure of the assembled ones."""

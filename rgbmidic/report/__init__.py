@@ -1,5 +1,6 @@
 """What is made of a finished result: figures, the pictures beside it, pages of text and pictures."""
 
+from rgbmidic.report.document import REPORT, remove_report, write_report
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -11,20 +12,25 @@ from rgbmidic.report.figures import (
     share_figure,
 )
 from rgbmidic.report.gallery import remove_figures, write_figures
+from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
 from rgbmidic.report.style import save_figure
 
 __all__ = [
     "MAPS",
+    "REPORT",
     "Page",
     "brightness_figure",
     "convergence_figure",
+    "history_figure",
     "map_figure",
     "mask_figure",
     "reflection_figure",
     "remove_figures",
+    "remove_report",
     "residual_figure",
     "save_figure",
     "share_figure",
     "write_figures",
+    "write_report",
 ]

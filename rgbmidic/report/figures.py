@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from rgbmidic.report.style import (
     BAR,
     GAP,
     LIGHT_COLOURS,
+    LINES,
     NUMBERS,
     add_colour_bar,
     colour_scale,
@@ -33,12 +35,14 @@ __all__ = [
     "MAPS",
     "brightness_figure",
     "convergence_figure",
+    "field_figure",
     "map_figure",
     "mask_figure",
     "reflection_figure",
     "residual_figure",
     "share_figure",
     "shown_frames",
+    "spread",
 ]
 
 MAPS = {
@@ -69,6 +73,11 @@ def shown_frames(result: Result) -> tuple[int, ...]:
     return deformed or tuple(np.flatnonzero(finished).tolist()) or tuple(range(len(result)))
 
 
+def spread(frames: Sequence[int], most: int) -> tuple[int, ...]:
+    """Some of the frames, evenly spaced up to the last one."""
+    return tuple(sorted({frames[int(i)] for i in np.linspace(len(frames) - 1, 0, min(most, len(frames))).round()}))
+
+
 def map_figure(result: Result, frame: int, kind: str) -> Figure:
     """Maps of the quantities of one of `MAPS` in one frame, around the mesh; blank where not measured.
 
@@ -82,6 +91,14 @@ def map_figure(result: Result, frame: int, kind: str) -> Figure:
     record = result.frame(frame)
     maps = {_label(name): (record.values[name], _scale(record, name, kind)) for name in MAPS[kind]}
     return _maps(result, maps, "plasma" if kind in _POSITIVE else "viridis", _frame_title(result, frame, record))
+
+
+def field_figure(
+    result: Result, frame: int, fields: Mapping[str, tuple[FloatArray, FloatArray]], *, positive: bool = False
+) -> Figure:
+    """Maps of nodal fields (N,) of one frame by their labels, each with its uncertainty, as `map_figure` draws them."""
+    maps = {label: (values, _norm(values, std, positive=positive)) for label, (values, std) in fields.items()}
+    return _maps(result, maps, "plasma" if positive else "viridis", _frame_title(result, frame, result.frame(frame)))
 
 
 def share_figure(result: Result, frame: int) -> Figure:
@@ -150,11 +167,9 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
 
     def draw(axes: list[Axes]) -> None:
         for axis, (label, values) in zip(axes, panels.items(), strict=True):
-            for light, series in zip(result.lights, values[frames].T, strict=True):
-                colour = LIGHT_COLOURS.get(light)
-                axis.plot(
-                    result.number[frames], series, marker="o", markersize=2.5, linewidth=1, label=light, color=colour
-                )
+            for light, line, series in zip(result.lights, cycle(LINES), values[frames].T, strict=False):
+                style: dict[str, Any] = {"linestyle": line, "color": LIGHT_COLOURS.get(light)}
+                axis.plot(result.number[frames], series, marker="o", markersize=2.5, linewidth=1, label=light, **style)
             if np.nanmin(values, initial=0) >= 0:
                 axis.set_ylim(bottom=0)
             finish_plot(axis, "frame", label)
@@ -164,14 +179,18 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
 
 
 def _scale(record: FrameRecord, name: str, kind: str) -> Normalize | None:
-    """Colours of a quantity, ruled by the nodes whose uncertainty is ordinary; None where nothing is measured."""
     values = record.values[name]
+    std = record.values.get(f"{name}_std", np.zeros(len(values)))
+    return _norm(values, std, positive=kind in _POSITIVE)
+
+
+def _norm(values: FloatArray, std: FloatArray, *, positive: bool) -> Normalize | None:
+    """Colours of a quantity, ruled by the nodes whose uncertainty is ordinary; None where nothing is measured."""
     known = np.isfinite(values)
     if not known.any():
         return None
-    std = record.values.get(f"{name}_std", np.zeros(len(values)))
     doubtful = std > _DOUBTFUL * np.median(std[known])
-    return colour_scale(values[known & ~doubtful], positive=kind in _POSITIVE)
+    return colour_scale(values[known & ~doubtful], positive=positive)
 
 
 def _maps(

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -19,6 +17,7 @@ from rgbmidic.report.figures import (
     residual_figure,
     share_figure,
     shown_frames,
+    spread,
 )
 from rgbmidic.report.style import save_figure
 from rgbmidic.results import Result
@@ -61,7 +60,7 @@ def write_figures(result: Result, folder: Path | str, frames: Sequence[int] | No
     folder = Path(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    frames = _spread(shown_frames(result)) if frames is None else frames
+    frames = spread(shown_frames(result), _FRAMES) if frames is None else frames
     for frame in frames:
         result.frame(frame)  # what is wrong with one is told before the first picture
     files = []
@@ -95,8 +94,3 @@ def _figures(result: Result, frames: Sequence[int]) -> Iterator[tuple[str, Figur
         made["shares"] = share_figure(result, frame) if len(result.lights) > 1 else None
         made |= {"masks": mask_figure(result, frame), "reflections": reflection_figure(result, frame)}
         yield from ((f"{kind}_{frame:06d}", figure) for kind, figure in made.items() if figure is not None)
-
-
-def _spread(frames: Sequence[int]) -> list[int]:
-    """Some of the frames, evenly spaced up to the last one."""
-    return sorted({frames[int(i)] for i in np.linspace(len(frames) - 1, 0, min(_FRAMES, len(frames))).round()})

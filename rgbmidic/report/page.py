@@ -9,10 +9,15 @@ from pathlib import Path
 
 __all__ = ["Page"]
 
-_STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
-table{border-collapse:collapse;font-size:13px;margin:1rem 0}td,th{border:1px solid #ccc;padding:.25rem .5rem;
-text-align:left;vertical-align:top}th{background:#f3f3f3}img{max-width:100%}figcaption{color:#555;font-size:13px}
-figure{margin:1rem 0}"""
+_STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
+h1{line-height:1.2}h2{margin-top:2.2rem;border-bottom:1px solid #ccc}
+.table{overflow-x:auto}table{border-collapse:collapse;font-size:13px;margin:1rem 0}
+td,th{border:1px solid #ccc;padding:.25rem .5rem;text-align:left;vertical-align:top;overflow-wrap:anywhere}
+td:first-child,th{overflow-wrap:normal}th{background:#f3f3f3}
+img{max-width:100%;max-height:54rem}figcaption{color:#555;font-size:13px}figure{margin:1rem 0}
+@media print{@page{size:A4;margin:14mm}body{font-size:10pt;max-width:none;margin:0;padding:0}table{font-size:8.5pt}
+figure,tr,li{break-inside:avoid}h1,h2{break-after:avoid}thead{display:table-header-group}
+img{max-height:112mm}.table{overflow:visible}}"""
 
 
 class Page:
@@ -33,6 +38,11 @@ class Page:
         self._markdown.append(text)
         self._html.append(f"<p>{_inline(text)}</p>")
 
+    def bullets(self, texts: Sequence[str]) -> None:
+        """A list of texts; words between backquotes are code."""
+        self._markdown.append("\n".join(f"- {text}" for text in texts))
+        self._html.append("<ul>" + "".join(f"<li>{_inline(text)}</li>" for text in texts) + "</ul>")
+
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """A table of texts."""
         lines = [header, ["---"] * len(header), *rows]
@@ -41,26 +51,33 @@ class Page:
         )
         head = "".join(f"<th>{_inline(cell)}</th>" for cell in header)
         body = "".join("<tr>" + "".join(f"<td>{_inline(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        self._html.append(f"<table><tr>{head}</tr>{body}</table>")
+        self._html.append(
+            f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+        )
 
-    def picture(self, file: str, caption: str) -> None:
-        """A picture that lies in the page's folder."""
-        self._markdown.append(f"![{caption}]({file})\n\n*{caption}*")
+    def picture(self, source: str, caption: str) -> None:
+        """A picture that lies in the page's folder, or is embedded (`rgbmidic.report.style.embedded`)."""
+        self._markdown.append(f"![{caption}]({source})\n\n*{caption}*")
         cell = html.escape(caption)
         self._html.append(
-            f'<figure><img src="{html.escape(file)}" alt="{cell}"><figcaption>{cell}</figcaption></figure>'
+            f'<figure><img src="{html.escape(source)}" alt="{cell}"><figcaption>{cell}</figcaption></figure>'
+        )
+
+    @property
+    def html(self) -> str:
+        """The page as HTML."""
+        title, body = html.escape(self.title), "\n".join(self._html)
+        return (
+            f'<!doctype html><html lang="en"><meta charset="utf-8">'
+            f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>'
+            f"<style>{_STYLE}</style>{body}</html>\n"
         )
 
     def write(self, folder: Path) -> tuple[Path, Path]:
         """Write both pages; gives their paths."""
         markdown, page = folder / "report.md", folder / "report.html"
         markdown.write_text("\n\n".join(self._markdown) + "\n", encoding="utf-8")
-        title, body = html.escape(self.title), "\n".join(self._html)
-        page.write_text(
-            f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
-            f"<style>{_STYLE}</style>{body}</html>\n",
-            encoding="utf-8",
-        )
+        page.write_text(self.html, encoding="utf-8")
         return markdown, page
 
 

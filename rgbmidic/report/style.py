@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -22,12 +24,14 @@ __all__ = [
     "BAR",
     "GAP",
     "LIGHT_COLOURS",
+    "LINES",
     "NUMBERS",
     "STYLE",
     "add_colour_bar",
     "colour_range",
     "colour_scale",
     "draw_figure",
+    "embedded",
     "finish_picture",
     "finish_plot",
     "save_figure",
@@ -46,10 +50,12 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
 }
 LIGHT_COLOURS = {"red": "#c8102e", "green": "#1a7f37", "blue": "#1f5fbf"}
+LINES = ("-", "--", "-.", ":")
+"""Line styles in turn: who does not tell colours apart tells the lines apart by these."""
 _WIDTH, _TALLEST = 9.0, 9.5
 """Largest width and height of a figure in inches."""
-NUMBERS, BAR, GAP = 0.65, 0.95, 0.15
-"""Inches: room left of a panel for its numbers, right of it for a colour bar or for nothing."""
+NUMBERS, BAR, GAP, LEGEND = 0.65, 0.95, 0.15, 2.2
+"""Inches: room left of a panel for its numbers, right of it for a colour bar, for nothing or for names of lines."""
 _BELOW, _ABOVE = 0.52, 0.3
 """Inches: room for the numbers below a panel, and for its title."""
 _CLIPPED, _WILD = 0.5, 0.1
@@ -59,11 +65,17 @@ _SPAN = 4.0
 
 
 def draw_figure(
-    draw: Callable[[list[Axes]], None], *, count: int, aspect: float, beside: float, title: str = ""
+    draw: Callable[[list[Axes]], None],
+    *,
+    count: int,
+    aspect: float,
+    beside: float,
+    title: str = "",
+    tallest: float = _TALLEST,
 ) -> Figure:
     """A figure of `count` panels whose height is `aspect` times their width: side by side, or stacked when flat.
 
-    `beside` is the room right of each panel, in inches: `BAR`, `NUMBERS` or `GAP`.
+    `beside` is the room right of each panel, in inches: `BAR`, `NUMBERS`, `GAP` or `LEGEND`.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -73,7 +85,7 @@ def draw_figure(
     rows = count // columns
     total = min(_WIDTH, max(6.0, 4.5 * columns))
     width = (total - NUMBERS) / columns - beside
-    height = min(width * aspect, (_TALLEST - 2 * GAP) / rows - _BELOW - _ABOVE)
+    height = min(width * aspect, (tallest - 2 * GAP) / rows - _BELOW - _ABOVE)
     heading = 2 * GAP if title else 0.0
     whole = rows * (height + _BELOW + _ABOVE) + heading
     with mpl.rc_context(STYLE):
@@ -100,6 +112,13 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
     """
     with writing(path):
         figure.savefig(path, dpi=dpi)
+
+
+def embedded(figure: Figure, *, dpi: int = 130) -> str:
+    """A figure as an address that holds the picture itself, for pages without files beside them."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=dpi)
+    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
 def colour_range(known: FloatArray) -> tuple[float, float]:
@@ -160,12 +179,12 @@ def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *
     axis.locator_params(nbins=5)
 
 
-def finish_plot(axis: Axes, x: str, y: str) -> None:
-    """Named axes, whole numbers along x, a light grid."""
+def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
+    """Named axes, `whole` numbers along x, a light grid."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True) if whole else MaxNLocator(5))
     axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)

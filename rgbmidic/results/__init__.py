@@ -1,7 +1,20 @@
 """What is kept of a test: one record per frame, the folder that holds them, and other programs' formats."""
 
 from rgbmidic.illumination.images import REFLECTING
+from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
+from rgbmidic.results.histories import Histories, Told
+from rgbmidic.results.history_table import history_rows, write_histories
+from rgbmidic.results.measures import (
+    exposure,
+    frame_times,
+    probes_of,
+    reference_frames,
+    scale_of,
+    shared_part,
+    units_of,
+)
+from rgbmidic.results.physical import Physical
 from rgbmidic.results.provenance import Origin
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
 from rgbmidic.results.record import FrameRecord
@@ -13,11 +26,24 @@ __all__ = [
     "QUANTITIES",
     "REFLECTING",
     "UNKNOWN_TIME",
+    "Channels",
     "FrameRecord",
+    "Histories",
     "Origin",
+    "Physical",
     "Quantity",
     "Result",
     "ResultStore",
+    "Told",
     "export_result",
+    "exposure",
     "finish_result",
+    "frame_times",
+    "history_rows",
+    "probes_of",
+    "reference_frames",
+    "scale_of",
+    "shared_part",
+    "units_of",
+    "write_histories",
 ]

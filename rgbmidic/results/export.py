@@ -5,29 +5,36 @@ from __future__ import annotations
 import csv
 import io
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 import numpy as np
 
-from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.files import write_complete, writing
+from rgbmidic.errors import InputError
+from rgbmidic.fields import column
+from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.hdf5 import write_hdf5
+from rgbmidic.results.physical import Physical
 from rgbmidic.results.quantities import QUANTITIES, Quantity
 from rgbmidic.results.result import Result
+from rgbmidic.settings import ScaleSettings
+from rgbmidic.typing import AnyArray, FloatArray
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
 
-_CSV_HEAD = ("frame", "number", "name", "status", "node", "node_status", "x", "y")
 
-
-def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool = False) -> None:
+def export_result(
+    result: Result, to: str, out: Path | str, *, scale: ScaleSettings | None = None, overwrite: bool = False
+) -> None:
     """Write all frames of a result into one file.
 
-    ``"npz"``: nodes (N, 2), elements (E, 3), names (T,), lights (k,) and every quantity of
+    ``"npz"`` is the store, in px: nodes (N, 2), elements (E, 3), names (T,), lights (k,) and every quantity of
     `rgbmidic.results.QUANTITIES` that has one shape in all frames, the frames as first axis.
-    ``"csv"``: a header line, then one row per node and frame with the quantities that are one number per node.
-    Positions and displacements are in px, x right, y down; NaN (an empty field in csv) where not measured.
+    ``"csv"`` and ``"hdf5"`` (`rgbmidic.results.hdf5`) are for engineers: seconds, millimetres where the scale is known,
+    Green-Lagrange strain over the shortest virtual strain gauge. csv has a header line, whose names hold the units, and
+    a row per node and frame with the quantities that are one number per node.
+    x is to the right, y down (ParaView's part of hdf5: up); NaN (an empty field in csv) where not measured.
 
     Parameters
     ----------
@@ -37,6 +44,8 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
         One of `EXPORT_FORMATS`.
     out
         File to write; it appears once it is complete.
+    scale
+        Stands in place of the ``[scale]`` that was kept with the result; None: that one. npz knows none.
     overwrite
         Whether an existing file may be replaced.
 
@@ -50,17 +59,13 @@ def export_result(result: Result, to: str, out: Path | str, *, overwrite: bool =
     out = Path(out)
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
-    with writing(out):
-        if out.exists() and not (overwrite and out.is_file()):
-            raise ResultError(
-                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
-            )
-        if not out.parent.is_dir():
-            raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
-    write_complete(out, lambda file: _WRITERS[to](result, file))
+    check_file(out, overwrite=overwrite)
+    told = Physical.of(result, scale)
+    write_complete(out, lambda file: _WRITERS[to](told, file))
 
 
-def _write_npz(result: Result, file: BinaryIO) -> None:
+def _write_npz(told: Physical, file: BinaryIO) -> None:
+    result = told.result
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("nodes", "elements", "names", "lights"):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -80,24 +85,29 @@ def _write_frames(result: Result, quantity: Quantity, file: IO[bytes]) -> None:
         file.write(np.asarray(value, dtype=one.dtype).tobytes())
 
 
-def _write_csv(result: Result, file: BinaryIO) -> None:
-    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-    writer = csv.writer(text)
-    fields = [name for name, quantity in QUANTITIES.items() if quantity.axes == ("node",) and name not in _CSV_HEAD]
-    writer.writerow((*_CSV_HEAD, *fields))
-    for index in range(len(result)):
-        writer.writerows(_csv_rows(result, index, fields))
+def _write_csv(told: Physical, file: BinaryIO) -> None:
+    result, text = told.result, io.TextIOWrapper(file, encoding="utf-8", newline="")
+    fields = {name: entry.unit for name, entry in told.quantities.items() if entry.axes == ("node",)}
+    del fields["node_status"]  # a whole number
+    length, writer = told.units.length, csv.writer(text)
+    places = [column(name, length) for name in ("x", "y")]
+    time = ["time_s"] if told.units.timed else []
+    head = ["frame", "number", "name", *time, "status", "node", "node_status"]
+    writer.writerow([*head, *places, *(column(name, unit) for name, unit in fields.items())])
+    for index, seconds in enumerate(told.times.tolist()):
+        values = told.frame(index)
+        one = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if time else []), values["status"]]
+        numbers = np.column_stack([told.length * result.nodes, *(values[name] for name in fields)])
+        writer.writerows(_csv_rows(one, values["node_status"], numbers))
     text.detach()  # leaves the file open for whoever opened it
 
 
-def _csv_rows(result: Result, index: int, fields: Iterable[str]) -> Iterator[list[Any]]:
-    record = result.frame(index)
-    head = [index, record.number, result.names[index], record.status]
-    numbers = np.column_stack([result.nodes, *(record.values[name] for name in fields)])
-    for node, (status, row) in enumerate(zip(record.node_status, numbers.tolist(), strict=True)):
-        yield [*head, node, int(status), *("" if number != number else f"{number:.9g}" for number in row)]
+def _csv_rows(one: list[Any], status: AnyArray, numbers: FloatArray) -> Iterator[list[Any]]:
+    """What belongs to the frame, then node, its status and numbers, which are empty where they are not known."""
+    for node, (code, row) in enumerate(zip(status.tolist(), numbers.tolist(), strict=True)):
+        yield [*one, node, code, *("" if number != number else f"{number:.9g}" for number in row)]
 
 
-_WRITERS: dict[str, Callable[[Result, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv}
+_WRITERS: dict[str, Callable[[Physical, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv, "hdf5": write_hdf5}
 EXPORT_FORMATS = tuple(_WRITERS)
 """Names of the formats that `export_result` writes."""

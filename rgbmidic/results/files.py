@@ -18,7 +18,16 @@ import numpy as np
 from rgbmidic.errors import ResultError
 from rgbmidic.typing import AnyArray
 
-__all__ = ["read_arrays", "read_json", "write_arrays", "write_complete", "write_json", "write_new_json", "writing"]
+__all__ = [
+    "check_file",
+    "read_arrays",
+    "read_json",
+    "write_arrays",
+    "write_complete",
+    "write_json",
+    "write_new_json",
+    "writing",
+]
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -121,6 +130,23 @@ def write_complete(
     finally:
         with contextlib.suppress(OSError):  # a read-only disk refuses even to remove what is not there
             temporary.unlink()
+
+
+def check_file(out: Path, *, overwrite: bool) -> None:
+    """Refuse a file that is already there, unless it may be replaced, or whose folder is not.
+
+    Raises
+    ------
+    ResultError
+        It cannot be written.
+    """
+    with writing(out):
+        if out.exists() and not (overwrite and out.is_file()):
+            raise ResultError(
+                f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
+            )
+        if not out.parent.is_dir():
+            raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
 
 
 @contextlib.contextmanager

@@ -31,6 +31,8 @@ SCHEMA_VERSION = 4
 
 PROVENANCE = "provenance.json"
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
+READING = ("scale", "probes", "setup")
+"""Sections of the settings that say how a result is read, and not what is measured."""
 _TOLD = 3
 """Differences that an error names."""
 
@@ -123,6 +125,8 @@ def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> No
 def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """What decides on the bits of a result, by names for people."""
     for section, keys in document.get("settings", {}).items():
+        if section in READING:
+            continue
         yield from ((f"{section}.{key}", value) for key, value in keys.items())
     yield "the calibration", document.get("calibration", {}).get("sha256")
     yield from ((f"the input {name}", text) for name, text in document["inputs"].items())

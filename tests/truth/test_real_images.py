@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rgbmidic import Solution, Status, Tri3Mesh, correlate, read_frame
-from rgbmidic.fields import at_nodes, at_pixels
+from rgbmidic.fields import Nodal, NodalCovariance, StrainGauges, at_nodes, at_pixels, make_probe
 
 SHIFT_ERROR = 1e-4
 """px: the shifted images are copies of the pixels."""
@@ -25,6 +25,12 @@ SECOND_OPINION = 0.02
 """px, rms difference to DICe (27 px subsets, other interpolation) away from the hole."""
 WAVE = 0.03
 """px, deviation from the 0.5 px of the crest."""
+GAUGE_GAIN = 0.03
+"""Deviation of the strain's amplitude from that of the command, seen through the same gauge."""
+GAUGE_RATIO = (0.9, 1.15)
+"""rms(error / stated uncertainty) of the strain of a gauge."""
+ALONG = 0.02
+"""Deviation of an extensometer's strain from the mean of the strain gauges along it."""
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +47,11 @@ def grey(shared_data):
 def field(found: Solution, shape: tuple[int, int]) -> np.ndarray:
     """u and v at the pixels, shape (2, H, W)."""
     return at_pixels(Tri3Mesh(nodes=found.nodes, elements=found.elements), found.displacement, shape).astype(float)
+
+
+def covariance(found: Solution) -> NodalCovariance:
+    """Of the mesh of a solution."""
+    return NodalCovariance.from_mesh(Tri3Mesh(nodes=found.nodes, elements=found.elements))
 
 
 def strains(found: Solution) -> np.ndarray:
@@ -76,6 +87,25 @@ def test_challenge_sample_14_has_the_commanded_amplitude(grey, shared_data, leve
     assert abs(v[inside].mean()) <= 0.005
     commanded = np.interp(found.nodes[:, 0], np.arange(len(command)), command)
     assert (found.displacement[:, 0] @ commanded) / (commanded @ commanded) == pytest.approx(1, abs=NODAL_GAIN)
+    if level == "L5":
+        check_strain_of_three_gauges(found, commanded, region)
+
+
+def check_strain_of_three_gauges(found, commanded, region):
+    """exx as the same gauge reads it off the command (N,), with the uncertainty that it states; eyy and exy are 0."""
+    still = np.zeros(len(commanded))
+    for length in (75, 100, 150):
+        gauges = StrainGauges.at_nodes(covariance(found), length)
+        inner = (
+            (found.nodes > np.add(region[:2], length / 2)) & (found.nodes < np.subtract(region[2:], length / 2))
+        ).all(1)
+        strain = gauges.strain(*found.displacement.T, *found.displacement_std.T, measure="engineering")
+        truth = np.zeros((len(still), 3))
+        truth[:, 0] = gauges.gradient(commanded, still, still, still)[0][:, 0, 0]
+        measured, exact = strain.components[inner], truth[inner]
+        assert (measured[:, 0] @ exact[:, 0]) / (exact[:, 0] @ exact[:, 0]) == pytest.approx(1, abs=GAUGE_GAIN)
+        ratio = np.sqrt(np.mean(((measured - exact) / strain.components_std[inner]) ** 2))
+        assert GAUGE_RATIO[0] <= ratio <= GAUGE_RATIO[1]
 
 
 @pytest.mark.parametrize("load", ["04", "11"])
@@ -116,6 +146,23 @@ def test_the_tension_test_converges_to_a_plausible_strain(grey, frame, stretch):
     rows = np.unique(found.nodes[:, 1])
     v = np.array([found.displacement[found.nodes[:, 1] == row, 1].mean() for row in rows])
     assert (np.diff(v) > -0.02).mean() > 0.95 or (np.diff(v) < 0.02).mean() > 0.95
+    check_three_gauges_and_an_extensometer(found)
+
+
+def check_three_gauges_and_an_extensometer(found):
+    """The mean strain along a line is that of its ends, whatever the gauge; a longer one is more certain."""
+    ends, std = np.array([[180, 400], [180, 1600]]), []
+    along = make_probe(covariance(found), "gauge", 1, ends.ravel(), "biot")
+    part = [found.displacement[along.nodes].T, found.displacement_std[along.nodes].T]
+    read = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), np.concatenate(part)[:, None], strict=True)))
+    _, strain = along.histories(read)
+    places = np.linspace(*ends, 200)
+    for length in (75, 125, 200):
+        gauges = StrainGauges.at_points(covariance(found), places, length)
+        read_there = gauges.strain(*found.displacement.T, *found.displacement_std.T, measure="biot")
+        assert read_there.components[:, 1].mean() == pytest.approx(strain.values[0], rel=ALONG)
+        std.append(np.median(read_there.components_std[:, 1]))
+    assert std[0] > 2 * std[1] > 3 * std[2]
 
 
 def test_the_challenge_2_wave_has_half_a_pixel_on_its_crest(grey):

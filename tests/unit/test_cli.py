@@ -11,13 +11,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
 from cine_files import write_cine
 from results import make_origin, make_result, random_record
 
-from rgbmidic import __version__, cli
+from rgbmidic import __version__, cli, report
 from rgbmidic.command import execute, read_shape
 from rgbmidic.errors import FrameError
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
@@ -56,8 +57,8 @@ def test_version_and_help(command: Run) -> None:
     for arguments in ((), ("--help",)):
         status, out, _ = command(*arguments)
         assert status == 0
-        assert all(word in out for word in ("run", "export", "figures", "frames", "demo", "virtual", "plan"))
-    for name in ("run", "export", "figures", "frames", "demo", "virtual", "plan"):
+        assert all(word in out for word in ("run", "export", "report", "figures", "frames", "demo", "virtual", "plan"))
+    for name in ("run", "export", "report", "figures", "frames", "demo", "virtual", "plan"):
         assert command(name, "--help")[0] == 0
 
 
@@ -213,6 +214,29 @@ def test_export(command: Run, tmp_path: Path) -> None:
     assert "already exists" in error
     assert command("export", result.path, "--to", "csv", "--out", tmp_path / "a.npz", "--overwrite")[0] == 0
     assert (tmp_path / "a.npz").read_text().startswith("frame,")
+
+
+def test_export_takes_the_scale_of_another_test_file(command: Run, tmp_path: Path) -> None:
+    result = make_result(tmp_path / "result")
+    test = tmp_path / "now.toml"
+    test.write_text('[frames]\npath = "a"\n[region]\nrectangle = [0, 0, 9, 9]\n[scale]\nmm_per_pixel = 0.5\n')
+    out = tmp_path / "a.vtkhdf"
+    assert command("export", result.path, "--to", "hdf5", "--out", out, "--test", test) == (0, "", "")
+    with h5py.File(out) as file:
+        np.testing.assert_array_equal(file["u"], 0.5 * result.u)
+
+
+def test_report(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = []
+    monkeypatch.setattr(report, "write_report", lambda *given, **options: written.append((given[1], options)))
+    result = make_result(tmp_path / "result")
+    assert command("report", result.path) == (0, f"{result.path / 'report.html'}\n", "")
+    assert command("report", result.path, "--out", tmp_path / "a.html", "--frames", "0,1", "--overwrite")[0] == 0
+    assert [file for file, _ in written] == [result.path / "report.html", tmp_path / "a.html"]
+    assert written[1][1] == {"settings": None, "frames": [0, 1], "overwrite": True}
+    status, _, error = command("report", tmp_path)
+    assert status == 2
+    assert "is not a result folder" in error
 
 
 def test_export_of_an_interrupted_run(command: Run, tmp_path: Path) -> None:

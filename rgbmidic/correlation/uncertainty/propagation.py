@@ -97,8 +97,8 @@ def functional_std(
     for i, functional in enumerate(functionals):
         row = np.repeat(np.arange(count), np.diff(functional.indptr))
         place = functional.indices.astype(np.int64) * colours + colouring.colour[row]
-        columns = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
-        columns = solve(columns.reshape(2 * count, colours))
+        sums = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
+        columns = solve(sums.astype(np.float64, copy=False).reshape(2 * count, colours))
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
         variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
     return np.sqrt(np.maximum(variance, 0))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
-from results import LIGHTS, NODES, make_result
+from results import LIGHTS, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import (
@@ -20,6 +21,17 @@ from rgbmidic.results import (
     ResultStore,
     export_result,
 )
+from rgbmidic.settings import ScaleSettings
+from rgbmidic.typing import AnyArray
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def column(rows: list[dict[str, str]], name: str) -> AnyArray:
+    return np.array([float(row[name] or "nan") for row in rows]).reshape(-1, NODES)
 
 
 @pytest.fixture
@@ -41,16 +53,33 @@ def test_npz_holds_every_array(result: Result, tmp_path: Path) -> None:
 
 def test_csv_has_one_row_per_node_and_frame(result: Result, tmp_path: Path) -> None:
     export_result(result, "csv", tmp_path / "fields.csv")
-    with (tmp_path / "fields.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(tmp_path / "fields.csv")
     assert len(rows) == 3 * NODES
-    for name in ("u", "v", "u_std", "v_std", "exy", "exx_std", "misfit"):
-        column = np.array([float(row[name] or "nan") for row in rows]).reshape(3, NODES)
-        np.testing.assert_allclose(column, getattr(result, name), rtol=1e-8, err_msg=name)
-    x, y = (np.array([float(row[name]) for row in rows[:NODES]]) for name in ("x", "y"))
+    for name, unit in {"u": "_px", "v": "_px", "u_std": "_px", "v_std": "_px", "misfit": ""}.items():
+        np.testing.assert_allclose(column(rows, f"{name}{unit}"), getattr(result, name), rtol=1e-8, err_msg=name)
+    x, y = (np.array([float(row[name]) for row in rows[:NODES]]) for name in ("x_px", "y_px"))
     np.testing.assert_allclose(np.stack([x, y], axis=1), result.nodes, rtol=1e-8)
     assert [row["status"] for row in rows[::NODES]] == ["0", "1", "0"]
-    assert {(row["u"] == "") == (row["node_status"] == "1") for row in rows} == {True}
+    assert {(row["u_px"] == "") == (row["node_status"] == "1") for row in rows} == {True}
+    np.testing.assert_allclose([float(row["time_s"]) for row in rows[::NODES]], [0, 1.000003e-3, 2.000006e-3])
+
+
+def test_csv_is_in_millimetres_where_the_scale_is_known(result: Result, tmp_path: Path) -> None:
+    scale = ScaleSettings(mm_per_pixel=0.02, mm_per_pixel_std=0.001)
+    export_result(result, "csv", tmp_path / "fields.csv", scale=scale)
+    rows = read_csv(tmp_path / "fields.csv")
+    assert not any("px" in name for name in rows[0])
+    np.testing.assert_allclose(column(rows, "u_mm"), 0.02 * result.u, rtol=1e-8)
+    np.testing.assert_allclose(column(rows, "x_mm")[0], 0.02 * result.nodes[:, 0], rtol=1e-8)
+    spread = np.hypot(0.02 * result.u_std, 0.001 * result.u)
+    np.testing.assert_allclose(column(rows, "u_std_mm"), spread, rtol=1e-6)
+
+
+def test_csv_has_no_time_where_nobody_knows_it(tmp_path: Path) -> None:
+    with ResultStore.create(tmp_path / "out", make_origin(1)) as store:
+        store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS)))
+    export_result(Result.open(tmp_path / "out"), "csv", tmp_path / "fields.csv")
+    assert "time" not in (tmp_path / "fields.csv").read_text(encoding="utf-8")
 
 
 def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(
@@ -66,8 +95,10 @@ def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(
     for to in EXPORT_FORMATS:
         export_result(result, to, tmp_path / to)
     np.testing.assert_array_equal(np.load(tmp_path / "npz")["depth"], [depth])
-    with (tmp_path / "csv").open(encoding="utf-8", newline="") as file:
-        assert [row["depth"] for row in csv.DictReader(file)] == ["0", "1", "2"]
+    assert [row["depth_px"] for row in read_csv(tmp_path / "csv")] == ["0", "1", "2"]
+    with h5py.File(tmp_path / "hdf5") as file:
+        np.testing.assert_array_equal(file["depth"], [depth])
+        np.testing.assert_array_equal(file["VTKHDF/PointData/depth"], depth)
 
 
 @pytest.mark.parametrize("to", EXPORT_FORMATS)
@@ -82,7 +113,7 @@ def test_existing_file_is_kept_unless_overwriting_is_allowed(result: Result, tmp
 
 
 def test_what_cannot_be_exported_leaves_nothing(result: Result, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match='"xls"; allowed are npz, csv'):
+    with pytest.raises(InputError, match='"xls"; allowed are npz, csv, hdf5'):
         export_result(result, "xls", tmp_path / "a")
     with pytest.raises(ResultError, match="no folder"):
         export_result(result, "npz", tmp_path / "none" / "a")

@@ -16,7 +16,7 @@ from results import MESH, make_origin, make_result, random_record
 
 from rgbmidic.errors import ResultError
 from rgbmidic.results import Result, ResultStore, finish_result, provenance
-from rgbmidic.settings import FrameSettings, RegionSettings, SolverSettings, TestSettings
+from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SolverSettings, TestSettings
 
 FRAMES = 600
 KILLS = 20
@@ -123,6 +123,15 @@ def test_the_result_of_another_test_is_refused_with_the_difference(
         ResultStore.resume(out, origin)
     assert not list(out.glob("in_use.*"))
     np.testing.assert_array_equal(Result.open(out, partial=True).frame(1).u, random_record(1).u)
+
+
+def test_how_a_result_is_read_may_change_while_it_is_measured(tmp_path: Path) -> None:
+    settings = _settings(tmp_path, 0.001)
+    with ResultStore.create(tmp_path / "out", make_origin(3, settings=settings)):
+        pass
+    read_otherwise = replace(settings, scale=ScaleSettings(mm_per_pixel=0.1), probes=ProbeSettings(points=((1, 2),)))
+    with ResultStore.resume(tmp_path / "out", make_origin(3, settings=read_otherwise)) as store:
+        assert not store.finished().any()
 
 
 def test_only_a_result_is_gone_on_with(tmp_path: Path) -> None:

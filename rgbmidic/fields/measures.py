@@ -1,0 +1,169 @@
+"""Finite strain of a displacement gradient, its principal values and its uncertainty.
+
+With the deformation gradient ``F = I + H`` and the stretch ``U = sqrt(F^T F)``: Green-Lagrange ``(U^2 - I) / 2``,
+Hencky ``ln U``, Biot ``U - I``, engineering (small strain) ``(H + H^T) / 2``. All are in the axes of the reference. The
+first three are functions of ``C = F^T F`` alone, hence blind to rotation, and have its eigenvectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rgbmidic.errors import InputError
+from rgbmidic.typing import FloatArray
+
+__all__ = ["MEASURES", "Strain", "strain_of_gradient"]
+
+_Function = Callable[[FloatArray], FloatArray]
+_OF_STRETCH: dict[str, tuple[_Function, _Function]] = {
+    "green-lagrange": (lambda c: (c - 1) / 2, lambda c: np.full_like(c, 0.5)),
+    "hencky": (lambda c: np.log(c) / 2, lambda c: 0.5 / c),
+    "biot": (lambda c: np.sqrt(c) - 1, lambda c: 0.5 / np.sqrt(c)),
+}
+"""Each measure as a function of an eigenvalue of C, and its derivative."""
+MEASURES = (*_OF_STRETCH, "engineering")
+"""Names of the strain measures; the first is the default."""
+_SAME = 1e-6
+"""Eigenvalues of C that differ by less count as one where a difference is divided by theirs: 1e-10 of error at most."""
+_LARGEST_ANGLE = np.degrees(np.pi / np.sqrt(12))
+"""Standard uncertainty (degrees) of a direction of which nothing is known."""
+_EQUIVALENT = np.array([[4 / 3, 2 / 3, 0], [2 / 3, 4 / 3, 0], [0, 0, 4 / 3]])
+"""``e^T A e`` for e = (exx, eyy, exy) is the square of the von Mises equivalent strain at constant volume."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Strain:
+    """Strain at some places, in the axes x, y of the reference; NaN where it is not measured.
+
+    Attributes
+    ----------
+    measure
+        One of `MEASURES`.
+    components, components_std : ndarray, shape (..., 3)
+        exx, eyy, exy (tensor shear) and their standard uncertainty.
+    principal, principal_std : ndarray, shape (..., 2)
+        The larger and the smaller principal strain, in the plane.
+    direction_deg, direction_std_deg : ndarray, shape (...)
+        Direction of the larger one on the reference, from x towards y, between -90 and 90 degrees. Where both are the
+        same within their uncertainty it means nothing, and the uncertainty tends to 52 degrees; NaN without strain.
+    equivalent, equivalent_std : ndarray, shape (...)
+        Von Mises equivalent at constant volume, ``sqrt(4/3 (e1^2 + e1 e2 + e2^2))``: e in a tensile test of e.
+        Being positive, it is more than 0 in noise alone, by about its uncertainty.
+    """
+
+    measure: str
+    components: FloatArray
+    components_std: FloatArray
+    principal: FloatArray
+    principal_std: FloatArray
+    direction_deg: FloatArray
+    direction_std_deg: FloatArray
+    equivalent: FloatArray
+    equivalent_std: FloatArray
+
+
+def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: str = MEASURES[0]) -> Strain:
+    """Strain of displacement gradients and, to first order, its standard uncertainty.
+
+    Parameters
+    ----------
+    gradient : ndarray, shape (..., 2, 2)
+        ``H[c, d]``: derivative of the displacement c by the coordinate d.
+    covariance : ndarray, shape (..., 4, 4)
+        Of ``H`` row by row: du/dx, du/dy, dv/dx, dv/dy.
+    measure
+        One of `MEASURES`.
+
+    Raises
+    ------
+    InputError
+        The measure is unknown.
+    """
+    if measure not in MEASURES:
+        raise InputError(f'unknown strain measure "{measure}"; allowed are {", ".join(MEASURES)}')
+    shape = gradient.shape[:-2]
+    h, spread = gradient.reshape(-1, 2, 2), covariance.reshape(-1, 4, 4)
+    tensor, slopes = _small(h) if measure == "engineering" else _of_stretch(h, *_OF_STRETCH[measure])
+    return _told(measure, tensor, slopes @ spread @ slopes.transpose(0, 2, 1), shape)
+
+
+def _small(gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Small strain (n, 2, 2) and the derivative (n, 3, 4) of its exx, eyy, exy by the gradient."""
+    slope = np.zeros((len(gradient), 3, 4))
+    slope[:, 0, 0] = slope[:, 1, 3] = 1
+    slope[:, 2, 1:3] = 0.5
+    return (gradient + gradient.transpose(0, 2, 1)) / 2, slope
+
+
+def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function) -> tuple[FloatArray, FloatArray]:
+    """A function of C (n, 2, 2) and the derivative (n, 3, 4) of its xx, yy, xy by the gradient (Daleckii and Krein)."""
+    f = np.eye(2) + gradient
+    values, vectors = _eigen(f.transpose(0, 2, 1) @ f)
+    values = np.maximum(values, np.finfo(float).tiny)
+    at = function(values)
+    gap, mean = values[:, 1] - values[:, 0], values.mean(axis=1)
+    close = np.abs(gap) < _SAME
+    across = np.where(close, derivative(mean), (at[:, 1] - at[:, 0]) / np.where(close, 1, gap))
+    along = derivative(values)
+    # what a change of H[c, d] alone makes of C along the axes a and b of C: F_ca V_db + V_da F_cb, F turned by V
+    turned = f @ vectors
+    change = [turned[:, :, None, a] * vectors[:, None, :, b] for a in (0, 1) for b in (0, 1)]
+    parts = [2 * change[0] * along[:, 0, None, None], 2 * change[3] * along[:, 1, None, None]]
+    parts.append((change[1] + change[2]) * across[:, None, None])
+    first, second, shear = (part.reshape(-1, 4) for part in parts)
+    slope = np.empty((len(f), 3, 4))
+    for row, (i, j) in enumerate(((0, 0), (1, 1), (0, 1))):
+        (vi, wi), (vj, wj) = vectors[:, i].T[..., None], vectors[:, j].T[..., None]
+        slope[:, row] = vi * vj * first + wi * wj * second + (vi * wj + wi * vj) * shear
+    return (vectors * at[:, None]) @ vectors.transpose(0, 2, 1), slope
+
+
+def _eigen(tensor: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (n, 2), the larger first, and eigenvectors (n, 2, 2) in columns; NaN for NaN."""
+    half, shear = (tensor[:, 0, 0] - tensor[:, 1, 1]) / 2, tensor[:, 0, 1]
+    middle, radius, angle = half + tensor[:, 1, 1], np.hypot(half, shear), np.arctan2(shear, half) / 2
+    c, s = np.cos(angle), np.sin(angle)
+    vectors = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    return np.stack([middle + radius, middle - radius], axis=1), vectors
+
+
+def _told(measure: str, tensor: FloatArray, covariance: FloatArray, shape: tuple[int, ...]) -> Strain:
+    """All of a `Strain` from the tensor (n, 2, 2) and the covariance (n, 3, 3) of exx, eyy, exy."""
+    e = np.stack([tensor[:, 0, 0], tensor[:, 1, 1], tensor[:, 0, 1]], axis=1)
+    principal, vectors = _eigen(tensor)
+    angle = np.degrees(np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
+    c, s = vectors[:, 0, 0], vectors[:, 1, 0]
+    along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
+    turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = principal[:, 0] - principal[:, 1]
+        direction = np.degrees(_deviation(turn, covariance) / apart)
+        equivalent, equivalent_std = _equivalent(e, covariance)
+    parts = {
+        "components": e,
+        "components_std": np.sqrt(np.einsum("naa->na", covariance)),
+        "principal": principal,
+        "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
+        "direction_deg": np.where(apart > 0, (angle + 90) % 180 - 90, np.nan),
+        "direction_std_deg": np.minimum(direction, _LARGEST_ANGLE),
+        "equivalent": equivalent,
+        "equivalent_std": equivalent_std,
+    }
+    return Strain(measure=measure, **{name: part.reshape((*shape, *part.shape[1:])) for name, part in parts.items()})
+
+
+def _deviation(direction: FloatArray, covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.maximum(np.einsum("na,nab,nb->n", direction, covariance, direction), 0)))
+
+
+def _equivalent(e: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The equivalent strain (n,) its uncertainty: of the first order where it is large, else what noise makes of 0."""
+    square = np.einsum("na,ab,nb->n", e, _EQUIVALENT, e)
+    noise = np.einsum("ab,nab->n", _EQUIVALENT, covariance)
+    slope = e @ _EQUIVALENT
+    first = np.einsum("na,nab,nb->n", slope, covariance, slope) / np.where(square > 0, square, np.inf)
+    large = square / (square + noise)
+    return np.sqrt(square), np.sqrt(large * first + (1 - large) * noise)

@@ -1,0 +1,240 @@
+"""Strain over a virtual strain gauge: a plane is fitted to the displacements of the nodes around a place.
+
+Nothing is measured anew: gauges of any length follow from the stored displacements. The length of a virtual strain
+gauge is the diameter of a circle. A node stands for as much as an element is wide and counts by the part of that within
+the circle, so that, as in the iDICs good practice guide, the length is that of the window of points plus one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from rgbmidic.errors import InputError
+from rgbmidic.fields.covariance import NodalCovariance
+from rgbmidic.fields.locate import Places
+from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray
+
+__all__ = ["SHORTEST", "StrainGauges", "shortest_gauge", "strain_of"]
+
+SHORTEST = 3.0
+"""Length of the shortest gauge in elements: a node and those around it."""
+_ROUND = 0.9
+"""Share of it that will do: the sides of a mesh's elements are not quite what was asked for."""
+_FLAT = 1e-2
+"""Least ratio of the second moments of a gauge's nodes across and along it: below, they lie on a line."""
+
+
+def shortest_gauge(mesh: Tri3Mesh) -> float:
+    """Length in px of the shortest virtual strain gauge on a mesh."""
+    return SHORTEST * mesh.size
+
+
+def strain_of(
+    nodes: FloatArray,
+    elements: npt.NDArray[np.int32],
+    u: FloatArray,
+    v: FloatArray,
+    u_std: FloatArray,
+    v_std: FloatArray,
+    *,
+    gauge: float | None = None,
+    measure: str = MEASURES[0],
+) -> Strain:
+    """Strain at the nodes of a mesh from the displacements of one frame.
+
+    For many frames or gauges make a `StrainGauges` once.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (N, 2)
+        In px on the reference.
+    elements : ndarray, shape (E, 3)
+    u, v, u_std, v_std : ndarray, shape (N,)
+        In px; NaN where not measured.
+    gauge
+        Length of the virtual strain gauge in px; None: the shortest, three elements.
+    measure
+        ``"green-lagrange"``, ``"hencky"``, ``"biot"`` or ``"engineering"``.
+
+    Returns
+    -------
+    Strain
+        NaN at nodes that are not measured and beside them.
+
+    Raises
+    ------
+    InputError
+        The gauge is too short, or the measure unknown.
+    """
+    covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
+    return StrainGauges.at_nodes(covariance, gauge).strain(u, v, u_std, v_std, measure=measure)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StrainGauges:
+    """Virtual strain gauges of one length at some places.
+
+    Attributes
+    ----------
+    length
+        In px.
+    centres : ndarray, shape (G, 2)
+        In px on the reference.
+    points : ndarray, shape (N, 2)
+        The nodes.
+    rows, nodes : ndarray, shape (M,), int
+        Gauge and node of every pair of them: nodes within the gauge's circle that hang together in it, so that none
+        lies across a crack or a hole.
+    shares : ndarray, shape (M,)
+        Part of each node that is within the gauge's circle.
+    needed : csr_matrix, shape (G, N)
+        Nodes that must be measured for a gauge to tell anything: the centre and those beside it.
+    whole : ndarray, shape (2, M)
+        Weight of every node in the slopes along x and y where all are measured.
+    inflation : ndarray, shape (G, 3)
+        Variance of the slopes along x and y, and their covariance, over what independent nodes would give.
+    """
+
+    length: float
+    centres: FloatArray
+    points: FloatArray
+    rows: npt.NDArray[np.int64]
+    nodes: npt.NDArray[np.int64]
+    shares: FloatArray
+    needed: sp.csr_matrix
+    whole: FloatArray
+    inflation: FloatArray
+
+    @classmethod
+    def at_nodes(cls, covariance: NodalCovariance, length: float | None = None) -> Self:
+        """A gauge around every node; errors as `strain_of`."""
+        mesh = covariance.mesh
+        return cls._around(covariance, mesh.nodes, length, _ring(mesh))
+
+    @classmethod
+    def at_points(cls, covariance: NodalCovariance, points: FloatArray, length: float | None = None) -> Self:
+        """Gauges around points (G, 2) within the mesh.
+
+        Raises
+        ------
+        InputError
+            A point is outside the mesh, or the gauge is too short.
+        """
+        mesh = covariance.mesh
+        places = Places.of(mesh, points)
+        places.check("the strain gauge")
+        row = np.repeat(np.arange(len(points)), 3)
+        nodes = mesh.elements[places.element].ravel()
+        needed = sp.csr_matrix((np.ones(len(row)), (row, nodes)), shape=(len(points), len(mesh.nodes)))
+        return cls._around(covariance, np.asarray(points, dtype=np.float64), length, needed)
+
+    @classmethod
+    def _around(
+        cls, covariance: NodalCovariance, centres: FloatArray, length: float | None, needed: sp.csr_matrix
+    ) -> Self:
+        mesh = covariance.mesh
+        length = shortest_gauge(mesh) if length is None else float(length)
+        if not (np.isfinite(length) and length >= _ROUND * shortest_gauge(mesh)):
+            raise InputError(
+                f"a strain gauge must be at least {shortest_gauge(mesh):.4g} px long, {SHORTEST:g} elements; given are "
+                f"{length:g} px"
+            )
+        pattern = _reach(mesh, centres, length / 2, needed)
+        rows = np.repeat(np.arange(len(centres)), np.diff(pattern.indptr))
+        away = np.hypot(*(mesh.nodes[pattern.indices] - centres[rows]).T)
+        gauges = cls(
+            length=length,
+            centres=centres,
+            points=mesh.nodes,
+            rows=rows,
+            nodes=pattern.indices.astype(np.int64),
+            shares=np.clip((length / 2 - away) / mesh.size, 0, 1),
+            needed=needed,
+            whole=np.zeros((2, len(rows))),
+            inflation=np.ones((len(centres), 3)),
+        )
+        return gauges._correlated(covariance.correlation)
+
+    def _correlated(self, correlation: sp.csr_matrix) -> Self:
+        """The same with its weights, and the `inflation` by the correlation (N, N) between nodes of one uncertainty."""
+        weights = self._weights(np.ones(len(self.points), dtype=bool))
+        shape, row = (len(self.centres), len(self.points)), self.rows
+        x, y = (sp.csr_matrix((weight, (row, self.nodes)), shape=shape) for weight in weights)
+        together = [np.asarray((a @ correlation).multiply(b).sum(axis=1)).ravel() for a, b in ((x, x), (y, y))]
+        alone = [np.asarray(a.multiply(a).sum(axis=1)).ravel() for a in (x, y)]
+        along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
+        inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
+        return replace(self, whole=weights, inflation=inflation)
+
+    def gradient(
+        self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Displacement gradient (G, 2, 2) and its covariance (G, 4, 4), row by row; displacements (N,) in px."""
+        measured = np.isfinite(u + v + u_std + v_std)
+        known = self.needed @ (~measured * 1.0) == 0
+        weights = self.whole if measured.all() else self._weights(measured)
+        values, spread = np.zeros((len(known), 2, 2)), np.zeros((len(known), 4, 4))
+        for component, (value, std) in enumerate(((u, u_std), (v, v_std))):
+            moved, square = (np.where(measured, part, 0.0)[self.nodes] for part in (value, std**2))
+            values[:, component] = np.stack([self._sum(w * moved) for w in weights], axis=1)
+            parts = [(0, 0), (1, 1), (0, 1)]
+            sums = np.stack([self._sum(weights[a] * weights[b] * square) for a, b in parts], axis=1) * self.inflation
+            for (a, b), part in zip(parts, sums.T, strict=True):
+                spread[:, 2 * component + a, 2 * component + b] = part
+                spread[:, 2 * component + b, 2 * component + a] = part
+        values[~known], spread[~known] = np.nan, np.nan
+        return values, spread
+
+    def strain(
+        self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray, *, measure: str = MEASURES[0]
+    ) -> Strain:
+        """Strain of every gauge from the displacements (N,) of one frame; errors as `strain_of`."""
+        return strain_of_gradient(*self.gradient(u, v, u_std, v_std), measure)
+
+    def _weights(self, measured: BoolArray) -> FloatArray:
+        """Weight (2, M) of every node in the slopes along x and y of each gauge; NaN where its nodes lie on a line."""
+        use = measured[self.nodes] * self.shares
+        arm = (self.points[self.nodes] - self.centres[self.rows]).T
+        count = np.maximum(self._sum(use), np.finfo(float).tiny)
+        x, y = (part - (self._sum(use * part) / count)[self.rows] for part in arm)
+        xx, xy, yy = (self._sum(use * a * b) for a, b in ((x, x), (x, y), (y, y)))
+        determinant = xx * yy - xy * xy
+        determinant = np.where(determinant > _FLAT * ((xx + yy) / 2) ** 2, determinant, np.nan)
+        xx, xy, yy = (part[self.rows] / determinant[self.rows] for part in (xx, xy, yy))
+        return np.stack([use * (yy * x - xy * y), use * (xx * y - xy * x)])
+
+    def _sum(self, values: AnyArray) -> FloatArray:
+        sums = np.bincount(self.rows, weights=values, minlength=len(self.centres))
+        return np.asarray(sums, dtype=np.float64)
+
+
+def _ring(mesh: Tri3Mesh) -> sp.csr_matrix:
+    """Every node with those that share an element with it, (N, N)."""
+    i, j = mesh.neighbours.T
+    count = len(mesh.nodes)
+    edges = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
+    return sp.csr_matrix(edges + edges.T + sp.eye(count))
+
+
+def _reach(mesh: Tri3Mesh, centres: FloatArray, radius: float, needed: sp.csr_matrix) -> sp.csr_matrix:
+    """Nodes (G, N) within `radius` px of each centre that are joined with it by edges inside the circle."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(centres).query_ball_tree(cKDTree(mesh.nodes), radius)
+    starts = np.cumsum([0, *map(len, near)])
+    columns = np.concatenate([np.asarray(some, dtype=np.int64) for some in near])
+    inside = sp.csr_matrix((np.ones(len(columns)), columns, starts), shape=needed.shape)
+    ring, reached = _ring(mesh), sp.csr_matrix(needed > 0) * 1.0
+    while True:
+        grown = sp.csr_matrix((((reached @ ring).multiply(inside) + reached) > 0) * 1.0)
+        if grown.nnz == reached.nnz:
+            grown.sort_indices()
+            return grown
+        reached = grown

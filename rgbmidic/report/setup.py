@@ -1,0 +1,145 @@
+"""What was measured with what, row by row, as the iDICs good-practice guide (2018) asks of a test report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from rgbmidic.report.facts import NoiseFloor, speckle_size
+from rgbmidic.results import Physical
+from rgbmidic.settings import SetupSettings
+
+__all__ = ["analysis_rows", "hardware_rows", "noise_words", "reference_words", "settings_rows"]
+
+Rows = Iterator[tuple[str, str]]
+
+_NAMES = {"stand_off": "stand-off distance", "pattern": "patterning", "lamps": "lamps"}
+_PREFILTERS = {"none": "none", "binomial": "[1 2 1]/4 along x and y", "gaussian": "Gaussian, σ = 1 px"}
+_WEIGHTS = {
+    "statistics": "by the statistics of each light's residual, robust",
+    "threshold": "a light is excluded where it is brighter than a threshold",
+    "geometry": "by the geometry of lamps, camera and specimen",
+    "none": "none: every light counts everywhere",
+}
+
+
+def hardware_rows(told: Physical, setup: SetupSettings) -> Rows:
+    """Camera, optics, light, image, pattern, specimen; what nobody stated names the key that would."""
+    for entry in fields(setup):
+        if entry.name not in ("pattern", "notes"):
+            yield _NAMES.get(entry.name, entry.name), getattr(setup, entry.name) or _missing(f"setup.{entry.name}")
+    result, reference = told.result, told.result.reference
+    yield "lights", ", ".join(result.lights)
+    if reference is not None:
+        rows, columns = reference.shape[1:]
+        scale = told.units.mm_per_pixel
+        field = "" if scale is None else f"; field of view {columns * scale:.4g} x {rows * scale:.4g} mm"
+        yield "image", f"{columns} x {rows} px{field}"
+    yield "image scale", _scale(told)
+    yield "frame rate", _rate(told)
+    exposure = result.provenance.get("exposure_ns")
+    yield "exposure", "not told by the files" if exposure is None else f"{exposure / 1000:g} µs"
+    yield "patterning", setup.pattern or _missing("setup.pattern")
+    size = speckle_size(result)
+    if size is not None:
+        yield "speckle size", f"{told.in_units(size)}, full width at half maximum of the reference's autocorrelation"
+    if setup.notes:
+        yield "notes", setup.notes
+
+
+def _missing(key: str) -> str:
+    return f"not stated (`{key}`)"
+
+
+def _scale(told: Physical) -> str:
+    scale, std = told.units.mm_per_pixel, told.units.mm_per_pixel_std
+    if scale is None:
+        return f"{_missing('scale.mm_per_pixel')}: lengths are in px"
+    return f"{scale:.6g} mm per px" + (f" ± {std:.2g} (one standard uncertainty)" if std else "")
+
+
+def _rate(told: Physical) -> str:
+    stated, camera = (
+        told.result.setting("scale", "frame_rate"),
+        told.result.provenance.get("frame_rate"),
+    )
+    if camera or stated:
+        return f"{camera or stated:g} frames per second" + (" (by the camera's file)" if camera else " (as stated)")
+    return "the frames' own times" if told.units.timed else f"{_missing('scale.frame_rate')}: time is in frames"
+
+
+def analysis_rows(told: Physical, floor: NoiseFloor | None) -> Rows:
+    """How the frames were analysed."""
+    result, set_ = told.result, told.result.setting
+    yield "software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"
+    yield "reference", reference_words(told)
+    demosaic = set_("illumination", "demosaic")
+    if len(result.lights) > 1 and demosaic is not None:
+        yield "separation of the lights", f"demosaicing `{demosaic}`, crosstalk unmixed by calibration"
+    normalise = set_("illumination", "normalise")
+    if normalise is not None:
+        yield "grey levels", f"divided by their local mean, σ = {normalise:g} px" if normalise else "as they are"
+    yield from _known("image filter", _PREFILTERS.get(set_("solver", "prefilter")))
+    yield from _known("weights of the lights", _WEIGHTS.get(set_("weights", "method")))
+    yield "elements", _elements(told)
+    yield "shape functions", "linear, continuous over the mesh"
+    yield "matching criterion", "weighted sum of squared differences over all lights at once"
+    yield "interpolant", "cubic B-spline"
+    yield from _known("grey-level correction", set_("solver", "brightness"))
+    yield from _known("rigid motion between lights", set_("solver", "rigid"))
+    length = told.in_units(told.gauges.length)
+    yield "strain", f"{told.measure_name}: plane fitted to the displacements of the nodes in a virtual strain gauge"
+    yield "virtual strain gauge", f"{length}, at every node"
+    yield "smoothing afterwards", "none"
+    yield "noise floor", noise_words(told, floor)
+
+
+def _known(name: str, text: str | None) -> Rows:
+    if text is not None:
+        yield name, text
+
+
+def reference_words(told: Physical) -> str:
+    """Which frames are the reference."""
+    frames = told.result.setting("frames", "reference", list(told.result.provenance["references"]))
+    if len(frames) == 1:
+        return f"frame {frames[0]}"
+    even = frames == list(range(frames[0], frames[-1] + 1))
+    return f"the mean of {len(frames)} frames, " + (
+        f"{frames[0]} to {frames[-1]}" if even else ", ".join(map(str, frames))
+    )
+
+
+def _elements(told: Physical) -> str:
+    mesh, size = told.mesh, told.result.setting("mesh", "element_size")
+    stated = told.in_units(mesh.size if size is None else size)
+    return f"{len(mesh.elements)} triangles of three nodes, {len(mesh.nodes)} nodes; side {stated}"
+
+
+def noise_words(told: Physical, floor: NoiseFloor | None) -> str:
+    """What static frames scatter by, one standard deviation."""
+    if floor is None:
+        return 'not known: one static frame only; `reference = "0:20"` of frames before the test would tell it'
+    u, v, *strain = floor.measured.values()
+    parts = ", ".join(f"{name} {value * 1e6:.3g}" for name, value in zip(("exx", "eyy", "exy"), strain, strict=True))
+    length = told.units.length
+    return f"u {u:.3g} {length}, v {v:.3g} {length}; {parts} µm/m (one standard deviation, {floor.count} static frames)"
+
+
+def settings_rows(settings: Mapping[str, Mapping[str, Any]]) -> Rows:
+    """Every key of the settings that says something, with its value; the words of ``[setup]`` stand elsewhere."""
+    for section, keys in settings.items():
+        for key, value in keys.items():
+            if section != "setup" and value != []:
+                yield f"{section}.{key}", _short(value)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list) and len(value) > 12 and all(isinstance(entry, int) for entry in value):
+        step = np.diff(value)
+        if (step == 1).all():
+            return f"{value[0]} to {value[-1]}"
+    return str(value)

@@ -1,0 +1,41 @@
+"""Velocity of whole measurements against one noisy reference: as certain as it says, the reference's noise left out."""
+
+from __future__ import annotations
+
+import numpy as np
+from textures import Affine, Texture
+
+from rgbmidic import correlate
+from rgbmidic.fields import rates, reference_share
+
+FRAMES, SHAPE, REGION = 10, (112, 112), (12, 12, 99, 99)
+NOISE = 4.0
+"""8 % of the contrast."""
+RIGHT = (0.85, 1.15)
+"""rms(error / stated) over 2 x 36 nodes; with the reference's noise counted as each frame's own it is .7."""
+TIMES = np.delete(np.arange(FRAMES + 2), [4, 5]) * 1e-3
+
+
+def motion(time: float) -> Affine:
+    """A shift that is braked and a stretch that grows, both parabolas of the time."""
+    return Affine(shift=(300 * time - 1e4 * time**2, 50 * time), gradient=((1 + 300 * time**2, 0), (0, 1 - time)))
+
+
+def test_velocity_and_acceleration_are_as_far_off_as_they_say():
+    random, texture = np.random.default_rng(4), Texture.random(8)
+    states = [texture.image(SHAPE, motion(time)) + random.normal(scale=NOISE, size=SHAPE) for time in TIMES]
+    solutions = [
+        correlate(states[0], state, region=REGION, element_size=17, initial=motion(time).shift)
+        for state, time in zip(states[1:], TIMES[1:], strict=True)
+    ]
+    nodes = solutions[0].nodes
+    still = np.zeros((1, *nodes.shape))
+    measured = np.concatenate([still, np.stack([one.displacement for one in solutions])])
+    std = np.concatenate([still, np.stack([one.displacement_std for one in solutions])])
+    truth = np.stack([motion(time).displacement(nodes, SHAPE) for time in TIMES])
+    options = {"window": 9e-3, "share": reference_share(1), "references": np.arange(FRAMES) == 0}
+    found, exact = (rates(TIMES, field, std, **options) for field in (measured, truth))
+    for name in ("velocity", "acceleration"):
+        error = getattr(found, name) - getattr(exact, name)
+        ratio = np.sqrt(np.mean((error / getattr(found, f"{name}_std")) ** 2))
+        assert RIGHT[0] <= ratio <= RIGHT[1], (name, ratio)

@@ -1,0 +1,110 @@
+"""A tensile test and an impact in closed form: every quantity is as far from the truth as it says, with lost frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from nodal_tests import COVARIANCE, MESH, NodalTest
+
+from rgbmidic.fields import MEASURES, Nodal, StrainGauges, make_probe, rates, reference_share
+from rgbmidic.typing import FloatArray
+
+RIGHT = (0.9, 1.1)
+"""rms(error / stated), the range that was asked for."""
+SHARE = reference_share(1)
+
+
+def tension(points: FloatArray, time: float) -> FloatArray:
+    """Stretch along y at a constant true strain rate of 2 /s with a lateral contraction of 0.4, turned by 20 deg/s."""
+    along, across = np.exp(2 * time), np.exp(-0.8 * time)
+    angle = np.radians(20 * time)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    arm = points - [110.0, 20.0]
+    return np.asarray(arm * [across, along] @ turn.T - arm)
+
+
+def impact(points: FloatArray, time: float) -> FloatArray:
+    """Struck at the time 0: 0.5 m/s = 2500 px/s, braked over 8 ms, and a bending wave that swings in."""
+    shift = 2500 * time - 2500 / 0.008 * time**2 / 2
+    swing = 1.5 * (1 - np.cos(2 * np.pi * time / 0.006))
+    x = (points[:, 0] - 110) / 100
+    return np.stack([shift + 0.02 * swing * (points[:, 0] - 110), swing * x**2], axis=1)
+
+
+TENSION = NodalTest(times=np.delete(np.arange(40) * 1e-3, [6, 7, 19, 30]), motion=tension)
+IMPACT = NodalTest(times=np.delete(np.arange(40) * 5e-5, [3, 12, 13, 14, 33]), motion=impact)
+TESTS = {"tension": (TENSION, 11e-3), "impact": (IMPACT, 4.5e-4)}
+"""Each with the window of its rates."""
+
+Errors = dict[str, FloatArray]
+
+
+def ratios(
+    name: str, errors: Callable[[NodalTest, float, FloatArray], Iterator[tuple[str, FloatArray]]], draws: int
+) -> Errors:
+    """rms over all draws of what `errors` gives of each quantity in one draw."""
+    test, window = TESTS[name]
+    squares: dict[str, list[float]] = {}
+    for seed in range(draws):
+        for key, ratio in errors(test, window, test.measured(seed)):
+            squares.setdefault(key, []).append(float(np.nanmean(ratio[np.isfinite(ratio)] ** 2)))
+    return {key: np.sqrt(np.mean(values)) for key, values in squares.items()}
+
+
+def nodal_errors(test: NodalTest, window: float, measured: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Displacement, velocity and acceleration at the nodes; the truth of the rates: the same without noise."""
+    std = np.repeat(test.std[..., None], 2, axis=2)
+    options = {"window": window, "share": SHARE, "references": test.references}
+    found, true = (rates(test.times, field, std, **options) for field in (measured, test.truth))
+    yield "displacement", (measured - test.truth)[1:] / std[1:]
+    yield "velocity", (found.velocity - true.velocity) / found.velocity_std
+    yield "acceleration", (found.acceleration - true.acceleration) / found.acceleration_std
+
+
+def strain_errors(test: NodalTest, window: float, measured: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Finite strain of a gauge in every frame, and its rate."""
+    probe = make_probe(COVARIANCE, "strain_gauge", 1, (110, 90, 80), MEASURES[0])
+    std = test.std[:, probe.nodes]
+    read = [
+        probe.histories(Nodal(u=f[:, probe.nodes, 0], v=f[:, probe.nodes, 1], u_std=std, v_std=std))
+        for f in (measured, test.truth)
+    ]
+    found, true = (np.stack([history.values for history in histories[:3]], axis=1) for histories in read)
+    spread = np.stack([history.std for history in read[0][:3]], axis=1)
+    yield "strain", (found - true)[1:] / spread[1:]
+    options = {"window": window, "share": SHARE, "references": test.references}
+    rate, exact = (rates(test.times, one, spread, **options) for one in (found, true))
+    yield "strain rate", (rate.velocity - exact.velocity) / rate.velocity_std
+
+
+@pytest.mark.parametrize("name", TESTS)
+@pytest.mark.parametrize(("errors", "draws"), [(nodal_errors, 8), (strain_errors, 20)])
+def test_every_quantity_is_as_far_off_as_it_says(name, errors, draws):
+    found = ratios(name, errors, draws)
+    assert all(RIGHT[0] <= ratio <= RIGHT[1] for ratio in found.values()), found
+
+
+@pytest.mark.parametrize("name", TESTS)
+def test_rates_without_noise_are_those_of_the_motion(name):
+    """What the polynomial cannot follow is less than its uncertainty in noise."""
+    test, window = TESTS[name]
+    std = np.repeat(test.std[..., None], 2, axis=2)
+    found = rates(test.times, test.truth, std, window=window, share=SHARE, references=test.references)
+    step = 1e-6
+    before, now, after = (
+        np.stack([test.motion(MESH.nodes, time + shift) for time in test.times]) for shift in (-step, 0, step)
+    )
+    velocity, acceleration = (after - before) / (2 * step), (after - 2 * now + before) / step**2
+    inner = (test.times > test.times[0] + window / 2) & (test.times < test.times[-1] - window / 2)
+    assert np.abs(found.velocity - velocity)[inner].max() < np.median(found.velocity_std)
+    assert np.abs(found.acceleration - acceleration)[inner].max() < np.median(found.acceleration_std)
+
+
+def test_the_strain_of_the_tensile_test_is_the_closed_form_at_every_node():
+    gauges = StrainGauges.at_nodes(COVARIANCE, 60)
+    for field, std, time in zip(TENSION.truth, TENSION.std, TENSION.times, strict=True):
+        strain = gauges.strain(*field.T, std, std, measure="hencky")
+        np.testing.assert_allclose(strain.components, [[-0.8 * time, 2 * time, 0]] * len(std), atol=1e-12)
+        np.testing.assert_allclose(strain.principal, [[2 * time, -0.8 * time]] * len(std), atol=1e-12)

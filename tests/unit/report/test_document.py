@@ -1,0 +1,232 @@
+"""The report of a test: what it says is what the result holds, and it needs no other file."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
+
+from rgbmidic.errors import InputError, ResultError
+from rgbmidic.report import document, facts, remove_report, style, write_report
+from rgbmidic.results import FrameRecord, Physical, Result, ResultStore
+from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SetupSettings, TestSettings
+
+X, Y = MESH.nodes.T
+ROOM = (NODES, len(LIGHTS))
+
+
+class Reader(HTMLParser):
+    """Texts of a page's tables and paragraphs, addresses of its pictures, and whether every element is closed."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.rows: dict[str, str] = {}
+        self.pictures: list[str] = []
+        self.texts: list[str] = []
+        self._cells: list[str] = []
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attributes: Any) -> None:
+        assert tag not in ("script", "link", "iframe"), "nothing that loads or runs"
+        if tag == "img":
+            self.pictures.append(dict(attributes)["src"])
+        elif tag not in ("meta", "!doctype"):
+            self.open.append(tag)
+        if tag == "tr":
+            self._cells = []
+        if tag in ("td", "th"):
+            self._cells.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+        if tag == "tr":
+            self.rows[self._cells[0]] = " | ".join(self._cells[1:])
+
+    def handle_data(self, text: str) -> None:
+        if self.open and self.open[-1] in ("td", "th", "code") and self._cells:
+            self._cells[-1] += text
+        self.texts.append(text)
+
+    @property
+    def words(self) -> str:
+        return "".join(self.texts)
+
+
+def settings(**sections: Any) -> TestSettings:
+    return TestSettings(frames=FrameSettings(path=("a",)), region=RegionSettings(rectangle=(0, 0, 9, 9)), **sections)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No pictures: drawing them takes nearly all of the time."""
+    monkeypatch.setattr(document, "embedded", lambda _: "data:image/png;base64,")
+    for module in (document, document.figures):
+        for name in [name for name in vars(module) if name.endswith("_figure")]:
+            monkeypatch.setattr(module, name, lambda *_, **__: None)
+
+
+def make(path: Path, records: list[FrameRecord], **options: Any) -> Result:
+    with ResultStore.create(path, make_origin(len(records), **options)) as store:
+        for index, record in enumerate(records):
+            store.write_frame(index, record)
+    return Result.open(path)
+
+
+def still(index: int, noise: float, **values: Any) -> FrameRecord:
+    """A frame of a body at rest, with the noise and uncertainty of u and v given in px."""
+    u, v = np.random.default_rng(index).normal(0, noise, (2, NODES))
+    std = np.full(NODES, noise)
+    given = {"number": index, "status": 0, "u": u, "v": v, "u_std": std, "v_std": std} | values
+    return FrameRecord.of(nodes=NODES, lights=len(LIGHTS), node_status=np.zeros(NODES, dtype=np.uint8), **given)
+
+
+def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(document, "embedded", lambda figure: style.embedded(figure, dpi=40))  # coarse: for the time
+    for name in ("brightness", "convergence", "map", "residual", "share"):  # have tests of their own
+        monkeypatch.setattr(document.figures, f"{name}_figure", lambda *_: Figure(facecolor="red"))
+    image = np.random.default_rng(0).normal(1000, 100, (3, 80, 120))
+    probes = ProbeSettings(points=((60.0, 40.0),))
+    records = [still(index, 0.01) for index in range(3)]
+    result = make(tmp_path / "result", records, reference=image, settings=settings(probes=probes))
+    write_report(result, tmp_path / "a.html", frames=[2])
+    page = Reader(tmp_path / "a.html")
+    assert page.open == []
+    assert len(page.pictures) >= 9
+    assert all(re.fullmatch("data:image/png;base64,[A-Za-z0-9+/=]{1000,}", source) for source in page.pictures)
+    assert "http" not in (tmp_path / "a.html").read_text(encoding="utf-8")
+    for heading in (
+        "Warnings",
+        "What was measured with what",
+        "Uncertainty",
+        "Lights",
+        "Quality",
+        "Provenance",
+        "Probes",
+    ):
+        assert heading in page.words
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
+    setup = SetupSettings(lens='50 mm, "f/2" <script>', loading="three-point bending")
+    scale = ScaleSettings(mm_per_pixel=0.05, mm_per_pixel_std=0.001)
+    notes = {"frame_rate": 5e4, "exposure_ns": 1500, "lost_frames": 2}
+    records = [still(index, 0.01, time_ns=20_000 * index) for index in range(3)]
+    image = np.random.default_rng(0).normal(1000, 100, (3, 80, 120))
+    stated = settings(setup=setup, scale=scale)
+    write_report(make(tmp_path / "r", records, reference=image, notes=notes, settings=stated), tmp_path / "a.html")
+    page = Reader(tmp_path / "a.html")
+    assert page.rows["lens"] == '50 mm, "f/2" <script>'
+    assert page.rows["loading"] == "three-point bending"
+    assert page.rows["camera"] == "not stated (setup.camera)"
+    assert page.rows["image"] == "120 x 80 px; field of view 6 x 4 mm"
+    assert page.rows["image scale"].startswith("0.05 mm per px ± 0.001")
+    assert page.rows["frame rate"].startswith("50000 frames per second")
+    assert page.rows["exposure"] == "1.5 µs"
+    assert page.rows["virtual strain gauge"] == f"{3 * MESH.size:.4g} px ({0.15 * MESH.size:.3g} mm), at every node"
+    assert page.rows["image filter"].startswith("[1 2 1]")
+    assert page.rows["u_std"].startswith("mm | ")
+    assert "lost between those it kept: 2" in page.words
+    assert "no image scale" not in page.words
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_other_settings_stand_in_place_of_those_kept(tmp_path: Path) -> None:
+    result = make_result(tmp_path / "r", settings=settings(setup=SetupSettings(lens="old")))
+    write_report(result, tmp_path / "a.html")
+    assert Reader(tmp_path / "a.html").rows["lens"] == "old"
+    assert "lengths are in px" in Reader(tmp_path / "a.html").words
+    now = settings(setup=SetupSettings(lens="new"), scale=ScaleSettings(mm_per_pixel=2.0))
+    write_report(result, tmp_path / "a.html", settings=now, overwrite=True)
+    assert Reader(tmp_path / "a.html").rows["lens"] == "new"
+    assert Reader(tmp_path / "a.html").rows["image scale"] == "2 mm per px"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_warnings_tell_what_is_wrong(tmp_path: Path) -> None:
+    fast = [still(index, 0.01, u=np.full(NODES, 30.0 * index), time_ns=10_000 * index) for index in range(3)]
+    failed = FrameRecord.failed("too <dark>", nodes=NODES, lights=len(LIGHTS), number=3, time_ns=30_000)
+    result = make(tmp_path / "r", [*fast, failed], notes={"exposure_ns": 1000})
+    write_report(result, tmp_path / "a.html")
+    page = Reader(tmp_path / "a.html")
+    assert "1 of 3 frames failed" in page.words
+    assert page.rows["frame 3"] == "too <dark>"
+    assert "33% of the nodes are not measured" in page.words
+    assert "motion blur: the fastest node moves by 3 px" in page.words
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_quiet_test_has_no_warning(tmp_path: Path) -> None:
+    records = [still(index, 0.01, time_ns=10_000 * index) for index in range(3)]
+    result = make(tmp_path / "r", records, settings=settings(scale=ScaleSettings(mm_per_pixel=1.0)))
+    write_report(result, tmp_path / "a.html")
+    assert re.search(r"Warnings\s*none", Reader(tmp_path / "a.html").words)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("records", [[], [0], [1, 3]])
+def test_a_run_that_is_not_finished_is_told(tmp_path: Path, records: list[int]) -> None:
+    with ResultStore.create(tmp_path / "r", make_origin(4)) as store:
+        for index in records:
+            store.write_frame(index, random_record(index))
+    write_report(Result.open(tmp_path / "r", partial=True), tmp_path / "a.html")
+    assert f"{4 - len(records)} of 4 frames are missing" in Reader(tmp_path / "a.html").words
+
+
+def test_nothing_is_overwritten_or_left_behind(tmp_path: Path) -> None:
+    result, page = make_result(tmp_path / "r"), tmp_path / "a.html"
+    page.write_text("mine")
+    with pytest.raises(ResultError, match="already exists"):
+        write_report(result, page)
+    with pytest.raises(ResultError, match="no folder"):
+        write_report(result, tmp_path / "none" / "a.html")
+    with pytest.raises(InputError, match="no frame 9"):
+        write_report(result, tmp_path / "b.html", frames=[9])
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.html", "r"]
+    assert page.read_text() == "mine"
+
+
+def test_the_report_of_an_earlier_run_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    for name in ("report.html", "mine.html"):
+        (tmp_path / name).touch()
+    remove_report(tmp_path)
+    remove_report(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.html"]
+
+
+@pytest.mark.parametrize("count", [5, 30])
+def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_path: Path, count: int) -> None:
+    """Static frames of known noise, each told against the mean of all: s sqrt(1 + 1/n) to within what n nodes know."""
+    noise = np.random.default_rng(1).normal(0, 0.02, (2, count, NODES))
+    u, v = noise - noise.mean(axis=1, keepdims=True)
+    records = [still(index, 0.02, u=u[index], v=v[index]) for index in range(count)]
+    frames = FrameSettings(path=("a",), reference=tuple(range(count)))
+    stated = TestSettings(frames=frames, region=RegionSettings(rectangle=(0, 0, 9, 9)))
+    origin = {"references": range(count), "settings": stated}
+    floor = facts.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
+    assert floor is not None
+    assert floor.count == count
+    accuracy = 4 / np.sqrt(2 * (count - 1) * NODES)
+    for name in ("u", "v"):
+        assert floor.measured[name] == pytest.approx(0.1 * 0.02 * np.sqrt(1 + 1 / count), rel=accuracy)
+
+
+def test_one_static_frame_tells_no_noise(tmp_path: Path) -> None:
+    assert facts.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
+
+
+@pytest.mark.parametrize("sigma", [1.5, 3.0])
+def test_speckle_size_is_the_width_of_the_autocorrelation(tmp_path: Path, sigma: float) -> None:
+    """White noise filtered by a Gaussian has one sqrt 2 times as wide as its autocorrelation."""
+    white = np.random.default_rng(0).normal(size=(3, 80, 120)).astype(np.float32)
+    texture = np.stack([cv2.GaussianBlur(image, (0, 0), sigma) for image in white])
+    size = facts.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=texture))
+    assert size == pytest.approx(2 * np.sqrt(2 * np.log(2)) * np.sqrt(2) * sigma, rel=0.1)

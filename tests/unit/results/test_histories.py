@@ -1,0 +1,284 @@
+"""What probes read off a result: right columns, units and times; what is wrong or unknown is one clear line."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from results import MESH, NODES, make_origin
+
+from rgbmidic import cli
+from rgbmidic.command import execute
+from rgbmidic.errors import InputError
+from rgbmidic.report import history_figure
+from rgbmidic.results import (
+    UNKNOWN_TIME,
+    Channels,
+    FrameRecord,
+    Histories,
+    Result,
+    ResultStore,
+    probes_of,
+    write_histories,
+)
+from rgbmidic.results.probing import read_histories
+from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
+
+NUMBERS = (0, 1, 2, 4, 5, 6, 7, 8)
+"""Of the frames: number 3 is lost."""
+RATE = 1000.0
+SCALE = ScaleSettings(mm_per_pixel=0.05, mm_per_pixel_std=1e-4)
+PLACE = (53.3, 47.1)
+LOST_NODE = int(np.argmin(np.hypot(*(MESH.nodes - [50, 45]).T)))
+
+
+def stretch(number: int) -> np.ndarray:
+    """u and v (2, N): 1 % along x in 10 frames, growing with the square of the time, and a shift of 2 px a frame."""
+    share = (number / 10) ** 2
+    return np.stack([0.01 * share * (MESH.nodes[:, 0] - 10) + 2 * number, np.zeros(NODES)])
+
+
+def make(path: Path, *, timed: bool = True, scale: ScaleSettings | None = None, **notes: Any) -> Result:
+    settings = TestSettings(
+        frames=FrameSettings(path=("f*.tif",), kind="monochrome"),
+        region=RegionSettings(rectangle=(10, 5, 110, 75)),
+        scale=scale or ScaleSettings(),
+        probes=ProbeSettings(points=(PLACE,)),
+    )
+    origin = replace(make_origin(len(NUMBERS), settings=settings, notes=notes), lights=("light",))
+    with ResultStore.create(path, origin) as store:
+        for index, number in enumerate(NUMBERS):
+            u, v = stretch(number)
+            std = np.full(NODES, 0.01 if index else 0.0)
+            if index == 5:
+                u[LOST_NODE] = v[LOST_NODE] = std[LOST_NODE] = np.nan
+            record = FrameRecord.of(
+                nodes=NODES,
+                lights=1,
+                status=0,
+                number=number,
+                time_ns=round(number * 1e9 / RATE) + 2_000 if timed else UNKNOWN_TIME,
+                **{"u": u, "v": v, "u_std": std, "v_std": std},
+                light_share=np.ones((NODES, 1)),
+            )
+            store.write_frame(index, record)
+        store.finish()
+    return Result.open(path)
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Result:
+    return make(tmp_path / "out", scale=SCALE, exposure_ns=200_000)
+
+
+def read(result: Result, **options: Any) -> Histories:
+    chosen = {key: options.pop(key) for key in list(options) if key in ("points", "gauges", "strain_gauges", "window")}
+    return read_histories(result, ProbeSettings(**chosen), **options)
+
+
+def test_a_point_is_told_in_mm_and_seconds_with_the_uncertainty_of_the_scale(result: Result) -> None:
+    found = read(result, points=(PLACE,))
+    np.testing.assert_allclose(found.times, np.array(NUMBERS) / RATE + 2e-6)
+    u = found["point_1_u_mm"]
+    pixels = np.array([0.01 * (n / 10) ** 2 * (PLACE[0] - 10) + 2 * n for n in NUMBERS])
+    known = np.arange(len(NUMBERS)) != 5
+    np.testing.assert_allclose(u.values[known], 0.05 * pixels[known])
+    assert u.std is not None
+    assert np.isnan(u.values[5])
+    assert u.std[7] == pytest.approx(np.hypot(0.05 * 0.01, 1e-4 * pixels[7]), rel=0.2)
+    assert "point_1 is not measured in 1 of 8 frames" in found.remarks
+
+
+def test_rates_know_the_times_of_the_frames_that_are_there(result: Result) -> None:
+    found = read(result, gauges=((20, 15, 90, 60),), window=5)
+    gauge = np.hypot(70, 45)
+    along = found["gauge_1_extension_acceleration_mm_per_s2"]
+    exact = 0.05 * 2 * 0.01 * 70 * (70 / gauge) * (RATE / 10) ** 2
+    np.testing.assert_allclose(along.values[2:-2], exact, rtol=0.01)
+    rate = found["gauge_1_strain_rate_per_s"]
+    np.testing.assert_allclose(
+        rate.values[2:-2], 0.02 * (70 / gauge) ** 2 * np.array(NUMBERS)[2:-2] / 10 * RATE / 10, rtol=0.01
+    )
+
+
+def test_the_table_has_one_header_line_and_one_row_a_frame(result: Result, tmp_path: Path) -> None:
+    found = read(result, points=(PLACE,), strain_gauges=((60, 40, 60),))
+    write_histories(found, tmp_path / "a.csv")
+    header, *rows = list(csv.reader((tmp_path / "a.csv").open()))
+    assert header[:8] == [
+        "frame",
+        "number",
+        "status",
+        "time_s",
+        *(f"point_1_{c}_mm{e}" for c in "uv" for e in ("", "_std")),
+    ]
+    assert header[8:10] == ["strain_gauge_1_exx", "strain_gauge_1_exx_std"]
+    assert [int(row[1]) for row in rows] == list(NUMBERS)
+    assert rows[5][4] == ""
+    np.testing.assert_allclose(float(rows[7][4]), found["point_1_u"].values[7], rtol=1e-8)
+
+
+def test_without_scale_and_time_it_counts_in_px_and_frames_and_says_so(tmp_path: Path) -> None:
+    result = make(tmp_path / "out", timed=False)
+    found = read(result, points=(PLACE,), window=5)
+    assert found.times is None
+    told = [told.column for told in found.quantities]
+    assert told[:3] == ["point_1_u_px", "point_1_u_velocity_px_per_frame", "point_1_u_acceleration_px_per_frame2"]
+    assert [remark.split(":")[0] for remark in found.remarks[:2]] == ["no scale is known", "no time is known"]
+    stated = read(result, points=(PLACE,), scale=ScaleSettings(frame_rate=500.0))
+    np.testing.assert_allclose(stated.times, np.array(NUMBERS) / 500)
+
+
+def test_a_stated_rate_that_is_not_that_of_the_stamps_is_told(result: Result, caplog: pytest.LogCaptureFixture) -> None:
+    found = read(result, points=(PLACE,), scale=replace(SCALE, frame_rate=25.0))
+    assert "states 25 frames per second, the frames' own times 1000" in caplog.text
+    np.testing.assert_allclose(found.times[-1], 8 / RATE + 2e-6)
+
+
+def test_motion_within_the_exposure_is_told_where_it_blurs(tmp_path: Path) -> None:
+    assert not [r for r in read(make(tmp_path / "a", exposure_ns=200_000), points=(PLACE,)).remarks if "blur" in r]
+    (blur,) = (r for r in read(make(tmp_path / "b", exposure_ns=600_000), points=(PLACE,)).remarks if "blur" in r)
+    assert "within the exposure of 0.0006 s the surface moves by up to 1.29 px" in blur
+
+
+def test_the_rigid_part_is_told_and_taken_off(result: Result) -> None:
+    probes = ProbeSettings(gauges=((20, 15, 90, 60),), points=(PLACE,), rigid_motion="remove")
+    found, plain = (read_histories(result, replace(probes, rigid_motion=rigid)) for rigid in ("remove", "none"))
+    middle = MESH.nodes[:, 0].mean() - 10
+    expected = [0.05 * (2 * n + 0.01 * (n / 10) ** 2 * middle) for n in NUMBERS]
+    np.testing.assert_allclose(np.delete(found["rigid_u"].values, 5), np.delete(expected, 5))
+    np.testing.assert_allclose(found["rigid_rotation"].values, 0, atol=1e-3)
+    left = 0.05 * 0.01 * 0.64 * (PLACE[0] - 10 - middle)
+    np.testing.assert_allclose(found["point_1_u"].values[-1], left, rtol=1e-6)
+    name = "gauge_1_extension"
+    np.testing.assert_allclose(found[name].values, plain[name].values, atol=1e-12)
+
+
+CHANNELS = "time_ms;force_kN;room\n-1;-0,5;20\n3,002;1,5;\n20;10;22\n"
+
+
+def test_channels_are_brought_to_the_frames_and_make_a_stress(result: Result, tmp_path: Path) -> None:
+    (tmp_path / "c.csv").write_text(CHANNELS, encoding="utf-8-sig")
+    channels = Channels.read(tmp_path / "c.csv")
+    found = read(result, gauges=((20, 15, 90, 60),), channels=channels, offset=1e-3, area=20.0)
+    np.testing.assert_allclose(found["force_kN"].values[3], 1.5)
+    np.testing.assert_allclose(found["stress_MPa"].values[3], 75)
+    assert found.stress_strain == ("gauge_1_strain", "stress")
+    assert np.isnan(found["room"].values).all()
+    assert "the channel room has no value in 8 of 8 frames" in found.remarks
+    figure = history_figure(found)
+    labels = [axis.get_ylabel() for axis in figure.axes]
+    assert labels == ["extension (mm)", "strain", "force_kN", "room", "stress (MPa)", "stress (MPa)"]
+    assert figure.axes[-1].get_xlabel() == "gauge_1_strain"
+    assert figure.axes[0].get_xlabel() == "time (s)"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0,1\n1,2\n", r"need a header line: \"time_s\""),
+        ("time_s,a\n0,1\n", "must rise from row to row, over two rows or more"),
+        ("time_s,a\n0,1\n0,2\n", "must rise"),
+        ("time_s,a\n0,x\n1,2\n", r"row 2 of the channels .* is not numbers"),
+        ("time_s,a\n0,1\n1,2,3\n", r"row 3 of the channels .* has 3 fields, the header 2"),
+        ("", "need a header line"),
+    ],
+)
+def test_a_channel_file_that_is_none_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "c.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        Channels.read(tmp_path / "c.csv")
+
+
+def command(*arguments: object) -> int:
+    return execute(cli.app, ["history", *map(str, arguments)])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            ["--gauge", "20,15:190,60"],
+            "gauge_1 at (190, 60) px is outside the region that was measured, which lies within",
+        ),
+        (["--point", "20"], "--point is X,Y in px, such as 120,85.5, not '20'"),
+        (["--strain-gauge", "60,40:9"], "a strain gauge must be at least 56.12 px long, 3 elements; given are 9 px"),
+        (
+            ["--circle", "500,40:9"],
+            "half or more of circle_1 is outside the region that was measured, which lies within x 10 to 110",
+        ),
+        (["--window", "3"], "probes.window must be 0 or at least 4 frames, not 3"),
+        (["--window", "30"], "rates over a window of 30 frames need as many; 8 are measured"),
+        (["--measure", "euler"], "probes.measure must be one of"),
+        (["--area", "20"], "a stress needs channels with a force"),
+        (["--channels", "none.csv"], "none.csv cannot be read"),
+        (
+            ["--channels", "late.csv"],
+            "late.csv span 100 to 101 s (offset 0 s included), the frames 2e-06 to 0.008002 s",
+        ),
+        (["--channels", "late.csv", "--area", "3", "--offset", "-100"], "one channel of late.csv with a force"),
+    ],
+)
+def test_what_a_new_user_gets_wrong_is_one_clear_line(
+    result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options, words
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("late.csv").write_text("time_s,bridge\n100,1\n101,2\n")
+    assert command(result.path, "--out", "h.csv", *options) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert words in error
+    assert not list(tmp_path.glob("h.*"))
+
+
+def test_a_probe_that_no_frame_measures_and_a_result_without_probes_are_refused(tmp_path: Path) -> None:
+    lost = make(tmp_path / "out", timed=False)
+    node = MESH.nodes[LOST_NODE]
+    with pytest.raises(InputError, match="no probe is stated"):
+        read(lost)
+    (tmp_path / "c.csv").write_text(CHANNELS)
+    channels = Channels.read(tmp_path / "c.csv")
+    with pytest.raises(InputError, match=r"channels .* cannot be brought to the frames, whose times are not known"):
+        read(lost, points=(PLACE,), channels=channels)
+    origin = make_origin(1)
+    with ResultStore.create(tmp_path / "blank", origin) as store:
+        store.write_frame(0, FrameRecord.failed("dark", nodes=NODES, lights=3, number=0, time_ns=0))
+        store.finish()
+    with pytest.raises(InputError, match=r"point_1 is measured in no frame of .*blank: .* place it elsewhere"):
+        read(Result.open(tmp_path / "blank"), points=(tuple(node),))
+
+
+def test_the_command_takes_the_test_s_probes_and_its_own_and_writes_table_and_picture(
+    result: Result, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert probes_of(result) == ProbeSettings(points=(PLACE,))
+    out = tmp_path / "h.csv"
+    assert command(result.path, "--point", "60,40", "--gauge", "20,15:90,60", "--window", 5, "--out", out) == 0
+    printed = capsys.readouterr()
+    assert all(name in printed.out for name in ("point_1_u", "point_2_v", "gauge_1_strain_rate", "1/s", "picture: "))
+    assert "note: point_1 is not measured in 1 of 8 frames" in printed.err
+    assert (tmp_path / "h.png").stat().st_size > 10_000
+    assert command(result.path, "--out", out) == 2
+    assert "already exists" in capsys.readouterr().err
+    (tmp_path / "test.toml").write_text(
+        '[frames]\npath = "f*.tif"\nkind = "monochrome"\n[region]\nrectangle = [10, 5, 110, 75]\n'
+        "[scale]\nmm_per_pixel = 2\n[probes]\ngauges = [20, 15, 90, 60]\n"
+    )
+    assert command(result.path, "--test", tmp_path / "test.toml", "--out", out, "--overwrite") == 0
+    header = out.read_text().splitlines()[0].split(",")
+    assert header[4:] == ["gauge_1_extension_mm", "gauge_1_extension_mm_std", "gauge_1_strain", "gauge_1_strain_std"]
+
+
+def test_the_command_scale_gives_lines_for_the_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["scale", "10,10:410,310", "--length", "25", "--length-std", "0.05"]
+    assert execute(cli.app, arguments) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == ["[scale]", "mm_per_pixel = 0.05", "mm_per_pixel_std = 0.00012"]
+    assert execute(cli.app, ["scale", "10,10:10,10", "--length", "25"]) == 2
+    assert "two different points" in capsys.readouterr().err
+    assert execute(cli.app, ["scale", "10,10:10,20", "--length", "0"]) == 2
+    assert "must be above 0 mm, not 0" in capsys.readouterr().err
