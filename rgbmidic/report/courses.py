@@ -8,12 +8,14 @@ import numpy as np
 
 from rgbmidic.report.facts import Course, NoiseFloor
 from rgbmidic.report.style import GAP, LINES, NUMBERS, draw_figure, finish_plot
-from rgbmidic.results import QUANTITIES, Physical
+from rgbmidic.results import QUANTITIES
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from rgbmidic.results.physical import Physical
 
 __all__ = ["course_figure", "status_figure", "uncertainty_figure"]
 

@@ -16,13 +16,14 @@ from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
 from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
 from rgbmidic.report.style import embedded
-from rgbmidic.results import QUANTITIES, Physical, Result, probes_of
+from rgbmidic.results import QUANTITIES, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete, writing
-from rgbmidic.results.probing import read_histories
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from rgbmidic.results.physical import Physical
 
 __all__ = ["REPORT", "remove_report", "write_report"]
 
@@ -70,6 +71,8 @@ def write_report(
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
     """
+    from rgbmidic.results.physical import Physical  # numba comes with it
+
     out = Path(out)
     check_file(out, overwrite=overwrite)
     kept = result.provenance.get("settings", {}).get("setup", {})
@@ -208,6 +211,8 @@ class _Report:
         """What the probes of the settings read."""
         if not self.probes.places:
             return
+        from rgbmidic.results.probing import read_histories
+
         page.heading("Probes")
         page.table(("probe", "place in px"), [(kind, _numbers(place)) for kind, place in self.probes.places])
         histories = read_histories(self.told.result, self.probes, scale=self.told.scale)

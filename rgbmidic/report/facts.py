@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from rgbmidic.results import QUANTITIES, Physical, Result
+from rgbmidic.results import QUANTITIES, Result
 from rgbmidic.typing import FloatArray
+
+if TYPE_CHECKING:
+    from rgbmidic.results.physical import Physical
 
 __all__ = ["Course", "NoiseFloor", "noise_floor", "speckle_size"]
 

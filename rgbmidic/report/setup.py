@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rgbmidic.report.facts import NoiseFloor, speckle_size
-from rgbmidic.results import Physical
 from rgbmidic.settings import SetupSettings
+
+if TYPE_CHECKING:
+    from rgbmidic.results.physical import Physical
 
 __all__ = ["analysis_rows", "hardware_rows", "noise_words", "reference_words", "settings_rows"]
 

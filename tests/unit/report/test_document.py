@@ -15,7 +15,8 @@ from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.report import document, facts, remove_report, style, write_report
-from rgbmidic.results import FrameRecord, Physical, Result, ResultStore
+from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.results.physical import Physical
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SetupSettings, TestSettings
 
 X, Y = MESH.nodes.T
