@@ -17,7 +17,7 @@ from rgbmidic.report.page import Page
 from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
 from rgbmidic.report.style import embedded
 from rgbmidic.results import QUANTITIES, Result, probes_of
-from rgbmidic.results.files import check_file, write_complete, writing
+from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 
     from rgbmidic.results.physical import Physical
 
-__all__ = ["REPORT", "remove_report", "write_report"]
-
-REPORT = "report.html"
-"""Name of the report that lies in a result's folder."""
+__all__ = ["write_report"]
 
 _MOST = 200
 """Frames that the course of a test is drawn from at most: more lie closer than the dots of a page."""
@@ -81,18 +78,6 @@ def write_report(
     told = Physical.of(result, None if settings is None else settings.scale)
     text = _Report.of(told, setup, probes, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))
-
-
-def remove_report(folder: Path | str) -> None:
-    """Remove the report in the folder of a result that was measured anew: it would show another one.
-
-    Raises
-    ------
-    ResultError
-        It cannot be removed.
-    """
-    with writing(Path(folder) / REPORT):
-        (Path(folder) / REPORT).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
