@@ -38,6 +38,7 @@ def course_figure(told: Physical, course: Course) -> Figure:
                 axis.fill_between(times, low, high, color=colour, alpha=0.18, linewidth=0)
                 axis.plot(times, middle, line, color=colour, linewidth=1.2, label=name, **_marks(times))
             axis.legend(loc="best")
+            axis.ticklabel_format(axis="y", scilimits=(-2, 3))  # long numbers would reach into the axis' name
             finish_plot(axis, unit, label, whole=not told.units.timed)
 
     return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
@@ -60,6 +61,7 @@ def uncertainty_figure(told: Physical, course: Course, floor: NoiseFloor | None)
                     axis.axhline(floor.measured[name], color=colour, linestyle=line, linewidth=0.6)
             axis.set_ylim(bottom=0)
             axis.legend(loc="best")
+            axis.ticklabel_format(axis="y", scilimits=(-2, 3))  # long numbers would reach into the axis' name
             finish_plot(axis, unit, label, whole=not told.units.timed)
 
     return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)

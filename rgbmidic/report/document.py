@@ -30,7 +30,7 @@ __all__ = ["REPORT", "remove_report", "write_report"]
 REPORT = "report.html"
 """Name of the report that lies in a result's folder."""
 
-_MOST = 400
+_MOST = 200
 """Frames that the course of a test is drawn from at most: more lie closer than the dots of a page."""
 _KEY = 3
 _LISTED = 20
@@ -165,7 +165,7 @@ class _Report:
         if lost > _LOST:
             yield f"{lost:.0%} of the nodes are not measured"
         if gaps := result.provenance.get("lost_frames"):
-            yield f"frames that the camera lost between those it kept: {gaps}"
+            yield f"frames missing between those that are there, by number or time: {gaps}"
         yield from self._doubts()
         if told.units.mm_per_pixel is None:
             yield "no image scale is stated (`scale.mm_per_pixel`): lengths are in px"

@@ -1,4 +1,4 @@
-"""The pictures that `rgbmidic run` leaves beside a result, and `rgbmidic figures` draws later."""
+"""Pictures that `rgbmidic run` leaves beside a result and `rgbmidic figures` draws later; what a new run removes."""
 
 from __future__ import annotations
 
