@@ -22,10 +22,10 @@ class Assembly:
 
     Attributes
     ----------
-    unknowns : ndarray, shape (E, 6), int64
-        Unknowns of each element.
-    slots : ndarray, shape (36 E,), int64
-        Position of each entry of the element matrices in the data of the assembled matrix.
+    entries, own : csr_matrix, shape (nonzeros, 27 E), (3 N, 27 E)
+        Sum element blocks into the data of the assembled matrix, and into entries xx, xy, yy of the nodes' own blocks.
+    corners : csr_matrix, shape (2 N, 6 E)
+        Sums element vectors into that of the unknowns.
     indices, indptr : ndarray
         Structure of the assembled matrix (compressed columns).
     smoothness : csc_matrix, shape (2 N, 2 N)
@@ -36,8 +36,9 @@ class Assembly:
         A third of the area of the elements around each node, square px.
     """
 
-    unknowns: npt.NDArray[np.int64]
-    slots: npt.NDArray[np.int64]
+    entries: sp.csr_matrix
+    own: sp.csr_matrix
+    corners: sp.csr_matrix
     indices: npt.NDArray[np.int32]
     indptr: npt.NDArray[np.int32]
     smoothness: sp.csc_matrix
@@ -52,13 +53,17 @@ class Assembly:
         rows = np.repeat(unknowns, 6, axis=1).ravel()
         columns = np.tile(unknowns, 6).ravel()
         keys, slots = np.unique(columns * size + rows, return_inverse=True)
+        part = np.arange(27 * len(mesh.elements)).reshape(-1, 3, 3, 3)
+        full = part[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
+        own = 3 * mesh.elements[..., None] + np.arange(3)
         indptr = np.searchsorted(keys, np.arange(size + 1) * size)
         structure = (keys % size).astype(np.int32), indptr.astype(np.int32)
         laplacian, data = sp.coo_matrix(_laplacian(mesh)), np.zeros(len(keys))
         data[np.searchsorted(keys, laplacian.col.astype(np.int64) * size + laplacian.row)] = laplacian.data
         return cls(
-            unknowns=unknowns,
-            slots=slots.ravel(),
+            entries=_sums(slots.ravel(), full.ravel(), (len(keys), part.size)),
+            own=_sums(own.ravel(), np.einsum("eaad->ead", part).ravel(), (3 * len(mesh.nodes), part.size)),
+            corners=_sums(unknowns.ravel(), np.arange(unknowns.size), (size, unknowns.size)),
             indices=structure[0],
             indptr=structure[1],
             smoothness=sp.csc_matrix((data, *structure), shape=(size, size)),
@@ -73,9 +78,7 @@ class Assembly:
 
     def matrix(self, blocks: FloatArray) -> sp.csc_matrix:
         """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N)."""
-        full = blocks[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
-        sums = np.bincount(self.slots, weights=full.ravel(), minlength=len(self.indices))
-        return self.with_structure(sums.astype(np.float64, copy=False))
+        return self.with_structure(self.entries @ blocks.ravel())
 
     def with_structure(self, data: FloatArray) -> sp.csc_matrix:
         """The matrix of these data in the structure of the assembled ones."""
@@ -83,13 +86,16 @@ class Assembly:
 
     def node_blocks(self, blocks: FloatArray) -> FloatArray:
         """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""
-        corners, own = self.unknowns[:, ::2].ravel() // 2, np.einsum("eaad->dea", blocks).reshape(3, -1)
-        return np.stack([np.bincount(corners, weights=part, minlength=self.size // 2) for part in own])
+        return np.ascontiguousarray((self.own @ blocks.ravel()).reshape(-1, 3).T)
 
     def vector(self, parts: FloatArray) -> FloatArray:
         """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""
-        sums = np.bincount(self.unknowns.ravel(), weights=parts.ravel(), minlength=self.size)
-        return np.asarray(sums, dtype=np.float64)
+        return np.asarray(self.corners @ parts.ravel())
+
+
+def _sums(rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64], shape: tuple[int, int]) -> sp.csr_matrix:
+    """The matrix that adds up entries: 1 at each pair of a row and a column."""
+    return sp.csr_matrix((np.ones(rows.size), (rows, columns)), shape=shape)
 
 
 def factorise(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:

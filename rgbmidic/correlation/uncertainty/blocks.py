@@ -67,7 +67,7 @@ def unfitted_share(
         hessian += own
     matrix = assembly.matrix(hessian)
     solve = factorise(sp.csc_matrix(matrix + _ANCHOR * matrix.diagonal().mean() * sp.eye(assembly.size)))
-    index, shape = pixels.blocks(side)
+    index, shape = pixels.blocks(side), pixels.grid(side)
     rows, columns = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
     group = rows % _APART * _APART + columns % _APART
     sign = np.random.default_rng(0).choice([-1.0, 1.0], group.size)

@@ -36,7 +36,7 @@ def test_the_unfitted_share_is_that_of_the_projection(size):
         for node, (constant, in_x, in_y) in zip(corners, pixels.barycentric[element], strict=True):
             values = constant + in_x * pixels.local_x[own] + in_y * pixels.local_y[own]
             columns[own, node] = values[:, None] * np.stack([slope[own] for slope in slopes], axis=1)
-    index, grid = pixels.blocks(BLOCK)
+    index, grid = pixels.blocks(BLOCK), pixels.grid(BLOCK)
     used = reference.pixel_weights[0] > 0
     inside = (index[:, None] == np.arange(grid[0] * grid[1])) & used[:, None]
     scores = np.concatenate([slope[:, None] * inside for slope in slopes], axis=1).astype(float)
