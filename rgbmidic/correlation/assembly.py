@@ -26,10 +26,9 @@ class Assembly:
         Sum element blocks into the data of the assembled matrix, and into entries xx, xy, yy of the nodes' own blocks.
     corners : csr_matrix, shape (2 N, 6 E)
         Sums element vectors into that of the unknowns.
-    indices, indptr : ndarray
-        Structure of the assembled matrix (compressed columns).
     smoothness : csc_matrix, shape (2 N, 2 N)
-        Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal; in that structure.
+        Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal; in the structure of the
+        assembled matrices.
     diagonal : ndarray
         The unit matrix's data in it.
     nodal_area : ndarray, shape (N,), float64
@@ -39,8 +38,6 @@ class Assembly:
     entries: sp.csr_matrix
     own: sp.csr_matrix
     corners: sp.csr_matrix
-    indices: npt.NDArray[np.int32]
-    indptr: npt.NDArray[np.int32]
     smoothness: sp.csc_matrix
     diagonal: FloatArray
     nodal_area: FloatArray
@@ -64,8 +61,6 @@ class Assembly:
             entries=_sums(slots.ravel(), full.ravel(), (len(keys), part.size)),
             own=_sums(own.ravel(), np.einsum("eaad->ead", part).ravel(), (3 * len(mesh.nodes), part.size)),
             corners=_sums(unknowns.ravel(), np.arange(unknowns.size), (size, unknowns.size)),
-            indices=structure[0],
-            indptr=structure[1],
             smoothness=sp.csc_matrix((data, *structure), shape=(size, size)),
             diagonal=(keys % size == keys // size).astype(np.float64),
             nodal_area=mesh.to_nodes(mesh.areas / 3),
@@ -74,15 +69,14 @@ class Assembly:
     @property
     def size(self) -> int:
         """Number of unknowns, twice the number of nodes."""
-        return len(self.indptr) - 1
+        return self.smoothness.shape[0]
 
-    def matrix(self, blocks: FloatArray) -> sp.csc_matrix:
-        """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N)."""
-        return self.with_structure(self.entries @ blocks.ravel())
-
-    def with_structure(self, data: FloatArray) -> sp.csc_matrix:
-        """The matrix of these data in the structure of the assembled ones."""
-        return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
+    def matrix(self, blocks: FloatArray, more: FloatArray | float = 0.0) -> sp.csc_matrix:
+        """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N); `more` is
+        added to its data."""
+        matrix = self.smoothness.copy()
+        matrix.data = self.entries @ blocks.ravel() + more
+        return matrix
 
     def node_blocks(self, blocks: FloatArray) -> FloatArray:
         """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""

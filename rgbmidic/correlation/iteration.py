@@ -119,7 +119,8 @@ def _right_sides(
     problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate
 ) -> tuple[FloatArray, FloatArray]:
     """Right-hand sides of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
-    total = -equations.turned_back((equations.smoothness @ estimate.displacement.ravel())[:, None]).ravel()
+    bend = problem.reference.assembly.smoothness @ estimate.displacement.ravel()
+    total = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
     rigid = []
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         given = values[light], equations.weights[light], displacement

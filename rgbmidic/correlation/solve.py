@@ -125,10 +125,10 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
     UnsolvableError
         Nothing is left to be measured.
     """
-    weights = weighting.weights
-    if not weights.any():
+    seen = weighting.seen
+    if not seen.any():
         raise UnsolvableError(_nothing_left(weighting), estimate)
-    if problem.functions.shape[1] and not weights[0].any():
+    if problem.functions.shape[1] and not seen[0]:
         raise UnsolvableError(
             "the first light sees nothing, and the rigid motions of the others are counted from it: "
             "put a light first that sees, or measure without rigid motions",
@@ -136,7 +136,9 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
         )
     given = None if weighting.precision is None else weighting.given
     try:
-        equations = Equations.build(problem.reference, weights, problem.functions, estimate.displacement, given)
+        equations = Equations.build(
+            problem.reference, weighting.weights, problem.functions, estimate.displacement, given
+        )
     except RuntimeError as error:  # what SuperLU raises on a matrix that is singular in double precision
         raise UnsolvableError(f"the equations cannot be solved: {error}", estimate) from None
     if not equations.textured.any():

@@ -28,8 +28,9 @@ __all__ = [
     "standard_uncertainty",
 ]
 
-FIRST_PASS = 0.01
-"""Increment (px) at which the first pass hands over to the pass with the weights brought back anew."""
+FIRST_PASS = 0.05
+"""Increment (px) at which the first pass hands over to the pass with the weights brought back anew: an iteration
+brings the displacement 20 times nearer, and the new weights then move it as far."""
 _REFINED = {"none": 1, "global": 1, "local": 4}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _STARTED = 0.25
@@ -66,6 +67,11 @@ class Weighting:
     matched: BoolArray
     precision: Precision | None = None
     returned: int = 0
+
+    @property
+    def seen(self) -> BoolArray:
+        """Which lights (k,) see an element that takes part."""
+        return np.asarray((self.residual.moments[:, self.matched, 0] > 0).any(axis=1))
 
     @property
     def given(self) -> FloatImage:

@@ -43,15 +43,15 @@ def displacing_share(reference: Reference, difference: FloatImage, used: BoolArr
     return np.asarray(reference.pixels.from_blocks(most[None], BLOCK)[0])
 
 
-def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
-    """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P)."""
+def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArray) -> FloatArray:
+    """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P), and with
+    its Hessian's element blocks `texture` (E, 3, 3, 3)."""
     reference = residual.reference
-    used = np.asarray(weights.any(axis=0), dtype=np.float32)
+    used = np.asarray(weights.max(axis=0) > 0, dtype=np.float32)
     side = block_side(reference.pixels, reference.mesh.size)
     x, y, information, _ = _score_sums(reference, residual.difference, weights, side).sum(axis=0)
     count = reference.pixels.block_sums(used[None], side)[0]
     ratios = _score_ratios(x, y, information, count.astype(np.float64), side)
-    texture = np.sum([reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)], axis=0)
     along_x, _, along_y = _per_element(reference, ratios, side) / reference.unfitted
     share = _share_along_x(reference, texture)
     along_x, along_y = along_x / share, along_y / (1 - share)
