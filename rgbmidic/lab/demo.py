@@ -16,6 +16,7 @@ from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.lab.rehearsal import rehearsed
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Separation, measure
 from rgbmidic.results import Result
@@ -130,10 +131,11 @@ def run_demo(
     say(
         f"1 of 5: virtual test, about half a minute: raw DNG frames, calibration captures and the exact truth in {test}"
     )
-    settings_file = write_dataset(scene, test, progress)
-    (test / "calibration.json").rename(test / "true_calibration.json")
-    say("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does it from the captures with one light at a time")
-    calibrate(test)
+    with rehearsed():
+        settings_file = write_dataset(scene, test, progress)
+        (test / "calibration.json").rename(test / "true_calibration.json")
+        say("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from the captures with one light at a time")
+        calibrate(test)
     settings = read_test(settings_file)
     say(f"3 of 5: measurement, some 5 s: rgbmidic run {settings_file} --out {out / 'result'}")
     result = measure(settings, out / "result", progress=progress)
