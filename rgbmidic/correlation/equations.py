@@ -23,8 +23,10 @@ _ROUNDING = 1e-4
 """Share of a node's texture under which what it sees in its worse direction may be rounding."""
 SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area..."""
-_INFORMED = 0.01
-"""...and this share of the median information, its texture over the variance of the residual: 10 times the noise."""
+_INFORMED = 0.001, 0.01
+"""...and this share of the median information, its texture over the variance of the residual: at least, where all
+around matches (the nodes that only a reflecting light sees have .003, and are .01 px off); and beside what does not,
+where a node with less was 1.2 px off."""
 
 
 def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
@@ -50,17 +52,22 @@ class Equations:
         Of the surface around each node.
     functions : ndarray, shape (2 N, m)
         The rigid functions in the axes of the reference.
-    hessian, smoothness : csc_matrix, shape (2 N, 2 N)
+    blocks : ndarray, shape (E, 3, 3, 3)
+        Element blocks of the Hessian.
+    smoothness : float
+        Factor on the smoothness of the `Assembly`.
     node_blocks : ndarray, shape (3, N)
         Entries xx, xy and yy of the nodes' own blocks of the Hessian.
     solve
-        Solves ``(hessian + smoothness) x = b``.
+        Solves the normal equations with it.
     border, border_solved : ndarray, shape (2 N, (k - 1) m)
         Hessian of each further light times the rigid functions, and the solution for it.
     schur : ndarray
         Schur complement of the rigid unknowns.
     textured : ndarray, shape (N,), bool
         Nodes that see enough texture.
+    informed : ndarray, shape (N,), bool
+        Nodes that see so much of it that they count beside what does not match, too.
     light_share : ndarray, shape (N, k), float64
         Share of each light in what determines a node; 0 where nothing does.
     """
@@ -68,14 +75,15 @@ class Equations:
     weights: FloatImage
     rotation: FloatArray
     functions: FloatArray
-    hessian: sp.csc_matrix
+    blocks: FloatArray
     node_blocks: FloatArray
-    smoothness: sp.csc_matrix
+    smoothness: float
     solve: Callable[[FloatArray], FloatArray]
     border: FloatArray
     border_solved: FloatArray
     schur: FloatArray
     textured: BoolArray
+    informed: BoolArray
     light_share: FloatArray
 
     @classmethod
@@ -96,35 +104,38 @@ class Equations:
         functions = _turned_back(rotation, functions)
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
         blocks = np.sum(per_light, axis=0)
-        hessian, own = assembly.matrix(blocks), assembly.node_blocks(blocks)
-        textured, scale = _observability(own, assembly.nodal_area, SEEN if given is None else _INFORMED)
+        own = assembly.node_blocks(blocks)
+        share = _observability(own, assembly.nodal_area)
+        least, usual = (SEEN, SEEN) if given is None else _INFORMED
+        textured, scale = share > least, _typical(own, share > least)
         if given is not None:
             texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
-            textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
-        smoothness = assembly.with_structure(_SMOOTHNESS * scale * assembly.smoothness.data)
+            textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area) > SEEN
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
-        anchor = 1e-9 * scale * assembly.diagonal
-        solve = factorise(assembly.with_structure(hessian.data + smoothness.data + anchor))
-        border, corner = _border([assembly.matrix(blocks) for blocks in per_light[1:]], functions)
+        held = scale * (_SMOOTHNESS * assembly.smoothness.data + 1e-9 * assembly.diagonal)
+        solve = factorise(assembly.matrix(blocks, held))
+        coupled = per_light[1:] if functions.shape[1] else []
+        border, corner = _border([assembly.matrix(blocks) for blocks in coupled], functions)
         solved = solve(border) if border.shape[1] else border
         return cls(
             weights=weights,
             rotation=rotation,
             functions=functions,
-            hessian=hessian,
+            blocks=blocks,
             node_blocks=own,
-            smoothness=smoothness,
+            smoothness=_SMOOTHNESS * scale,
             solve=solve,
             border=border,
             border_solved=solved,
             schur=corner - border.T @ solved,
             textured=textured,
+            informed=textured & (share > usual),
             light_share=_light_share(reference, per_light),
         )
 
     def information(self, reference: Reference) -> FloatArray:
         """Texture times weight around each node, over its area, (N,): what the inverse variance of a node goes with."""
-        return np.asarray(self.hessian.diagonal().reshape(-1, 2).sum(axis=1) / reference.assembly.nodal_area)
+        return np.asarray((self.node_blocks[0] + self.node_blocks[2]) / reference.assembly.nodal_area)
 
     def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solve for the motion of the nodes (N, 2) and of the rigid functions ((k - 1) m,)."""
@@ -155,7 +166,7 @@ def _rotation(gradient: FloatArray) -> FloatArray:
 def _border(hessians: list[sp.csc_matrix], functions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Coupling of the nodes with the rigid unknowns of the further lights, and these with themselves."""
     count = functions.shape[1]
-    columns = [hessian @ functions for hessian in hessians] if count else []
+    columns = [hessian @ functions for hessian in hessians]
     corner = np.zeros((count * len(columns),) * 2)
     for i, column in enumerate(columns):
         part = slice(i * count, (i + 1) * count)
@@ -170,8 +181,8 @@ def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArra
     return np.asarray(light / np.where(total > 0, total, 1.0))
 
 
-def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[BoolArray, float]:
-    """Which nodes see at least that share of the median texture, and the typical diagonal entry of the Hessian.
+def _observability(own: FloatArray, area: FloatArray) -> FloatArray:
+    """What each node (N,) sees in its worse direction, over the median texture around a node of its area.
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
     """
@@ -181,5 +192,10 @@ def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[Boo
     smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only
     density = smallest / area
     typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
-    seen = density > least * typical if typical > 0 else np.zeros(len(density), dtype=bool)
-    return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
+    return density / typical if typical > 0 else np.zeros_like(density)
+
+
+def _typical(own: FloatArray, seen: BoolArray) -> float:
+    """The typical diagonal entry of the Hessian."""
+    half = (own[0] + own[2]) / 2
+    return float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
