@@ -14,7 +14,7 @@ from rgbmidic.lab.study.causes import VARIATIONS, find_causes
 from rgbmidic.lab.study.claims import judge
 from rgbmidic.lab.study.results import PaperStudy
 
-ANGLES = (2.0, 8.0)
+ANGLES = (1.0, 8.0)
 
 
 @pytest.fixture(scope="module")
@@ -92,9 +92,9 @@ def test_command_writes_tables_pictures_and_report(study, tmp_path, monkeypatch)
 
     monkeypatch.setattr("rgbmidic.lab.study.run_paper_study", canned)
     out = tmp_path / "study"
-    result = CliRunner().invoke(app, ["study", "paper", "--out", str(out), "--angles", "2,8", "--size", "512"])
+    result = CliRunner().invoke(app, ["study", "paper", "--out", str(out), "--angles", "1,8", "--size", "512"])
     assert result.exit_code == 0, result.output
-    assert asked["angles"] == [2.0, 8.0]
+    assert asked["angles"] == [1.0, 8.0]
     assert (asked["size"], asked["causes"]) == (512, False)
     with (out / "perturbation.csv").open() as file:
         rows = list(csv.DictReader(file))
