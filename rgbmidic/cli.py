@@ -233,6 +233,17 @@ def report(
 
 
 @app.command()
+def view(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder, also one that still grows.")],
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
+) -> None:
+    """Look at a result in the browser: its address is printed; Ctrl-C ends it. Only this machine is served."""
+    serve = command.optional("rgbmidic.view", "view").serve
+    serve(result, port=port, browser=browser, tell=lambda address: print(address, flush=True))
+
+
+@app.command()
 def history(
     folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
