@@ -116,12 +116,9 @@ class Fields:
         fields = [Field(name="magnitude", unit=length, meaning="length of the displacement", kind="positive")]
         for name, entry in told.items():
             if entry.axes == ("node",):
+                meaning = ", ".join(entry.codes) or entry.meaning
                 kind = self._kind(name)
-                fields.append(
-                    Field(name=name, unit=entry.unit, meaning=entry.meaning, kind=kind, codes=QUANTITIES[name].codes)
-                    if name in QUANTITIES
-                    else Field(name=name, unit=entry.unit, meaning=entry.meaning, kind=kind)
-                )
+                fields.append(Field(name=name, unit=entry.unit, meaning=meaning, kind=kind, codes=entry.codes))
         fields += [
             Field(name=f"share of {light}", unit="", meaning=told["light_share"].meaning, kind="share")
             for light in self.result.lights

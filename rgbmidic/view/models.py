@@ -44,6 +44,7 @@ _DARK = """
 .noUi-target { background: #24292f; border-color: #4b545e; box-shadow: none; }
 """
 _LIGHT = ":host { color: #1b1f24; }"
+_LETTERS = {"background_fill_color": "#15181c", "background_fill_alpha": 0.75, "text_font_size": "12px", "padding": 2}
 _SHORT = 150
 """Smallest number of ms between two frames that are played: what eyes follow, and 6 to 7 a second."""
 
@@ -86,7 +87,6 @@ class Plots:
     field: Any
     image: ColumnDataSource
     colours: LinearColorMapper
-    bar: ColorBar
     marks: ColumnDataSource
     joined: ColumnDataSource
     tools: tuple[Any, ...]
@@ -128,6 +128,7 @@ def plots(frames: int) -> Plots:
     """The plots, empty."""
     field = figure(
         name="plot",
+        title=" ",
         x_range=Range1d(0, 1),
         y_range=Range1d(1, 0),
         sizing_mode="stretch_both",
@@ -141,15 +142,14 @@ def plots(frames: int) -> Plots:
     image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")})
     field.image_rgba("image", "x", "y", "dw", "dh", source=image)
     colours = LinearColorMapper(palette=["#000000"], low=0, high=1)
-    bar = ColorBar(color_mapper=colours, width=14, title_standoff=8)
-    field.add_layout(bar, "right")
+    field.add_layout(ColorBar(color_mapper=colours, width=14), "right")
     marks = ColumnDataSource({"x": [], "y": [], "kind": []}, name="marks")
     joined = ColumnDataSource({"xs": [], "ys": [], "colour": [], "x": [], "y": [], "text": []})
     field.multi_line("xs", "ys", source=joined, line_color="colour", line_width=3)
-    field.text("x", "y", "text", source=joined, text_color="colour", x_offset=8, y_offset=-4, text_outline_color="black")
+    field.text("x", "y", "text", source=joined, text_color="colour", x_offset=8, y_offset=-4, **_LETTERS)
     dots = field.scatter("x", "y", source=marks, size=9, fill_color="white", line_color="black", line_width=1.5)
     draw = tuple(
-        PointDrawTool(renderers=[dots], empty_value=kind, description=kind.replace("_", " ")) for kind in KINDS
+        PointDrawTool(renderers=[dots], empty_value=kind, visible=False) for kind in KINDS
     )
     pan, wheel = PanTool(), WheelZoomTool(zoom_on_axis=False)
     field.add_tools(pan, wheel, BoxZoomTool(match_aspect=True), ResetTool(), SaveTool(filename="field"), *draw)
@@ -163,7 +163,6 @@ def plots(frames: int) -> Plots:
         field=field,
         image=image,
         colours=colours,
-        bar=bar,
         marks=marks,
         joined=joined,
         tools=(pan, *draw),
@@ -203,15 +202,16 @@ def _curves() -> tuple[Any, ColumnDataSource, ColumnDataSource]:
         sizing_mode="stretch_both",
         min_border=4,
         tools="pan,wheel_zoom,box_zoom,reset,save,hover",
-        toolbar_location="right",
+        toolbar_location="above",
     )
     plot.toolbar.logo = None
     lines = ColumnDataSource({"xs": [], "ys": [], "colour": [], "name": []}, name="lines")
     bands = ColumnDataSource({"xs": [], "ys": [], "colour": []}, name="bands")
     plot.patches("xs", "ys", source=bands, fill_color="colour", fill_alpha=0.25, line_alpha=0)
     drawn = plot.multi_line("xs", "ys", source=lines, line_color="colour", line_width=1.5, legend_field="name")
+    plot.x_range.renderers = plot.y_range.renderers = [drawn]  # the values rule, not the widest band
     plot.hover.renderers, plot.hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
-    plot.legend.location, plot.legend.label_text_font_size = "top_left", "11px"
+    plot.legend.visible, plot.legend.location, plot.legend.label_text_font_size = False, "top_left", "11px"
     plot.legend.background_fill_alpha = 0.6
     return plot, lines, bands
 
@@ -220,7 +220,7 @@ def controls(frames: int, *, dark: bool) -> Controls:
     """The controls, with nothing chosen yet."""
     sheets = [InlineStyleSheet(css=_DARK if dark else _LIGHT)]
     wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
-    half: dict[str, Any] = {"stylesheets": sheets, "width": 130}
+    half: dict[str, Any] = {"stylesheets": sheets, "width": 112}
     last = max(frames - 1, 1)
     return Controls(
         head=Div(**wide),

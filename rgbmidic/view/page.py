@@ -11,6 +11,7 @@ from functools import lru_cache, partial, wraps
 from typing import Any
 
 import numpy as np
+from bokeh.core.property.descriptors import UnsetValueError
 from bokeh.document import Document
 from bokeh.events import DocumentReady, MouseMove, RangesUpdate, Tap
 from bokeh.layouts import column, row
@@ -99,8 +100,8 @@ class ResultPage:
             p.under, p.mode, p.curve, row(p.clear, p.csv), p.told, p.theme, sizing_mode="stretch_width",
         )  # fmt: skip
         player = row(p.play, p.step, p.frame, sizing_mode="stretch_width")
-        drawn = {"field": self.plots.field, "course": self.plots.course, "curves": self.plots.curves}
-        return {"head": p.head, "field": drawn["field"], "side": side, "player": player, **drawn}
+        drawn = {"plot": self.plots.field, "course": self.plots.course, "curves": self.plots.curves}
+        return {"head": p.head, "side": side, "player": player, **drawn}
 
     def _whole(self) -> Window:
         """All of the mesh, with a margin."""
@@ -196,10 +197,14 @@ class ResultPage:
             around=30 if self.dark else 235,
         )
         w, plots = self.window, self.plots
+        self.parts.low.visible = self.parts.high.visible = look.range == "hand"
+        self.parts.symmetric.visible = field.signed and look.range != "hand"
         place = {"x": [w.left], "y": [w.top], "dw": [w.right - w.left], "dh": [w.bottom - w.top]}
         plots.image.data = {"image": [image], **place}
-        plots.colours.update(low=low, high=high, palette=colours)
-        plots.bar.title = field.label
+        plots.colours.update(low=low, high=high)
+        if plots.colours.palette != list(colours):  # which takes as long to check as a frame to paint
+            plots.colours.palette = list(colours)
+        plots.field.title.text = field.label
         self.parts.words.text = self._words(remark)
         self._place_marks()
         plots.now[0].location = look.frame
@@ -273,7 +278,10 @@ class ResultPage:
         plot.y_range.update(start=w.bottom, end=w.top)
 
     def _resized(self) -> None:
-        width, height = self.plots.field.inner_width or 0, self.plots.field.inner_height or 0
+        try:
+            width, height = self.plots.field.inner_width, self.plots.field.inner_height
+        except UnsetValueError:  # the browser has not told yet
+            return
         if min(width, height) > 1 and (width, height) != (self.window.width, self.window.height):
             self._set_window(replace(self.window, width=width, height=height))
 
@@ -376,6 +384,7 @@ class ResultPage:
         names = [told.name.replace("_", " ") for told in own]
         plot.lines.data = {"xs": [x] * len(own), "ys": [told.values for told in own], "colour": colours, "name": names}
         plot.curves.xaxis.axis_label, plot.curves.yaxis.axis_label = axis, p.curve.value if own else ""
+        plot.curves.legend.visible = bool(own)
         remarks = [] if histories is None else histories.remarks
         p.told.text = "<br>".join(map(html.escape, remarks)) or _HELP
         plot.now[1].location = self._time(self.look.frame)

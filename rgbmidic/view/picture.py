@@ -126,6 +126,7 @@ def paint(
     return out
 
 
+
 def _resampled(window: Window, picture: AnyArray, around: int) -> npt.NDArray[np.uint8]:
     """The image in the window, reduced by whole factors first, so that nothing fine turns into moiré."""
     across, down = window.steps
