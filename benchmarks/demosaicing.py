@@ -248,9 +248,8 @@ def measured(study: str, index: int, contender: Contender, *, wrinkles: float, s
         normalise=contender.normalise,
         statistics=not contender.masks,
     )
-    mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
-    inside = np.s_[:, margin + 25 : far - 24, margin + 25 : far - 24]
-    error = (at_pixels(mesh, solution.displacement, (size, size)) - exact)[inside].reshape(2, -1)
+    mesh, inside = Tri3Mesh(nodes=solution.nodes, elements=solution.elements), slice(margin + 25, far - 24)
+    error = (at_pixels(mesh, solution.displacement, (size, size)) - exact)[:, inside, inside].reshape(2, -1)
     bias = np.nanmean(error, axis=1)
     scatter, rms = np.sqrt(np.nanmean((error - bias[:, None]) ** 2)), np.sqrt(np.nanmean(error**2))
     missing, of_image = float(np.isnan(error).any(axis=0).mean()), float(np.sqrt(np.nanmean(image**2)))

@@ -23,7 +23,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from demosaicing import field_error
 from uncertainty_scenes import (
     CACHE,
     SPOILS,
@@ -39,7 +38,18 @@ from uncertainty_scenes import (
 )
 
 from rgbmidic.correlation import Solution, correlate
-from rgbmidic.fields import at_nodes, at_pixels, high_pass
+from rgbmidic.fields import (
+    MEASURES,
+    Nodal,
+    NodalCovariance,
+    at_nodes,
+    at_pixels,
+    difference_std,
+    field_rms,
+    high_pass,
+    make_probe,
+    reference_share,
+)
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.study.bench import Bench
 from rgbmidic.lab.study.perturbation import area_stds
@@ -57,6 +67,7 @@ SPHERE_TARGETS = {
     "bayer": {0.33: 0.0045, 1: 0.0065, 2: 0.0076, 4: 0.0100, 8: 0.0150},
 }
 REFLECTION_SHARE = 1 / 3
+NODAL = ("u", "v", "u_std", "v_std")
 EDGE = 12
 
 
@@ -93,12 +104,11 @@ class Verdict:
     @classmethod
     def of(cls, solution: Solution, pair: Pair) -> Verdict:
         """Error of the field without its border element, errors and ratios (N, ...) at the nodes."""
-        low, high = square(pair.size)
-        field = field_error(solution.nodes, solution.elements, solution.displacement, pair.exact, (low + 25, high - 25))
+        mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
         error = solution.displacement - at_nodes(pair.exact, solution.nodes)
         strain = solution.strain - true_strain(pair, solution.nodes)
         return cls(
-            rms=field.rms,
+            rms=field_rms(mesh, solution.displacement, pair.exact, border=25),
             error=error,
             ratio=error / solution.displacement_std,
             strain_ratio=strain / solution.strain_std,
@@ -437,6 +447,43 @@ def elements(quick: bool) -> None:
         row(size, side, lights, f"{share:.1%}", rms(ratio), f"{covered(ratio):.1%}", float(np.nanmedian(spread)))
 
 
+PLACES = (
+    ("point", (53.3, 47.1)),
+    ("line", (20, 20, 100, 100)),
+    ("circle", (60, 60, 25)),
+    ("region", (30, 30, 100, 100)),
+    ("gauge", (33, 40, 100, 90)),
+    ("strain_gauge", (65, 60, 51)),
+    ("strain_gauge", (65, 60, 87)),
+)
+"""Probes on a region of 100 px: kind and place in px; elements have 16 px."""
+
+
+def probes(quick: bool) -> None:
+    """Means, gauges and their change between two frames: a plain texture at rest, noise of 8 % of its contrast."""
+    image, draws = 100 + 50 * _speckle(130, 3.5), []
+    for draw in range(20 if quick else 100):
+        random = np.random.default_rng(draw)
+        first, *later = (image + 4 * random.normal(size=image.shape) for _ in range(3))
+        states = [correlate(first, one, region=(15, 15, 114, 114), element_size=16, initial=(0, 0)) for one in later]
+        draws.append(np.stack([np.concatenate([one.displacement.T, one.displacement_std.T]) for one in states], axis=1))
+    covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=states[0].nodes, elements=states[0].elements))
+    fields = np.stack(draws)
+    nodal = fields[:, :2] / fields[:, 2:]
+    heading("probe", "quantity", "ratio", "covered", "ratio of the change")
+    row("nodes", "u, v", rms(nodal), f"{covered(nodal):.1%}", "")
+    for number, (kind, place) in enumerate(PLACES):
+        probe = make_probe(covariance, kind, number, place, MEASURES[0])
+        read = [probe.histories(Nodal(**dict(zip(NODAL, draw[..., probe.nodes], strict=True)))) for draw in fields]
+        for histories in zip(*read, strict=True):
+            error, std = (np.stack([getattr(one, name) for one in histories]) for name in ("values", "std"))
+            change = (error[:, 1] - error[:, 0]) / difference_std(std[:, 0], std[:, 1], reference_share(1))
+            name = histories[0].name.removeprefix(f"{kind}_{number}_")
+            if histories[0].unit == "deg" or name in ("e1", "e2", "equivalent"):  # mean nothing without strain
+                continue
+            row(f"{kind} {place}", name, rms(error / std), f"{covered(error / std):.1%}", rms(change))
+
+
 def _speckle(size: int, width: float) -> FloatArray:
     """Gaussian speckle of unit contrast; `width` (px) of the autocorrelation at half maximum."""
     blurred = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(size + 40, size + 40)), (0, 0), width / 3.33)
@@ -464,6 +511,7 @@ TABLES: dict[str, Callable[[bool], None]] = {
     "spoiled": spoiled,
     "texture": texture,
     "elements": elements,
+    "probes": probes,
 }
 
 if __name__ == "__main__":

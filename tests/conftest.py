@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # the processes share the cores already
+    os.environ.setdefault("RGBMIDIC_THREADS", "1")
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

@@ -18,9 +18,11 @@ _COARSE = 4
 
 def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
     """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
-    total = [_blur(grid) for grid in pixels.block_means(fields * weights, _COARSE)]
-    share = [_blur(grid) for grid in pixels.block_means(weights, _COARSE)]
-    return np.asarray(np.stack(total) / np.maximum(share, np.float32(1e-6 / _COARSE**2)))
+    means = []
+    for field, weight in zip(fields, weights, strict=True):
+        total, share = (_blur(pixels.block_means(values, _COARSE)) for values in (field * weight, weight))
+        means.append(total / np.maximum(share, np.float32(1e-6 / _COARSE**2)))
+    return np.stack(means)
 
 
 def spread(pixels: PixelMap, grids: FloatImage) -> FloatImage:

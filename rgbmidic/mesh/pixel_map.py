@@ -126,8 +126,10 @@ class PixelMap:
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
         size = grids.shape[2] * side, grids.shape[1] * side
-        images = [cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR) for grid in grids.astype(np.float32)]
-        return self.from_window(np.stack(images))
+        out = np.empty((len(grids), self.rows.size), dtype=np.float32)
+        for grid, values in zip(grids.astype(np.float32), out, strict=True):
+            values[:] = self.from_window(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)[None])[0]
+        return out
 
     def window(self, values: FloatImage, side: int = 1) -> FloatImage:
         """`values` (n, P) as images of the rectangle `bounds`, grown to whole blocks of `side` px on the right and
@@ -145,10 +147,10 @@ class PixelMap:
         return out
 
     def block_means(self, values: FloatImage, side: int) -> FloatImage:
-        """Sums of `values` (n, P) over such blocks, over the pixels of a block, shape (n, rows, columns)."""
-        images = self.window(values, side)
-        size = images.shape[2] // side, images.shape[1] // side
-        return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
+        """Sums of `values` (P,) over such blocks, over the pixels of a block, shape (rows, columns)."""
+        image = self.window(values[None], side)[0]
+        size = image.shape[1] // side, image.shape[0] // side
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
         """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""

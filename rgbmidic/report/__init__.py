@@ -1,6 +1,6 @@
 """What is made of a finished result: figures, the pictures beside it, pages of text and pictures."""
 
-from rgbmidic.report.document import REPORT, remove_report, write_report
+from rgbmidic.report.document import write_report
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -11,7 +11,7 @@ from rgbmidic.report.figures import (
     residual_figure,
     share_figure,
 )
-from rgbmidic.report.gallery import remove_figures, write_figures
+from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures
 from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
 from rgbmidic.report.style import save_figure

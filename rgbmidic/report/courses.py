@@ -8,12 +8,14 @@ import numpy as np
 
 from rgbmidic.report.facts import Course, NoiseFloor
 from rgbmidic.report.style import GAP, LINES, NUMBERS, draw_figure, finish_plot
-from rgbmidic.results import QUANTITIES, Physical
+from rgbmidic.results import QUANTITIES
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from rgbmidic.results.physical import Physical
 
 __all__ = ["course_figure", "status_figure", "uncertainty_figure"]
 
@@ -36,6 +38,7 @@ def course_figure(told: Physical, course: Course) -> Figure:
                 axis.fill_between(times, low, high, color=colour, alpha=0.18, linewidth=0)
                 axis.plot(times, middle, line, color=colour, linewidth=1.2, label=name, **_marks(times))
             axis.legend(loc="best")
+            axis.ticklabel_format(axis="y", scilimits=(-2, 3))  # long numbers would reach into the axis' name
             finish_plot(axis, unit, label, whole=not told.units.timed)
 
     return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
@@ -58,6 +61,7 @@ def uncertainty_figure(told: Physical, course: Course, floor: NoiseFloor | None)
                     axis.axhline(floor.measured[name], color=colour, linestyle=line, linewidth=0.6)
             axis.set_ylim(bottom=0)
             axis.legend(loc="best")
+            axis.ticklabel_format(axis="y", scilimits=(-2, 3))  # long numbers would reach into the axis' name
             finish_plot(axis, unit, label, whole=not told.units.timed)
 
     return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)

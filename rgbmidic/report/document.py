@@ -16,20 +16,18 @@ from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
 from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
 from rgbmidic.report.style import embedded
-from rgbmidic.results import QUANTITIES, Physical, Result, probes_of
-from rgbmidic.results.files import check_file, write_complete, writing
-from rgbmidic.results.probing import read_histories
+from rgbmidic.results import QUANTITIES, Result, probes_of
+from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["REPORT", "remove_report", "write_report"]
+    from rgbmidic.results.physical import Physical
 
-REPORT = "report.html"
-"""Name of the report that lies in a result's folder."""
+__all__ = ["write_report"]
 
-_MOST = 400
+_MOST = 200
 """Frames that the course of a test is drawn from at most: more lie closer than the dots of a page."""
 _KEY = 3
 _LISTED = 20
@@ -70,6 +68,8 @@ def write_report(
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
     """
+    from rgbmidic.results.physical import Physical  # numba comes with it
+
     out = Path(out)
     check_file(out, overwrite=overwrite)
     kept = result.provenance.get("settings", {}).get("setup", {})
@@ -78,18 +78,6 @@ def write_report(
     told = Physical.of(result, None if settings is None else settings.scale)
     text = _Report.of(told, setup, probes, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))
-
-
-def remove_report(folder: Path | str) -> None:
-    """Remove the report in the folder of a result that was measured anew: it would show another one.
-
-    Raises
-    ------
-    ResultError
-        It cannot be removed.
-    """
-    with writing(Path(folder) / REPORT):
-        (Path(folder) / REPORT).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,7 +150,7 @@ class _Report:
         if lost > _LOST:
             yield f"{lost:.0%} of the nodes are not measured"
         if gaps := result.provenance.get("lost_frames"):
-            yield f"frames that the camera lost between those it kept: {gaps}"
+            yield f"frames missing between those that are there, by number or time: {gaps}"
         yield from self._doubts()
         if told.units.mm_per_pixel is None:
             yield "no image scale is stated (`scale.mm_per_pixel`): lengths are in px"
@@ -208,6 +196,8 @@ class _Report:
         """What the probes of the settings read."""
         if not self.probes.places:
             return
+        from rgbmidic.results.probing import read_histories
+
         page.heading("Probes")
         page.table(("probe", "place in px"), [(kind, _numbers(place)) for kind, place in self.probes.places])
         histories = read_histories(self.told.result, self.probes, scale=self.told.scale)

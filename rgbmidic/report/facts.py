@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from rgbmidic.results import QUANTITIES, Physical, Result
+from rgbmidic.results import QUANTITIES, Result
 from rgbmidic.typing import FloatArray
+
+if TYPE_CHECKING:
+    from rgbmidic.results.physical import Physical
 
 __all__ = ["Course", "NoiseFloor", "noise_floor", "speckle_size"]
 
@@ -150,17 +154,25 @@ def _half_width(picture: FloatArray) -> float | None:
     """Of the autocorrelation, averaged over all directions; None where there is no texture."""
     texture = picture - cv2.GaussianBlur(picture, (0, 0), _BACKGROUND)
     power = np.abs(np.fft.rfft2(texture, s=[2 * side for side in texture.shape])) ** 2
-    product = np.fft.irfft2(power)
-    if not product[0, 0] > 0:
-        return None
     reach = min(int(2 * _BACKGROUND), *(side - 1 for side in texture.shape))
     lag = np.arange(-reach, reach + 1)
-    distance = np.hypot(lag[:, None], lag).round().astype(int).ravel()
     pairs = np.multiply.outer(*(1 - np.abs(lag) / side for side in texture.shape))
-    mean = product[np.ix_(lag, lag)] / pairs / product[0, 0]
-    profile = np.bincount(distance, weights=mean.ravel()) / np.bincount(distance)
-    below = np.flatnonzero(profile < 0.5)
+    mean, away = np.fft.irfft2(power)[np.ix_(lag, lag)] / pairs, np.hypot(lag[:, None], lag)
+    ring = away.round().astype(int).ravel()
+    product, distance = (np.bincount(ring, part.ravel()) / np.bincount(ring) for part in (mean, away))
+    if not (len(product) > 2 and product[0] > 0):
+        return None
+    product[0] = _without_noise(product, distance)
+    below = np.flatnonzero(product < 0.5 * product[0])
     if not below.size:
         return None
-    last = below[0] - 1
-    return float(2 * (last + (profile[last] - 0.5) / (profile[last] - profile[last + 1])))
+    ends = slice(below[0], below[0] - 2 if below[0] > 1 else None, -1)
+    return float(2 * np.interp(0.5 * product[0], product[ends], distance[ends]))
+
+
+def _without_noise(product: FloatArray, distance: FloatArray) -> float:
+    """The autocorrelation at distance 0 without the peak of white noise there: a Gaussian through the next two."""
+    if not (product[1] > product[2] > 0):
+        return float(product[0])
+    fall = np.log(product[1] / product[2]) / (distance[2] ** 2 - distance[1] ** 2)
+    return float(min(product[1] * np.exp(fall * distance[1] ** 2), product[0]))

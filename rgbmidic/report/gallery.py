@@ -1,4 +1,4 @@
-"""The pictures that `rgbmidic run` leaves beside a result, and `rgbmidic figures` draws later."""
+"""The pictures that `rgbmidic run` leaves beside a result, `rgbmidic figures` draws later, and a new run removes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ from rgbmidic.results.files import writing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["remove_figures", "write_figures"]
+__all__ = ["REPORT", "remove_figures", "remove_report", "write_figures"]
+
+REPORT = "report.html"
+"""Name of the report that lies in a result's folder."""
 
 _FRAMES = 3
 _OF_FRAMES = (*MAPS, "shares", "masks", "reflections")
@@ -82,6 +85,18 @@ def remove_figures(folder: Path | str) -> None:
         if _NAMES.fullmatch(file.name):
             with writing(file):
                 file.unlink()
+
+
+def remove_report(folder: Path | str) -> None:
+    """Remove the report in the folder of a result that was measured anew: it would show another one.
+
+    Raises
+    ------
+    ResultError
+        It cannot be removed.
+    """
+    with writing(Path(folder) / REPORT):
+        (Path(folder) / REPORT).unlink(missing_ok=True)
 
 
 def _figures(result: Result, frames: Sequence[int]) -> Iterator[tuple[str, Figure]]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rgbmidic.report.facts import NoiseFloor, speckle_size
-from rgbmidic.results import Physical
 from rgbmidic.settings import SetupSettings
+
+if TYPE_CHECKING:
+    from rgbmidic.results.physical import Physical
 
 __all__ = ["analysis_rows", "hardware_rows", "noise_words", "reference_words", "settings_rows"]
 
@@ -85,7 +87,7 @@ def analysis_rows(told: Physical, floor: NoiseFloor | None) -> Rows:
     yield from _known("image filter", _PREFILTERS.get(set_("solver", "prefilter")))
     yield from _known("weights of the lights", _WEIGHTS.get(set_("weights", "method")))
     yield "elements", _elements(told)
-    yield "shape functions", "linear, continuous over the mesh"
+    yield "shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"
     yield "matching criterion", "weighted sum of squared differences over all lights at once"
     yield "interpolant", "cubic B-spline"
     yield from _known("grey-level correction", set_("solver", "brightness"))

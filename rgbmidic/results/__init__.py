@@ -14,7 +14,6 @@ from rgbmidic.results.measures import (
     shared_part,
     units_of,
 )
-from rgbmidic.results.physical import Physical
 from rgbmidic.results.provenance import Origin
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
 from rgbmidic.results.record import FrameRecord
@@ -30,7 +29,6 @@ __all__ = [
     "FrameRecord",
     "Histories",
     "Origin",
-    "Physical",
     "Quantity",
     "Result",
     "ResultStore",

@@ -7,19 +7,19 @@ import io
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import column
 from rgbmidic.results.files import check_file, write_complete
-from rgbmidic.results.hdf5 import write_hdf5
-from rgbmidic.results.physical import Physical
 from rgbmidic.results.quantities import QUANTITIES, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray, FloatArray
+
+if TYPE_CHECKING:
+    from rgbmidic.results.physical import Physical
 
 __all__ = ["EXPORT_FORMATS", "export_result"]
 
@@ -60,6 +60,8 @@ def export_result(
     if to not in _WRITERS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
     check_file(out, overwrite=overwrite)
+    from rgbmidic.results.physical import Physical  # numba comes with it
+
     told = Physical.of(result, scale)
     write_complete(out, lambda file: _WRITERS[to](told, file))
 
@@ -86,6 +88,8 @@ def _write_frames(result: Result, quantity: Quantity, file: IO[bytes]) -> None:
 
 
 def _write_csv(told: Physical, file: BinaryIO) -> None:
+    from rgbmidic.fields.units import column
+
     result, text = told.result, io.TextIOWrapper(file, encoding="utf-8", newline="")
     fields = {name: entry.unit for name, entry in told.quantities.items() if entry.axes == ("node",)}
     del fields["node_status"]  # a whole number
@@ -108,6 +112,12 @@ def _csv_rows(one: list[Any], status: AnyArray, numbers: FloatArray) -> Iterator
         yield [*one, node, code, *("" if number != number else f"{number:.9g}" for number in row)]
 
 
-_WRITERS: dict[str, Callable[[Physical, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv, "hdf5": write_hdf5}
+def _write_hdf5(told: Physical, file: BinaryIO) -> None:
+    from rgbmidic.results.hdf5 import write_hdf5
+
+    write_hdf5(told, file)
+
+
+_WRITERS: dict[str, Callable[[Physical, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv, "hdf5": _write_hdf5}
 EXPORT_FORMATS = tuple(_WRITERS)
 """Names of the formats that `export_result` writes."""

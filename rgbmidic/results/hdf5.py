@@ -60,23 +60,31 @@ def write_hdf5(told: Physical, file: BinaryIO) -> None:
     OSError
         The disk is full or refuses.
     """
-    import h5py
-
     _check_room(told, Path(file.name).parent)
-    with h5py.File(file.name, "w") as out:
-        _write_shared(out, told)
-        for entry in told.quantities.values():
-            _declare(out, told, entry)
-        group = out.create_group("VTKHDF")
-        _declare_grid(group, told)
-        arrays = {name: _Rows.of(out[name]) for name in told.quantities}
-        turned = {name: _Rows.of(group["PointData"][name]) for name in ("displacement", *_TURNED)}
+    arrays, turned = _lay_out(told, file.name)
     for index in range(len(told.result)):
         values = told.frame(index)
         for name, rows in arrays.items():
             rows.write(file, index, values[name])
         for name, rows in turned.items():
             rows.write(file, index, _upward(values) if name == "displacement" else -values[name])
+
+
+def _lay_out(told: Physical, name: str) -> tuple[dict[str, _Rows], dict[str, _Rows]]:
+    """Write all but what belongs to a frame; gives the place of each array of the root, and of VTK's group."""
+    import h5py
+
+    try:
+        with h5py.File(name, "w") as out:
+            _write_shared(out, told)
+            for entry in told.quantities.values():
+                _declare(out, told, entry)
+            group = out.create_group("VTKHDF")
+            _declare_grid(group, told)
+            arrays = {name: _Rows.of(out[name]) for name in told.quantities}
+            return arrays, {name: _Rows.of(group["PointData"][name]) for name in ("displacement", *_TURNED)}
+    except OSError as error:  # whose text is HDF5's, in several lines
+        raise OSError(error.errno, os.strerror(error.errno)) if error.errno else error from None
 
 
 class _Rows(NamedTuple):

@@ -26,7 +26,7 @@ from rgbmidic.typing import AnyArray
 __all__ = ["PROVENANCE", "SCHEMA_VERSION", "Origin", "check_same", "digest", "now", "read_provenance"]
 
 SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"

@@ -161,7 +161,7 @@ class Bench:
         mixing = self.scene.camera.mixing(self.scene.lights).astype(np.float32)
         return max(float(np.einsum("l,lyx->yx", row, images).max()) for row in mixing)
 
-    def photograph(self, images: FloatImage, shot: int) -> IlluminationImages:
+    def photograph(self, images: FloatImage, shot: int, demosaic: str = "malvar") -> IlluminationImages:
         """Illumination images from noisy shots of a state: one per light, or one mosaic of all.
 
         Parameters
@@ -170,12 +170,14 @@ class Bench:
             Noise-free images (k, H, W), exposed.
         shot
             Number of the state; every one has its own noise.
+        demosaic
+            How a Bayer mosaic is separated, see `rgbmidic.illumination.separate.separate`.
         """
         camera, lights = self.scene.camera, self.scene.lights
         if self.name == "bayer":
             mosaic = linearise(record(images, camera, lights, seed=self._noise_seed(shot, 0)), camera.noise)
             assert isinstance(mosaic, LinearMosaic)
-            return separate(mosaic, camera.true_crosstalk(lights), "malvar")  # the study's figures are about the solve
+            return separate(mosaic, camera.true_crosstalk(lights), demosaic)
         frames = [
             linearise(record(images, camera, lights, seed=self._noise_seed(shot, i), on=(light.name,)))
             for i, light in enumerate(lights)

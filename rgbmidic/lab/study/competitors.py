@@ -1,8 +1,9 @@
-"""The four methods that the paper compares, as settings of one solver.
+"""The four methods that the paper compares, as settings of one solver, and rgbmidic's own default beside them.
 
 Plain DIC with one light (section 2.2), the same with a local grey-level correction (GLC-DIC, section 2.2 and ref. 14),
-all lights together without weights (Fig. 13), and all lights with binary weights (MIDIC, section 3). Grey levels are
-taken as they are and the lights' shares are not balanced: what rgbmidic does beyond the paper is left out on purpose.
+all lights together without weights (Fig. 13), and all lights with binary weights (MIDIC, section 3). In these four grey
+levels are taken as they are and the lights' shares are not balanced: what rgbmidic does beyond the paper is in the
+fifth, the settings that a test has where TEST.toml says nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from rgbmidic.correlation.start import find_start
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.settings import ELEMENT_SIZE, SolverSettings
+from rgbmidic.pipeline.separation import correlated
+from rgbmidic.settings import ELEMENT_SIZE, IlluminationSettings, SolverSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import threshold_weights
 
@@ -38,12 +40,22 @@ class Method:
         Whether reflections are excluded by binary weights.
     brightness
         Grey-level correction of the solver: ``"none"`` or ``"local"``.
+    default
+        rgbmidic's own settings: local normalisation, prefilter, weights by statistics.
+    demosaic
+        How a Bayer mosaic is separated; Malvar's filters for the paper's methods, whose figures are about the solve.
     """
 
     title: str
     all_lights: bool = False
     weighted: bool = False
     brightness: Literal["none", "local"] = "none"
+    default: bool = False
+    demosaic: str = "malvar"
+
+    def correlated(self, images: IlluminationImages) -> FloatImage:
+        """What the solve correlates (k, H, W)."""
+        return correlated(images, IlluminationSettings()) if self.default else images.values
 
 
 METHODS: dict[str, Method] = {
@@ -51,6 +63,7 @@ METHODS: dict[str, Method] = {
     "glc-dic": Method(title="GLC-DIC, one light", brightness="local"),
     "midic-unweighted": Method(title="MIDIC without weights", all_lights=True),
     "midic": Method(title="MIDIC", all_lights=True, weighted=True),
+    "default": Method(title="rgbmidic, default", all_lights=True, default=True, demosaic="auto"),
 }
 """The methods by the name they have in perturbation.csv."""
 
@@ -107,7 +120,8 @@ class Competitor:
         element_size
             px.
         prefilter
-            As in `rgbmidic.correlation.correlate`; the paper has none. A Bayer mosaic needs ``"binomial"``.
+            As in `rgbmidic.correlation.correlate`; the paper has none. A Bayer mosaic needs ``"binomial"``. The method
+            ``"default"`` has its own.
 
         Raises
         ------
@@ -118,18 +132,18 @@ class Competitor:
             raise InputError(f"unknown method {method!r}; allowed are {', '.join(METHODS)}")
         if not 0 <= light < len(images.values):
             raise InputError(f"light {light} is not one of the {len(images.values)} lights")
-        weighted = METHODS[method].weighted
+        weighted, default = METHODS[method].weighted, METHODS[method].default
         if weighted and threshold is None:
             raise InputError(f"method {method!r} needs a weighting threshold; see `set_up_threshold`")
         lights = tuple(range(len(images.values))) if METHODS[method].all_lights else (light,)
         chosen = _only(images, lights)
         limit = threshold if weighted else None
         reference = Reference.prepare(
-            chosen.values,
+            METHODS[method].correlated(chosen),
             region,
             _weights(chosen, limit, blur),
             mesh=Tri3Mesh.from_region(region, element_size),
-            prefilter=prefilter,
+            prefilter=SolverSettings().prefilter if default else prefilter,
         )
         return cls(method=method, lights=lights, reference=reference, threshold=limit, blur=blur)
 
@@ -143,14 +157,13 @@ class Competitor:
         start : ndarray, shape (N, 2), optional
             Displacement (px) to start from; None looks for it.
         """
-        chosen = _only(images, self.lights)
-        deformed = Deformed.prepare(
-            chosen.values, _weights(chosen, self.threshold, self.blur), prefilter=self.reference.prefilter
-        )
+        chosen, method = _only(images, self.lights), METHODS[self.method]
+        weights = _weights(chosen, self.threshold, self.blur)
+        deformed = Deformed.prepare(method.correlated(chosen), weights, prefilter=self.reference.prefilter)
         if start is None:
             start = find_start(self.reference, deformed).displacement
-        options = SolverSettings(brightness=METHODS[self.method].brightness)
-        return solve(self.reference, deformed, start, options, statistics=False)
+        options = SolverSettings(brightness=method.brightness)
+        return solve(self.reference, deformed, start, options, statistics=method.default)
 
 
 def _weights(images: IlluminationImages, threshold: float | None, blur: float) -> FloatImage:

@@ -1,4 +1,4 @@
-"""The paper's experiment on the virtual bench: every angle, the four methods, two ways to light and record."""
+"""The paper's experiment on the virtual bench: every angle, the methods, two ways to light and record."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def run_paper_study(
     causes: bool = True,
     progress: Progress | None = None,
 ) -> PaperStudy:
-    """Render the sphere at every angle and measure it with the four methods; then the flat specimen and the causes.
+    """Render the sphere at every angle and measure it with every method; then the flat specimen and the causes.
 
     Parameters
     ----------
@@ -119,7 +119,8 @@ class _Steps:
 
 
 def _run_scene(bench: Bench, angles: tuple[float, ...], steps: _Steps) -> SceneStudy:
-    reference, shots, gain = _photograph(bench, angles, steps)
+    photographs, gain = _photograph(bench, angles, steps)
+    reference, shots = photographs[METHODS["midic"].demosaic]
     small = next(angle for angle in angles if angle > 0)
     kept = {small, angles[-1]}
     thresholds = _thresholds(bench, reference, shots, gain)
@@ -128,14 +129,14 @@ def _run_scene(bench: Bench, angles: tuple[float, ...], steps: _Steps) -> SceneS
     competitors = {
         method: Competitor.prepare(
             method,
-            reference,
+            photographs[settings.demosaic][0],
             bench.region,
             light=bench.light,
             threshold=limit,
             blur=BLUR,
             prefilter=bench.prefilter,
         )
-        for method in METHODS
+        for method, settings in METHODS.items()
     }
     masks = threshold_weights(reference, threshold=limit, blur=BLUR)
     measurements: dict[tuple[str, float], Measurement] = {}
@@ -144,7 +145,8 @@ def _run_scene(bench: Bench, angles: tuple[float, ...], steps: _Steps) -> SceneS
         fields = {}
         truth = bench.truth(angle)
         for method, competitor in competitors.items():
-            measurement, field = measure_state(competitor, reference, shots[angle], bench, truth)
+            first, states = photographs[METHODS[method].demosaic]
+            measurement, field = measure_state(competitor, first, states[angle], bench, truth)
             measurements[method, angle], fields[method] = measurement, field
         if angle in kept:
             both = masks * threshold_weights(shots[angle], threshold=limit, blur=BLUR)
@@ -165,16 +167,20 @@ def _run_scene(bench: Bench, angles: tuple[float, ...], steps: _Steps) -> SceneS
 
 def _photograph(
     bench: Bench, angles: tuple[float, ...], steps: _Steps
-) -> tuple[IlluminationImages, dict[float, IlluminationImages], np.float32]:
-    """Reference and states, all with the one exposure, given too, at which no pixel of the series saturates."""
+) -> tuple[dict[str, tuple[IlluminationImages, dict[float, IlluminationImages]]], np.float32]:
+    """Reference and states for each way to separate a mosaic, all with the one exposure, given too, at which no pixel
+    of the series saturates."""
     clean = {}
     for angle in (0.0, *(angle for angle in angles if angle > 0)):
         clean[angle] = bench.render(angle)
         steps(f"{bench.name}: {angle:g} degrees rendered")
     gain = np.float32(bench.exposure_gain(max(bench.brightest(images) for images in clean.values())))
-    reference = bench.photograph(clean[0.0] * gain, 0)
-    shots = {angle: bench.photograph(clean[angle] * gain, 1 + i) for i, angle in enumerate(angles)}
-    return reference, shots, gain
+    photographs = {}
+    for demosaic in {method.demosaic for method in METHODS.values()}:
+        reference = bench.photograph(clean[0.0] * gain, 0, demosaic)
+        shots = {angle: bench.photograph(clean[angle] * gain, 1 + i, demosaic) for i, angle in enumerate(angles)}
+        photographs[demosaic] = reference, shots
+    return photographs, gain
 
 
 def _thresholds(

@@ -192,7 +192,9 @@ def _scene_section(page: Page, scene: SceneStudy) -> None:
     page.heading(f"Scene {name}: {_SCENES[name]}")
     page.picture(f"{name}_fig04_images.png", "Fig. 4: the reflection at the first and the last angle, and the areas")
     page.picture(f"{name}_fig07_08_13_17_perturbation.png", "Figs 7, 8, 13 and 17: perturbation P of the areas")
-    page.table(("method", "angle (°)", *(area.name for area in scene.bench.areas)), list(_table(scene)))
+    page.table(
+        ("method", "angle (°)", *(area.name for area in scene.bench.areas), "A3/A0", "A4/A0"), list(_table(scene))
+    )
     page.text("P in 1e-3 px; a dash where less than half of the area was measured.")
     page.picture(f"{name}_ripple.png", "What P is taken from: the vertical displacement without its long waves")
     page.picture(f"{name}_fig05_dic.png", "Fig. 5: vertical displacement by plain DIC")
@@ -206,7 +208,8 @@ def _scene_section(page: Page, scene: SceneStudy) -> None:
 def _table(scene: SceneStudy) -> Iterator[tuple[str, ...]]:
     for method, settings in METHODS.items():
         for angle, row in zip(scene.angles, scene.perturbation(method), strict=True):
-            yield settings.title, f"{angle:g}", *("-" if np.isnan(p) else f"{1000 * p:.1f}" for p in row)
+            ratios = ["-" if np.isnan(ratio) else f"{ratio:.2f}" for ratio in row[3:] / row[0]]
+            yield settings.title, f"{angle:g}", *("-" if np.isnan(p) else f"{1000 * p:.1f}" for p in row), *ratios
 
 
 def _causes_section(page: Page, causes: Sequence[Cause]) -> None:

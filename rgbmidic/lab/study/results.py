@@ -68,7 +68,7 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneStudy:
-    """The four methods on one scene.
+    """The methods on one scene.
 
     Attributes
     ----------

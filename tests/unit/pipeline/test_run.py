@@ -176,11 +176,13 @@ def test_a_dask_cluster_gives_the_same_bits(movie: Path, whole: Result, tmp_path
         same(measure(settings(movie), tmp_path / "result", scheduler=cluster.scheduler_address), whole)
 
 
-def test_a_rotation_is_followed_by_renewed_references_to_the_same_bits(tmp_path: Path) -> None:
-    texture, rng = Texture.random(3, contrast=35.0), np.random.default_rng(1)
-    for index in range(20):
-        image = texture.image(SHAPE, Affine.strain_and_rotation(0.0, 3.0 * index))
-        values = np.clip(np.round(image + rng.normal(0, 1.0, SHAPE)), 0, 255).astype(np.uint8)
+def test_paint_that_wears_off_is_followed_by_renewed_references_to_the_same_bits(tmp_path: Path) -> None:
+    old, new, rng = Texture.random(3, contrast=35.0), Texture.random(4, contrast=35.0), np.random.default_rng(1)
+    motions = [Affine(shift=(0.1 * index, 0.0)) for index in range(20)]
+    for index, motion in enumerate(motions):
+        worn = np.radians(1.0 * index)
+        image = 200 + np.cos(worn) * (old.image(SHAPE, motion) - 200) + np.sin(worn) * (new.image(SHAPE, motion) - 200)
+        values = np.clip(np.round(image + rng.normal(0, 4.0, SHAPE)), 0, 255).astype(np.uint8)
         frame = ChannelFrame(values=values[None], black_level=0.0, white_level=255.0)
         write_tiff(tmp_path / f"f{index:03d}.tif", frame)
 
@@ -195,9 +197,9 @@ def test_a_rotation_is_followed_by_renewed_references_to_the_same_bits(tmp_path:
     last = renewing.frame(19)
     assert len(last.renewals) >= 1
     assert (last.node_status == 0).all()
-    truth = Affine.strain_and_rotation(0.0, 57.0).displacement(renewing.nodes, SHAPE)
+    truth = motions[-1].displacement(renewing.nodes, SHAPE)
     error = np.stack([last.u, last.v], axis=1) - truth
-    assert np.sqrt((error**2).mean()) < 0.1
+    assert np.sqrt((error**2).mean()) < 1  # a third of the paint is another one
     assert 0.5 < np.sqrt(((error / np.stack([last.u_std, last.v_std], axis=1)) ** 2).mean()) < 2
     with pytest.raises(KeyboardInterrupt):
         measure(chosen, tmp_path / "resumed", progress=interrupt)

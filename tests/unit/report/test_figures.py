@@ -126,8 +126,8 @@ def test_each_frame_has_the_pictures_it_can_have(tmp_path: Path) -> None:
 
 
 def test_three_deformed_frames_get_pictures_and_the_reference_none() -> None:
-    assert gallery._spread(tuple(range(1, 12))) == [1, 6, 11]
-    assert gallery._spread((5,)) == [5]
+    assert figures.spread(tuple(range(1, 12)), 3) == (1, 6, 11)
+    assert figures.spread((5,), 3) == (5,)
 
 
 def test_the_reference_is_left_out_of_what_happens_over_the_frames(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The four methods differ in what they use of the images, and only in that."""
+"""The methods differ in what they use of the images, and only in that."""
 
 import numpy as np
 import pytest
@@ -55,6 +55,7 @@ def test_weights_remove_what_the_reflections_disturb():
     assert errors["midic"] < 0.2 * errors["glc-dic"]
     assert errors["midic"] < 0.1 * errors["midic-unweighted"]
     assert errors["glc-dic"] < errors["dic"]
+    assert errors["default"] < errors["midic"]
 
 
 def test_one_light_or_all_with_or_without_weights():
