@@ -126,7 +126,6 @@ def paint(
     return out
 
 
-
 def _resampled(window: Window, picture: AnyArray, around: int) -> npt.NDArray[np.uint8]:
     """The image in the window, reduced by whole factors first, so that nothing fine turns into moiré."""
     across, down = window.steps
@@ -134,9 +133,7 @@ def _resampled(window: Window, picture: AnyArray, around: int) -> npt.NDArray[np
     small = picture
     if factor > 1:
         rows, columns = (size // factor * factor for size in picture.shape)
-        small = cv2.resize(
-            picture[:rows, :columns], (columns // factor, rows // factor), interpolation=cv2.INTER_AREA
-        )
+        small = cv2.resize(picture[:rows, :columns], (columns // factor, rows // factor), interpolation=cv2.INTER_AREA)
     x, y = window.left + across / 2, window.top + down / 2
     shift = (factor - 1) / 2
     to_image = np.array(

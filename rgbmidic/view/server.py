@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import html
+import logging
 import secrets
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.core.templates import get_env
 from bokeh.document import Document
+from bokeh.model import Model
 from bokeh.models import Div
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
@@ -21,11 +24,13 @@ from bokeh.server.util import bind_sockets
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
 
-from rgbmidic.errors import InputError, ResultError
+from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.results import Result
+from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.view.address import Look
 from rgbmidic.view.fields import Fields
 from rgbmidic.view.page import ResultPage
+from rgbmidic.view.runner import Run
 
 __all__ = ["serve", "start"]
 
@@ -56,6 +61,8 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
     InputError
         The port is in use.
     """
+    for library in ("bokeh", "tornado"):  # what they say of a strange request is for programmers
+        logging.getLogger(library).setLevel(logging.CRITICAL)
     server, address = start(path, port=port)
     tell(address)
     if browser:
@@ -66,16 +73,18 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
         server.stop()
 
 
-def start(path: Path, *, port: int = 0, loop: Any = None) -> tuple[BaseServer, str]:
+def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
     """A server that answers once its loop runs, and its address; errors as `serve`."""
-    result = Result.open(path, partial=True)
+    pages = _pages(path)
     token = secrets.token_urlsafe(24)
     try:
         sockets, port = bind_sockets(_HOST, port)
     except OSError as error:
-        raise InputError(f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another --port, or none") from None
+        raise InputError(
+            f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another --port, or none"
+        ) from None
     application = BokehTornado(
-        {"/": Application(FunctionHandler(lambda document: _open(document, result)))},
+        {route: Application(FunctionHandler(page)) for route, page in pages.items()},
         prefix=f"/{token}",
         extra_websocket_origins=[f"{_HOST}:{port}"],
         unused_session_lifetime_milliseconds=_FORGOTTEN,
@@ -85,43 +94,78 @@ def start(path: Path, *, port: int = 0, loop: Any = None) -> tuple[BaseServer, s
     )
     http = HTTPServer(application)
     http.add_sockets(sockets)
-    server = BaseServer(loop or IOLoop.current(), application, http)
+    server = BaseServer(IOLoop.current(), application, http)
     server.start()
     return server, f"http://{_HOST}:{port}/{token}/"
 
 
-def _open(document: Document, result: Result) -> None:
-    """The page of a visitor: the result as it is now, looked at as the address says."""
+def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
+    """What is served: a result, or a test that is set up and the result of its run; bad input is told at once."""
+    if (path / PROVENANCE).exists():
+        Result.open(path, partial=True)
+        return {"/": partial(_open, path)}
+    from rgbmidic.view.draft import Draft
+    from rgbmidic.view.setup import SetupPage
+    from rgbmidic.view.setup_frames import Footage
+
+    Footage.of(Draft.of(path))
+    runs: list[Run] = []
+
+    def setup(document: Document) -> None:
+        theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
+        page = SetupPage(document, Draft.of(path), runs.append, dark=theme == "dark")
+        _place(document, page.roots, f"rgbmidic: {path.name}", theme)
+
+    def result(document: Document) -> None:
+        if not runs:
+            raise ResultError("no run was started yet")
+        _fill(document, Result.open(runs[-1].out, partial=True))
+
+    return {"/": partial(_told, setup), "/result": partial(_told, result)}
+
+
+def _open(path: Path, document: Document) -> None:
+    """The page of a result as it is now."""
+    _told(lambda own: _fill(own, Result.open(path, partial=True)), document)
+
+
+def _told(fill: Callable[[Document], None], document: Document) -> None:
+    """A page, or what is wrong in one line of it."""
     try:
-        result = result.refresh()
-    except ResultError as error:
-        _refuse(document, str(error))
-        return
+        fill(document)
+    except RgbmidicError as error:
+        document.clear()
+        _place(document, {"head": Div(text=html.escape(str(error)))}, "rgbmidic", "")
+
+
+def _query(document: Document) -> dict[str, list[bytes]]:
+    context = document.session_context
+    return {} if context is None or context.request is None else context.request.arguments
+
+
+def _fill(document: Document, result: Result) -> None:
+    """The page of a result, looked at as the address says."""
     there = np.flatnonzero(result.finished)
     last = int(there[-1]) if len(there) else 0
-    context = document.session_context
-    query = {} if context is None or context.request is None else context.request.arguments
-    look = Look.from_query(query, frames=len(result), names=list(Fields.of(result).all), frame=last)
+    names = list(Fields.of(result).all)
+    look = Look.from_query(_query(document), frames=len(result), names=names, frame=last)
     page = ResultPage(document, result, look)
-    roots = page.roots
+    _place(document, page.roots, f"rgbmidic: {result.path.name}", look.theme)
+
+
+def _place(document: Document, roots: Mapping[str, Model], title: str, theme: str) -> None:
+    """Put the parts of a page into its frame, with its style and its keys."""
     for name, root in roots.items():
         root.name = name
         document.add_root(root)
-    if look.theme in _THEMES:
-        document.theme = _THEMES[look.theme]
-    _dress(document, f"rgbmidic: {result.path.name}", look.theme, list(roots))
-
-
-def _refuse(document: Document, text: str) -> None:
-    document.add_root(Div(name="head", text=text))
-    _dress(document, "rgbmidic", "", ["head"])
-
-
-def _dress(document: Document, title: str, theme: str, areas: list[str]) -> None:
-    """The frame of the page, its style and its keys."""
+    if theme in _THEMES:
+        document.theme = _THEMES[theme]
     document.title = title
     page, style, script = (
-        files("rgbmidic.view").joinpath(name).read_text(encoding="utf-8") for name in ("page.html", "page.css", "keys.js")
+        files("rgbmidic.view").joinpath(name).read_text(encoding="utf-8")
+        for name in ("page.html", "page.css", "keys.js")
     )
     document.template = get_env().from_string(page)
-    document.template_variables.update(theme=theme, areas=areas, style=style, script=script)
+    document.template_variables.update(
+        theme=theme if theme in ("light", "dark") else "", areas=list(roots), style=style, script=script
+    )
