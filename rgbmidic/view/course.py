@@ -47,6 +47,9 @@ class Course:
     def words(self) -> str:
         """How many frames ended how."""
         known = int((self.status != _NOT_YET).sum())
-        counts = {word: int((self.status == code).sum()) for code, word in ((1, "not converged"), (2, "failed"), (DAMAGED, "damaged"))}
+        counts = {
+            word: int((self.status == code).sum())
+            for code, word in ((1, "not converged"), (2, "failed"), (DAMAGED, "damaged"))
+        }
         told = [f"{known} of {len(self.status)} frames measured"]
         return ", ".join(told + [f"{count} {word}" for word, count in counts.items() if count])

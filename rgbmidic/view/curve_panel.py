@@ -41,7 +41,7 @@ class CurvePanel:
         self.histories: Histories | None = None
         self.colours: Mapping[str, str] = {}
         self._document, self._select, self._told, self._hint, self._chosen = document, select, told, hint, chosen
-        self._reader, self._number = ThreadPoolExecutor(1), 0
+        self._reader, self._number, self._task = ThreadPoolExecutor(1), 0, Future[Histories | None]()
         self.plot, self._lines, self._bands = _plot()
         self.now = Span(dimension="height", line_color="#d1495b", line_width=1.5)
         self.plot.add_layout(self.now)
@@ -51,13 +51,14 @@ class CurvePanel:
     def read(self, result: Result, marks: Sequence[Mark], gauge: float, shown: Callable[[], None]) -> None:
         """Read marks off all frames beside the page, then call `shown`; only the last request counts."""
         self._number += 1
+        self._task.cancel()
         if not marks:
             self._have(self._number, None, shown)
             return
         self._told.text = "reading all frames …"
-        task = self._reader.submit(curves.read, result, tuple(marks), gauge)
-        done = partial(self._have, self._number, task, shown)
-        task.add_done_callback(lambda _: self._document.add_next_tick_callback(done))
+        self._task = self._reader.submit(curves.read, result, tuple(marks), gauge)
+        done = partial(self._have, self._number, self._task, shown)
+        self._task.add_done_callback(lambda _: self._document.add_next_tick_callback(done))
 
     def _have(self, number: int, task: Future[Histories | None] | None, shown: Callable[[], None]) -> None:
         if number != self._number:

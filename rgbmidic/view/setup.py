@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -44,10 +45,13 @@ from rgbmidic.view.setup_frames import RAW, Footage, inspected, pictures
 
 __all__ = ["SetupPage"]
 
+logger = logging.getLogger(__name__)
+
 _SHAPES = (*OUTLINES, *HOLES)
 _MOST_EDGES = 20_000
 """Elements whose edges are drawn: more are a grey surface."""
-_TICK = 500
+_TICK, _SOON = 500, 60
+"""Ms between two looks at the run, and that a mark which moves waits for its next move."""
 _EXPECTED = "expected uncertainty"
 _TOOL = f"if (cb_obj.active === null) return; {TOOL}; other.active = null"
 _HELP = (
@@ -82,7 +86,7 @@ class SetupPage:
         self.mesh: Tri3Mesh | None = None
         self.run: Run | None = None
         self._history: list[tuple[Mark, ...]] = [self._first_marks()]
-        self._reader, self._hole = ThreadPoolExecutor(1), 1
+        self._reader, self._hole, self._moved, self._coming = ThreadPoolExecutor(1), 1, False, False
         self._edges = ColumnDataSource({"xs": [], "ys": []})
         self._rings = ColumnDataSource({"xs": [], "ys": [], "colour": []}, name="rings")
         self._build()
@@ -171,14 +175,18 @@ class SetupPage:
 
     def _ready(self) -> None:
         self.canvas.resize()
-        self._keep(self._history.pop())
+        self._remesh()
 
     def _guarded(self, act: Callable[[], None]) -> None:
         """Do something; what is wrong with it is told in one line."""
         try:
             act()
-        except (RgbmidicError, OSError) as error:
-            self.told.text = f'<b style="color:var(--warn)">{html.escape(str(error))}</b>'
+        except Exception as error:  # the last resort of a page: it goes on, and says what happened
+            known = isinstance(error, RgbmidicError | OSError)
+            if not known:
+                logger.exception("the page failed")
+            text = html.escape(str(error) if known else f"{type(error).__name__}: {error}")
+            self.told.text = f'<b style="color:var(--warn)">{text}</b>'
 
     def show(self) -> None:
         """Draw the picture with what is marked."""
@@ -217,11 +225,15 @@ class SetupPage:
         if now == self.marks:
             return
         new = next((mark.kind for mark in now if mark not in self.marks), "")
-        self._keep(arranged(_numbered(now, self._hole), new))
+        self._keep(arranged(_numbered(now, self._hole), new), moved=len(now) == len(self.marks))
 
-    def _keep(self, marks: tuple[Mark, ...]) -> None:
-        self._history = [*self._history[-99:], marks]
-        self._remesh()
+    def _keep(self, marks: tuple[Mark, ...], *, moved: bool = False) -> None:
+        """Let these be the marks; a mark that is dragged comes many times, and is undone at once."""
+        before = self._history[:-1] if moved and self._moved else self._history
+        self._history, self._moved = [*before[-99:], marks], moved
+        if not self._coming:
+            self._coming = True
+            self.document.add_timeout_callback(self._remesh, _SOON)
 
     def _undo(self) -> None:
         if len(self._history) > 1:
@@ -235,6 +247,7 @@ class SetupPage:
 
     def _remesh(self) -> None:
         """Draw outline, holes and the mesh that they get."""
+        self._coming = False
         self.canvas.place(self.marks)
         outline, holes = rings(self.marks)
         closed = [[*ring, *ring[:1]] for ring in (outline, *holes)]

@@ -276,5 +276,5 @@ def test_random_records_are_shown_too(tmp_path):
         for name in page.fields.all:
             page.show(field=name, over=over, symmetric=True, range="test")
             assert "Frame 2 of 2" in page.parts.words.text, page.parts.words.text
-            image = np.asarray(page.plots.image.data["image"][0])
+            image = np.asarray(page.canvas.plot.renderers[0].data_source.data["image"][0])
             assert len(np.unique(image)) > 1
