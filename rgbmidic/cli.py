@@ -162,10 +162,15 @@ def _conclude(result: Result, started: float, *, draw: bool) -> None:
         raise typer.Exit(command.fail(f"no deformed frame is measured; {first}", command.FAILURE))
 
 
+def _interrupt(*_: object) -> None:
+    """As Ctrl-C does, which a command in the background of a script ignores."""
+    raise KeyboardInterrupt
+
+
 @contextmanager
 def _telling_how_to_go_on(test: Path, out: Path, frames: str) -> Iterator[None]:
     """An interruption, by Ctrl-C or by whoever runs the machine, says how to go on."""
-    before = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         yield
     except KeyboardInterrupt:
@@ -572,7 +577,7 @@ def _tell_first_run() -> None:
     if not are_compiled():
         _messages.print(
             "first run on this machine: kernels are compiled for its processor as they are needed, in all about "
-            "two minutes on two cores; later runs take them from a cache",
+            "a minute on two cores; later runs take them from a cache",
             soft_wrap=True,
         )
 

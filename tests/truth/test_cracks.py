@@ -23,6 +23,8 @@ NOISE = 2.0
 GAP_LEVEL = 60.0
 ERROR_NEAR = 0.02
 """rms error (px) of the nodes within an element of the crack; .013 measured, .011 far from it."""
+LEFT = 0.3
+"""Largest error (px) of a node that is kept beside a crack of which nothing is said, and which opens by 5 px."""
 RATIO = (0.75, 1.25)
 """rms of error over stated uncertainty of these nodes: some 60 values a case, so to 10 %."""
 
@@ -87,8 +89,10 @@ def test_without_the_path_nodes_at_the_crack_are_lost_for_their_reason():
     whole = measured(5.0)
     lost = ~whole.measured
     assert (whole.node_status[lost] == NodeStatus.DECORRELATED).all()
-    assert (lost & near(whole)).sum() >= 5
+    assert (lost & near(whole)).sum() >= 3
     assert not (lost & ~near(whole)).any()
+    error = whole.displacement - truth(whole.nodes, whole.nodes[:, 1] < PATH[0][1], 5.0)
+    assert np.abs(error[~lost]).max() < LEFT
 
 
 def test_filled_nodes_take_their_uncertainty_from_their_own_side():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -112,6 +113,23 @@ def test_bad_frames_are_status_2_and_an_interruption_130(
         status, _, error = command("run", test_file, "--out", test_file.parent / "out")
         assert status == expected
         assert error.splitlines()[-1].startswith("error: ")
+
+
+def test_a_termination_ends_a_run_in_the_background_of_a_script_too(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    def measure(*_: Any, **__: Any) -> Result:
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise AssertionError("still running")
+
+    _replace_pipeline(monkeypatch, measure)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a job behind &
+    try:
+        status, _, error = command("run", test_file, "--out", test_file.parent / "out")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert status == 130
+    assert "--resume" in error
 
 
 def test_run_passes_everything_on_and_tells_what_came_out(

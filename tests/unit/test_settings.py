@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from hypothesis import given
+from hypothesis import settings as examples
 from hypothesis import strategies as st
 
 from rgbmidic.errors import ConfigurationError
@@ -242,6 +243,7 @@ _settings = st.builds(
 )
 
 
+@examples(max_examples=40)
 @given(settings=_settings)
 def test_settings_come_back_from_their_plain_form(settings: TestSettings) -> None:
     document: dict[str, dict[str, Any]] = settings.to_mapping()
