@@ -144,7 +144,7 @@ def element_right_side(
                 n = _span(left, tx, ty, fxx, fyx, column, width)
                 # whole vectors, the rest of the last one without weight, where memory goes on so far
                 filled = (n + _LANES - 1) // _LANES * _LANES
-                if slot + filled > reference.size or column + filled + 3 > width + 2 * PAD:
+                if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
                 i0, r, c = np.uint64(slot), np.uint64(row + PAD - 1), np.uint64(column + PAD - 1)
                 k0, k1 = coefficients[r, c:], coefficients[r + np.uint64(1), c:]
@@ -278,7 +278,7 @@ def bring_back(
                 tx, ty = px - cx, py - cy
                 n = _span(left, tx, ty, fxx, fyx, column, width)
                 filled = (n + _LANES - 1) // _LANES * _LANES  # as in `element_right_side`
-                if slot + filled > out.size or column + filled + 3 > width + 2 * PAD:
+                if slot + filled > out.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
                 i0, r, c = np.uint64(slot), np.uint64(row + PAD - 1), np.uint64(column + PAD - 1)
                 k0, k1 = coefficients[r, c:], coefficients[r + np.uint64(1), c:]
