@@ -1,4 +1,4 @@
-"""What the kernel that paints a field does, pixel by pixel and element by element."""
+"""What the kernel that paints a field does, element by element over all pixels."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ __all__ = ["paint_field"]
 
 
 def paint_field(out, grey, x, y, elements, values, low, high, colours, share, nearest):
-    for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            shown = int(grey[row, column]) * 0x010101 | 0xFF000000
-            for element in elements:
-                corners = np.stack([x[element], y[element], np.ones(3)])
-                own = values[element]
-                if not np.isfinite(corners).all() or not np.isfinite(own).all() or abs(np.linalg.det(corners)) < 1e-12:
-                    continue
-                weights = np.linalg.solve(corners, [column, row, 1.0])
-                if weights.min() < -1e-6:
-                    continue
-                value = own[weights.argmax()] if nearest else weights @ own
-                place = int(np.clip((value - low) / (high - low) * len(colours), 0, len(colours) - 1))
-                shown = int(colours[place]) + (int(grey[row, column]) * share >> 8) * 0x010101
-            out[row, column] = shown
+    out[:] = grey * np.uint32(0x010101) | np.uint32(0xFF000000)
+    rows, columns = np.indices(out.shape)
+    under = (grey.astype(np.uint32) * share >> 8) * 0x010101
+    for element in elements:
+        corners, own = np.stack([x[element], y[element], np.ones(3)]), values[element]
+        if not np.isfinite(corners).all() or not np.isfinite(own).all() or abs(np.linalg.det(corners)) < 1e-12:
+            continue
+        weights = np.einsum("ij,jrc->irc", np.linalg.inv(corners), np.stack([columns, rows, np.ones(out.shape)]))
+        inside = weights.min(axis=0) >= -1e-6
+        value = own[weights.argmax(axis=0)] if nearest else np.einsum("i,irc->rc", own, weights)
+        place = np.clip((value - low) / (high - low) * len(colours), 0, len(colours) - 1).astype(int)
+        out[inside] = (colours[place] + under)[inside]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Any, Self
 from urllib.parse import urlencode
 
 __all__ = ["KINDS", "Look", "Mark"]
@@ -81,12 +81,11 @@ class Look:
         """What an address asks for, as far as it makes sense for a result of `frames` frames with these fields; what
         does not is as if it were not said, and `frame` stands for a frame that is not said."""
         told = {key: values[-1].decode("utf-8", "replace") for key, values in query.items() if values}
-        look = cls(frame=frame)
-        for entry in fields(cls):
-            if (value := _value(entry.name, told.get(entry.name, ""), names)) is not None:
-                look = replace(look, **{entry.name: value})
-        look = replace(look, frame=min(max(look.frame, 0), frames - 1))
-        return look if look.low < look.high else replace(look, low=cls.low, high=cls.high, range="frame")
+        asked = {entry.name: _value(entry.name, told.get(entry.name, ""), names) for entry in fields(cls)}
+        known: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+        look = cls(**{"frame": frame, **known})
+        look, plain = replace(look, frame=min(max(look.frame, 0), frames - 1)), cls()
+        return look if look.low < look.high else replace(look, low=plain.low, high=plain.high, range="frame")
 
     def query(self) -> str:
         """What the address says behind its question mark: all that is not as at the beginning."""

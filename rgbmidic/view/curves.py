@@ -24,7 +24,7 @@ def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings) -> ProbeS
     places: dict[str, list[tuple[float, ...]]] = {}
     for kind, count in KINDS.items():
         own = [(mark.x, mark.y) for mark in marks if mark.kind == kind]
-        whole = [sum(own[i : i + count], ()) for i in range(0, len(own) - count + 1, count)]
+        whole = [tuple(np.ravel(own[i : i + count]).tolist()) for i in range(0, len(own) - count + 1, count)]
         places[f"{kind}s"] = [(*place, gauge) for place in whole] if kind == "strain_gauge" else whole
     made: dict[str, Any] = {key: tuple(value) for key, value in places.items()}
     return ProbeSettings(measure=stated.measure, window=stated.window, **made)

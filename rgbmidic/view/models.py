@@ -65,7 +65,7 @@ state.csv = "";
 """
 
 
-class Asked(DataModel):
+class Asked(DataModel):  # type: ignore[misc]  # see pyproject.toml
     """What browser and server tell each other: the frame asked for, the one shown, the address, a file to keep."""
 
     asked = Int(0)

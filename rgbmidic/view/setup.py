@@ -83,7 +83,6 @@ class SetupPage:
         self.canvas = Canvas(document, _SHAPES, (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
-        self.mesh: Tri3Mesh | None = None
         self.run: Run | None = None
         self._history: list[tuple[Mark, ...]] = [self._first_marks()]
         self._reader, self._hole, self._moved, self._coming = ThreadPoolExecutor(1), 1, False, False
@@ -256,11 +255,8 @@ class SetupPage:
             "ys": [[p[1] for p in ring] for ring in closed],
             "colour": ["#56b4e9", *["#e69f00"] * len(holes)],
         }
-        self.mesh = None
+        self._edges.data = {"xs": [], "ys": []}
         self._guarded(self._make_mesh)
-        drawn = self.mesh is not None and len(self.mesh.elements) <= _MOST_EDGES
-        corners = self.mesh.nodes[self.mesh.elements][:, [0, 1, 2, 0]] if drawn else np.zeros((0, 4, 2))
-        self._edges.data = {"xs": list(corners[..., 0]), "ys": list(corners[..., 1])}
         self.show()
 
     def _make_mesh(self) -> None:
@@ -268,8 +264,11 @@ class SetupPage:
         if content is None or not self.size.value:
             self.told.text = _HELP
             return
-        self.mesh = Tri3Mesh.from_region(self._region(content), float(self.size.value))
-        self.told.text = f"{len(self.mesh.nodes)} nodes, {len(self.mesh.elements)} elements.<br>{_HELP}"
+        mesh = Tri3Mesh.from_region(self._region(content), float(self.size.value))
+        self.told.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
+        if len(mesh.elements) <= _MOST_EDGES:
+            corners = mesh.nodes[mesh.elements][:, [0, 1, 2, 0]]
+            self._edges.data = {"xs": list(corners[..., 0]), "ys": list(corners[..., 1])}
 
     def _region(self, content: dict[str, Any]) -> Region:
         return read_region(read_section(RegionSettings, "region", content), self.footage.shape)

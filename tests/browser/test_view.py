@@ -11,7 +11,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import pytest
 from browser import MISSING, Page, chromium, click, serving
-from results import MESH, NODES, make_origin, make_result, random_record
+from results import NODES, make_origin, make_result, random_record, smooth_record
 
 from rgbmidic import cli
 from rgbmidic.command import execute
@@ -22,15 +22,6 @@ from rgbmidic.view.fields import Fields, robust_range
 
 needs_browser = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 RIGHT, LEFT = "\ue014", "\ue012"
-
-
-def smooth_record(index):
-    """A field that every probe can read, of a stretch that grows with the frames."""
-    x, y = MESH.nodes.T
-    u, v = 0.002 * index * (x - 60), 0.001 * index * (y - 40)
-    both = {"u": u, "v": v, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.02)}
-    more = {"exx": np.full(NODES, 0.002 * index), "misfit": np.ones(NODES), "light_share": np.full((NODES, 3), 1 / 3)}
-    return FrameRecord.of(nodes=NODES, lights=3, number=index, status=0, node_status=np.zeros(NODES), **both, **more)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from results import LIGHTS, NODES, make_origin, make_result, random_record
+from results import LIGHTS, NODES, make_origin, make_result, random_record, smooth_record
 
 from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.results.history_table import write_histories
@@ -160,12 +160,13 @@ def test_marks_make_probes_in_the_order_set_and_a_lone_end_waits():
     assert made.measure == "hencky"
 
 
-def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(result, tmp_path):
+def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(tmp_path):
+    result = make_result(tmp_path / "result", frames=4, record=smooth_record)
     set_ = [Mark("point", 50, 40), Mark("gauge", 30, 30), Mark("gauge", 90, 30), Mark("point", 60, 40)]
     histories = curves.read(result, set_, 60.0)
     groups = {name: [told.name for told in own] for name, own in curves.groups(histories).items()}
-    assert groups["u (mm)"] == ["point_1_u", "point_2_u"]
-    assert groups["extension (mm)"] == ["gauge_1_extension"]
+    assert groups["u (px)"] == ["point_1_u", "point_2_u"]
+    assert groups["extension (px)"] == ["gauge_1_extension"]
     write_histories(histories, tmp_path / "own.csv")
     assert curves.as_csv(histories) == (tmp_path / "own.csv").read_bytes().decode()
     assert curves.read(result, [], 60.0) is None
