@@ -86,7 +86,9 @@ class Canvas:
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
         self._dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
         pan, wheel = PanTool(), WheelZoomTool(zoom_on_axis=False)
-        draw = [PointDrawTool(renderers=[self._dots], empty_value=kind, visible=False) for kind in kinds]
+        draw = [
+            PointDrawTool(renderers=[self._dots], default_overrides={"kind": kind}, visible=False) for kind in kinds
+        ]
         self.tools = (pan, *draw)
         self.plot.add_tools(pan, wheel, BoxZoomTool(match_aspect=True), ResetTool(), SaveTool(filename="field"), *draw)
         self.plot.toolbar.active_drag, self.plot.toolbar.active_scroll, self.plot.toolbar.logo = pan, wheel, None

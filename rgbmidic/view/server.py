@@ -23,6 +23,7 @@ from bokeh.server.tornado import BokehTornado
 from bokeh.server.util import bind_sockets
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
+from tornado.web import ErrorHandler
 
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.results import Result
@@ -92,6 +93,7 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
         include_headers=[],
         include_cookies=[],
     )
+    application.add_handlers(".*", [(".*%00.*", ErrorHandler, {"status_code": 404})])  # no name of a file
     http = HTTPServer(application)
     http.add_sockets(sockets)
     server = BaseServer(IOLoop.current(), application, http)

@@ -6,8 +6,8 @@ import tomllib
 
 import numpy as np
 import pytest
-from browser import MISSING, Page, chromium, click, serving
 from small_tests import grey_frame
+from viewer import MISSING, Page, chromium, click, serving
 
 from rgbmidic.frames.writers import write_tiff
 from rgbmidic.mesh import Tri3Mesh
