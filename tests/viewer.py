@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 import threading
 import time
@@ -14,13 +15,19 @@ from queue import Queue
 __all__ = ["MISSING", "Page", "chromium", "click", "serving"]
 
 _ABSENT = [name for name in ("chromium", "chromedriver") if not shutil.which(name)]
-MISSING = f"{_ABSENT[0]} is not installed (Debian: chromium, chromium-driver)" if _ABSENT else ""
+if "RGBMIDIC_BROWSER" not in os.environ:
+    MISSING = "two minutes in a browser: set RGBMIDIC_BROWSER=1 (needs the extra browser, chromium, chromium-driver)"
+else:
+    MISSING = f"{_ABSENT[0]} is not installed (Debian: chromium, chromium-driver)" if _ABSENT else ""
+"""Why there are no tests in a browser; empty: there are."""
 _FLAGS = (
     "--headless=new --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
     "--disable-component-update --disable-sync --disable-dev-shm-usage --window-size=1280,940"
 )
 _MODEL = "const model = (name) => Bokeh.documents[0].get_model_by_name(name);"
 _PATIENCE = 30.0
+_TWO_CLICKS = 0.4
+"""Seconds that make two clicks of what would be a double click: Bokeh's 300 ms and some."""
 _CLICK = """
 const label = arguments[0];
 const press = (root) => root.querySelectorAll("*").forEach((one) => {
@@ -133,6 +140,7 @@ class Page:
         for what, x, y in steps:
             actions.pointer_action.move_to_location(*self.place(x, y))
             if what == "click":
+                actions.pointer_action.pause(_TWO_CLICKS)
                 actions.pointer_action.click()
             elif what == "press":
                 actions.pointer_action.pointer_down()

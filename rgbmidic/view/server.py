@@ -87,6 +87,8 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
     application = BokehTornado(
         {route: Application(FunctionHandler(page)) for route, page in pages.items()},
         prefix=f"/{token}",
+        sign_sessions=True,
+        secret_key=secrets.token_bytes(32),
         extra_websocket_origins=[f"{_HOST}:{port}"],
         unused_session_lifetime_milliseconds=_FORGOTTEN,
         check_unused_sessions_milliseconds=_FORGOTTEN,
@@ -115,7 +117,7 @@ def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
 
     def setup(document: Document) -> None:
         theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
-        page = SetupPage(document, Draft.of(path), runs.append, dark=theme == "dark")
+        page = SetupPage(document, Draft.of(path), runs, dark=theme == "dark")
         _place(document, page.roots, f"rgbmidic: {path.name}", theme)
 
     def result(document: Document) -> None:
@@ -157,9 +159,10 @@ def _fill(document: Document, result: Result) -> None:
 
 def _place(document: Document, roots: Mapping[str, Model], title: str, theme: str) -> None:
     """Put the parts of a page into its frame, with its style and its keys."""
-    for name, root in roots.items():
-        root.name = name
-        document.add_root(root)
+    with document.models.freeze():  # else all models are counted anew for each
+        for name, root in roots.items():
+            root.name = name
+            document.add_root(root)
     if theme in _THEMES:
         document.theme = _THEMES[theme]
     document.title = title

@@ -70,20 +70,19 @@ class SetupPage:
         Of the visitor.
     draft
         The test as far as it is known.
-    started
-        Is given the run that the page starts, so that its result can be served.
+    runs
+        The runs that pages have started, the last of which is told; this one's come to it, so that they can be served.
     dark
         Whether the page is dark.
     """
 
-    def __init__(self, document: Document, draft: Draft, started: Callable[[Run], None], *, dark: bool) -> None:
-        self.document, self.draft, self.dark, self._started = document, draft, dark, started
+    def __init__(self, document: Document, draft: Draft, runs: list[Run], *, dark: bool) -> None:
+        self.document, self.draft, self.dark, self.runs = document, draft, dark, runs
         self.footage = Footage.of(draft)
         rows, columns = self.footage.shape
         self.canvas = Canvas(document, _SHAPES, (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
-        self.run: Run | None = None
         self._history: list[tuple[Mark, ...]] = [self._first_marks()]
         self._reader, self._hole, self._moved, self._coming = ThreadPoolExecutor(1), 1, False, False
         self._edges = ColumnDataSource({"xs": [], "ys": []})
@@ -122,8 +121,9 @@ class SetupPage:
         calibration = self.draft.section("calibration").get("file", "")
         self.calibration = TextInput(title="Calibration file", name="calibration", value=str(calibration), **wide)
         self.file = TextInput(title="Write to", name="file", value=str(self.draft.file), **wide)
+        out = self.runs[-1].out if self.runs else self.draft.file.parent / "result"
         self.write = Button(label="Write TEST.toml", name="write", **wide)
-        self.out = TextInput(title="Result folder", name="out", value=str(self.draft.file.parent / "result"), **wide)
+        self.out = TextInput(title="Result folder", name="out", value=str(out), **wide)
         self.go = Button(label="Run", name="run", button_type="primary", **wide)
         self.ran = Div(name="ran", **wide)
         self.frame = Slider(
@@ -328,18 +328,17 @@ class SetupPage:
         self.told.text = f"{html.escape(str(self.draft.file))} is written."
 
     def _run(self) -> None:
-        if self.run is not None and self.run.going:
+        if self.runs and self.runs[-1].going:
             self.told.text = "The run still goes on."
             return
         self._write()
-        self.run = Run.start(self.draft.file, Path(self.out.value))
-        self._started(self.run)
+        self.runs.append(Run.start(self.draft.file, Path(self.out.value)))
 
     def _tick(self) -> None:
-        if self.run is not None:
-            link = '<br><a id="result" href="result">look at the result as it grows</a>' if self.run.begun else ""
-            words = html.escape(self.run.words())
-            self.ran.text = words + link
+        if self.runs:
+            run = self.runs[-1]
+            link = '<br><a id="result" href="result">look at the result as it grows</a>' if run.begun else ""
+            self.ran.text = html.escape(run.words()) + link
 
 
 def _numbered(marks: Sequence[Mark], hole: int) -> tuple[Mark, ...]:
