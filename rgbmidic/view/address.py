@@ -8,12 +8,13 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 from urllib.parse import urlencode
 
-__all__ = ["KINDS", "Look", "Mark"]
+__all__ = ["KINDS", "OVER", "Look", "Mark"]
 
 KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1}
 """Probes that can be set with the pointer, and how many places each takes."""
+OVER = ("reference", "deformed")
 _MOST_MARKS = 200
-_CHOICES = {"over": ("reference", "deformed"), "range": ("frame", "test", "hand"), "theme": ("light", "dark")}
+_CHOICES = {"over": OVER, "range": ("frame", "test", "hand"), "theme": ("light", "dark")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +52,8 @@ class Look:
         Ends of the colours by hand.
     symmetric
         Whether the colours of a signed field are as far below 0 as above.
+    directions
+        Whether principal directions are drawn.
     opacity
         Of the field, from 0 to 1.
     curve
@@ -70,6 +73,7 @@ class Look:
     low: float = -1.0
     high: float = 1.0
     symmetric: bool = False
+    directions: bool = False
     opacity: float = 0.85
     curve: str = ""
     theme: str = ""
@@ -88,10 +92,10 @@ class Look:
         return look if look.low < look.high else replace(look, low=plain.low, high=plain.high, range="frame")
 
     def query(self) -> str:
-        """What the address says behind its question mark: all that is not as at the beginning."""
+        """What the address says beside the frame: all that is not as at the beginning."""
         plain = type(self)()
-        kept = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        told = {name: _text(value) for name, value in kept.items() if value != getattr(plain, name) or name == "frame"}
+        kept = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "frame"}
+        told = {name: _text(value) for name, value in kept.items() if value != getattr(plain, name)}
         return urlencode(told, safe=":,;")
 
 
@@ -111,7 +115,7 @@ def _value(name: str, text: str, names: Sequence[str]) -> object:
         if name in ("low", "high", "opacity"):
             number = _number(text)
             return min(max(number, 0.0), 1.0) if name == "opacity" else number
-        if name == "symmetric":
+        if name in ("symmetric", "directions"):
             return bool(int(text))
         if name == "window":
             left, top, right, bottom = map(_number, text.split(","))

@@ -16,6 +16,7 @@ from bokeh.plotting import figure
 from rgbmidic.results import Histories, Result
 from rgbmidic.view import curves
 from rgbmidic.view.address import Mark
+from rgbmidic.view.timeline import NOW
 
 __all__ = ["CurvePanel"]
 
@@ -43,7 +44,7 @@ class CurvePanel:
         self._document, self._select, self._told, self._hint, self._chosen = document, select, told, hint, chosen
         self._reader, self._number, self._task = ThreadPoolExecutor(1), 0, Future[Histories | None]()
         self.plot, self._lines, self._bands = _plot()
-        self.now = Span(dimension="height", line_color="#d1495b", line_width=1.5)
+        self.now = Span(**NOW)
         self.plot.add_layout(self.now)
         select.on_change("value", lambda attr, old, new: self.draw())
         document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
@@ -98,11 +99,9 @@ class CurvePanel:
 
     def point(self, frame: int) -> None:
         """Point at a frame."""
-        self.now.location = None
-        if self.histories is not None:
-            at = int(np.searchsorted(self.histories.frames, frame))
-            x = curves.over(self.histories)[0]
-            self.now.location = float(x[at]) if at < len(x) else None
+        x = curves.over(self.histories)[0] if self.histories is not None else ()
+        at = 0 if self.histories is None else int(np.searchsorted(self.histories.frames, frame))
+        self.now.location = float(x[at]) if at < len(x) else None
 
     def frame(self, x: float) -> int:
         """The frame at a place of the axis."""

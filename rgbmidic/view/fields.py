@@ -61,6 +61,12 @@ class Field:
         """Whether values between those of two nodes mean nothing."""
         return self.kind in ("angle", "codes")
 
+    @property
+    def ends(self) -> tuple[float, float] | None:
+        """Values of the first and last colour, where the kind of field says them."""
+        fixed = {"codes": (-0.5, len(self.codes) - 0.5), "share": (0.0, 1.0), "angle": (-90.0, 90.0)}
+        return fixed.get(self.kind)
+
     def text(self, value: float, std: float = float("nan")) -> str:
         """A value with its standard uncertainty in words."""
         if not np.isfinite(value):

@@ -11,21 +11,19 @@ from bokeh.model import DataModel
 from bokeh.models import (
     Button,
     Checkbox,
-    ColumnDataSource,
     CustomJS,
     Div,
     InlineStyleSheet,
     NumericInput,
     RadioButtonGroup,
-    Range1d,
     Select,
     Slider,
+    Span,
     Spinner,
     Toggle,
 )
-from bokeh.plotting import figure
 
-__all__ = ["DOWNLOAD", "PUMP_EVERY", "TOOL", "Asked", "Controls", "controls", "course_plot", "sheet", "wire"]
+__all__ = ["DOWNLOAD", "PUMP_EVERY", "TOOL", "Asked", "Controls", "controls", "sheet", "wire"]
 
 _DARK = """
 :host { color: #e6e9ec; }
@@ -53,7 +51,10 @@ setTimeout(() => {
 """
 TOOL = "tools[cb_obj.active].active = true"
 PUMP_EVERY = PUMP % _SHORT
-ADDRESS = "history.replaceState(null, '', '?' + state.query)"
+SHOWN = """
+now.setv({location: state.shown}, {sync: false});
+history.replaceState(null, "", "?frame=" + state.shown + (state.query && "&" + state.query));
+"""
 DOWNLOAD = """
 if (!state.csv) return;
 const link = document.createElement("a");
@@ -66,7 +67,7 @@ state.csv = "";
 
 
 class Asked(DataModel):  # type: ignore[misc]  # see pyproject.toml
-    """What browser and server tell each other: the frame asked for, the one shown, the address, a file to keep."""
+    """What browser and server tell each other: frame asked for, frame shown, rest of the address, a file to keep."""
 
     asked = Int(0)
     shown = Int(0)
@@ -86,6 +87,7 @@ class Controls:
     low: NumericInput
     high: NumericInput
     symmetric: Checkbox
+    directions: Checkbox
     words: Div
     under: Div
     mode: RadioButtonGroup
@@ -97,25 +99,6 @@ class Controls:
     frame: Slider
     play: Toggle
     step: Spinner
-
-
-def course_plot(frames: int) -> tuple[Any, ColumnDataSource, ColumnDataSource]:
-    """The time line: how many nodes each frame measures, and the frames that failed."""
-    plot = figure(
-        sizing_mode="stretch_both",
-        x_range=Range1d(-0.5, max(frames - 0.5, 0.5)),
-        y_range=Range1d(0, 105),
-        x_axis_label=None,
-        y_axis_label="nodes (%)",
-        tools=[],
-        toolbar_location=None,
-        min_border=2,
-    )
-    plot.yaxis.ticker = [0, 50, 100]
-    shares, faults = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": [], "colour": []})
-    plot.varea("x", 0, "y", source=shares, fill_color="#6baed6", fill_alpha=0.6)
-    plot.segment("x", 0, "x", "y", source=faults, line_color="colour", line_width=2)
-    return plot, shares, faults
 
 
 def sheet(*, dark: bool) -> InlineStyleSheet:
@@ -143,6 +126,7 @@ def controls(frames: int, *, dark: bool) -> Controls:
         low=NumericInput(title="lowest", name="low", mode="float", **half),
         high=NumericInput(title="highest", name="high", mode="float", **half),
         symmetric=Checkbox(label="symmetric about 0", name="symmetric", stylesheets=sheets),
+        directions=Checkbox(label="principal directions", name="directions", stylesheets=sheets),
         words=Div(name="words", **wide),
         under=Div(name="under", **wide),
         mode=RadioButtonGroup(labels=["Move", "Point", "Gauge", "Line", "Strain"], active=0, name="mode", **wide),
@@ -157,14 +141,16 @@ def controls(frames: int, *, dark: bool) -> Controls:
     )
 
 
-def wire(state: Asked, parts: Controls, tools: Sequence[Any]) -> None:
-    """What happens in the browser itself."""
+def wire(state: Asked, parts: Controls, tools: Sequence[Any], now: Span) -> None:
+    """What happens in the browser itself; `now` marks the frame that is shown."""
     models = {"state": state, "slider": parts.frame, "play": parts.play, "step": parts.step}
     pump = CustomJS(args=models, code=PUMP_EVERY)
     parts.frame.js_on_change("value", pump)
     parts.play.js_on_change("active", pump)
     state.js_on_change("shown", pump)
-    state.js_on_change("query", CustomJS(args={"state": state}, code=ADDRESS))
+    shown = CustomJS(args={"state": state, "now": now}, code=SHOWN)
+    state.js_on_change("shown", shown)
+    state.js_on_change("query", shown)
     state.js_on_change("csv", CustomJS(args={"state": state}, code=DOWNLOAD))
     parts.mode.js_on_change("active", CustomJS(args={"tools": list(tools)}, code=TOOL))
     turn = "const u = new URL(location.href); u.searchParams.set('theme', '%s'); location.replace(u.href)"

@@ -14,11 +14,13 @@ from rgbmidic._kernels.picture import paint_field
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.typing import AnyArray, FloatArray
 
-__all__ = ["Window", "element_at", "grey_picture", "paint", "palette", "palette_name"]
+__all__ = ["AROUND", "Window", "element_at", "grey_picture", "paint", "palette", "palette_name"]
 
 _LARGEST = 2_000_000
 """Pixels of a picture that is sent to the screen: all of a window of 1920 x 1080, less than all of a larger one."""
 _COLOURS = 256
+AROUND = {False: 235, True: 30}
+"""Grey level outside the image, by whether the page is dark."""
 _PALETTES = {"displacement": "viridis", "strain": "viridis", "positive": "plasma", "share": "cividis"}
 _STATUS = ("#2c7fb8", "#bdbdbd", "#d95f0e", "#fec44f")
 """Measured, not seen, decorrelated, filled: told apart without telling red from green."""

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from bokeh.application import Application
@@ -32,6 +33,7 @@ from rgbmidic.view.address import Look
 from rgbmidic.view.fields import Fields
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.runner import Run
+from rgbmidic.view.timeline import Course
 
 __all__ = ["serve", "start"]
 
@@ -39,6 +41,13 @@ _HOST = "127.0.0.1"
 _FORGOTTEN = 15_000
 """Ms after which what a closed page held is let go."""
 _THEMES = {"dark": "dark_minimal"}
+
+
+class _Application(BokehTornado):  # type: ignore[misc]  # see pyproject.toml
+    """Bokeh's server, whose pages load no more scripts than they need: a third of them."""
+
+    def resources(self, absolute_url: str | bool | None = None) -> Any:
+        return super().resources(absolute_url).clone(components=["bokeh", "bokeh-widgets"])
 
 
 def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[str], None] = print) -> None:
@@ -84,7 +93,7 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
         raise InputError(
             f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another --port, or none"
         ) from None
-    application = BokehTornado(
+    application = _Application(
         {route: Application(FunctionHandler(page)) for route, page in pages.items()},
         prefix=f"/{token}",
         sign_sessions=True,
@@ -105,9 +114,10 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
 
 def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
     """What is served: a result, or a test that is set up and the result of its run; bad input is told at once."""
+    courses: dict[tuple[Path, int], Course] = {}
     if (path / PROVENANCE).exists():
         Result.open(path, partial=True)
-        return {"/": partial(_open, path)}
+        return {"/": partial(_told, partial(_fill, path, courses))}
     from rgbmidic.view.draft import Draft
     from rgbmidic.view.setup import SetupPage
     from rgbmidic.view.setup_frames import Footage
@@ -123,14 +133,9 @@ def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
     def result(document: Document) -> None:
         if not runs:
             raise ResultError("no run was started yet")
-        _fill(document, Result.open(runs[-1].out, partial=True))
+        _fill(runs[-1].out, courses, document)
 
     return {"/": partial(_told, setup), "/result": partial(_told, result)}
-
-
-def _open(path: Path, document: Document) -> None:
-    """The page of a result as it is now."""
-    _told(lambda own: _fill(own, Result.open(path, partial=True)), document)
 
 
 def _told(fill: Callable[[Document], None], document: Document) -> None:
@@ -147,13 +152,15 @@ def _query(document: Document) -> dict[str, list[bytes]]:
     return {} if context is None or context.request is None else context.request.arguments
 
 
-def _fill(document: Document, result: Result) -> None:
-    """The page of a result, looked at as the address says."""
+def _fill(path: Path, courses: dict[tuple[Path, int], Course], document: Document) -> None:
+    """The page of a result as it is now, looked at as the address says."""
+    result = Result.open(path, partial=True)
     there = np.flatnonzero(result.finished)
     last = int(there[-1]) if len(there) else 0
     names = list(Fields.of(result).all)
     look = Look.from_query(_query(document), frames=len(result), names=names, frame=last)
-    page = ResultPage(document, result, look)
+    course = courses.setdefault((path, len(result)), Course(len(result)))
+    page = ResultPage(document, result, look, course)
     _place(document, page.roots, f"rgbmidic: {result.path.name}", look.theme)
 
 

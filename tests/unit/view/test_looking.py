@@ -15,9 +15,9 @@ from rgbmidic.results.history_table import write_histories
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.view import curves
 from rgbmidic.view.address import KINDS, Look, Mark
-from rgbmidic.view.course import Course
 from rgbmidic.view.fields import Fields, Values, robust_range
 from rgbmidic.view.picture import Window, element_at, paint, palette, palette_name
+from rgbmidic.view.timeline import Course
 
 NAMES = ("u", "v", "e1")
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
@@ -28,6 +28,7 @@ looks = st.builds(
     field=st.sampled_from(NAMES),
     over=st.sampled_from(["reference", "deformed"]),
     symmetric=st.booleans(),
+    directions=st.booleans(),
     curve=st.text("abc ()/²", max_size=9),
     theme=st.sampled_from(["", "light", "dark"]),
     marks=marks,
@@ -41,7 +42,7 @@ def opened(query: str) -> Look:
 
 @given(looks)
 def test_an_address_opens_what_it_was_made_of(look):
-    assert opened(look.query()) == look
+    assert opened(f"frame={look.frame}&{look.query()}") == look
 
 
 @given(
@@ -187,8 +188,9 @@ def test_the_time_line_tells_failed_frames_and_lost_nodes(tmp_path):
     for index, record in enumerate(records):
         store.write_frame(index, record)
     result, course = Result.open(tmp_path / "result", partial=True), Course(4)
-    assert course.advance(result)
-    assert not course.advance(result)
+    for _ in range(2):
+        course.advance(result)
+        assert course.known == 3
     assert course.status.tolist() == [0, 2, 1, -1]
     np.testing.assert_allclose(course.share[:3], [(r.node_status == 0).mean() for r in records])
     assert course.words() == "3 of 4 frames measured, 1 not converged, 1 failed"
