@@ -23,7 +23,7 @@ from bokeh.models import (
     Toggle,
 )
 
-__all__ = ["DOWNLOAD", "PUMP_EVERY", "TOOL", "Asked", "Controls", "controls", "sheet", "wire"]
+__all__ = ["DOWNLOAD", "TOOL", "Asked", "Controls", "controls", "pump", "sheet", "theme_button", "wire"]
 
 _DARK = """
 :host { color: #e6e9ec; }
@@ -50,7 +50,6 @@ setTimeout(() => {
 }, wait);
 """
 TOOL = "tools[cb_obj.active].active = true"
-PUMP_EVERY = PUMP % _SHORT
 SHOWN = """
 now.setv({location: state.shown}, {sync: false});
 history.replaceState(null, "", "?frame=" + state.shown + (state.query && "&" + state.query));
@@ -106,6 +105,23 @@ def sheet(*, dark: bool) -> InlineStyleSheet:
     return InlineStyleSheet(css=_DARK if dark else _LIGHT)
 
 
+def theme_button(*, dark: bool, **style: Any) -> Button:
+    """A button that opens the page anew, light or dark."""
+    other = "light" if dark else "dark"
+    turn = f"const u = new URL(location.href); u.searchParams.set('theme', '{other}'); location.replace(u.href)"
+    button = Button(label=f"{other.capitalize()} page", **style)
+    button.js_on_click(CustomJS(code=turn))
+    return button
+
+
+def pump(state: Asked, slider: Slider, play: Toggle, step: Spinner) -> None:
+    """Let the slider ask for frames, and play them."""
+    asks = CustomJS(args={"state": state, "slider": slider, "play": play, "step": step}, code=PUMP % _SHORT)
+    slider.js_on_change("value", asks)
+    play.js_on_change("active", asks)
+    state.js_on_change("shown", asks)
+
+
 def controls(frames: int, *, dark: bool) -> Controls:
     """The controls, with nothing chosen yet."""
     sheets = [sheet(dark=dark)]
@@ -134,7 +150,7 @@ def controls(frames: int, *, dark: bool) -> Controls:
         clear=Button(label="Remove all", **half),
         csv=Button(label="Save CSV", name="save_csv", **half),
         told=Div(name="told", **wide),
-        theme=Button(label="Light page" if dark else "Dark page", **wide),
+        theme=theme_button(dark=dark, **wide),
         frame=Slider(title="Frame", name="frame", start=0, end=last, step=1, value=0, disabled=frames < 2, **wide),
         play=Toggle(label="▶ Play", name="play", width=90, stylesheets=sheets),
         step=Spinner(name="step", low=1, high=last, value=1, width=70, stylesheets=sheets),
@@ -143,15 +159,9 @@ def controls(frames: int, *, dark: bool) -> Controls:
 
 def wire(state: Asked, parts: Controls, tools: Sequence[Any], now: Span) -> None:
     """What happens in the browser itself; `now` marks the frame that is shown."""
-    models = {"state": state, "slider": parts.frame, "play": parts.play, "step": parts.step}
-    pump = CustomJS(args=models, code=PUMP_EVERY)
-    parts.frame.js_on_change("value", pump)
-    parts.play.js_on_change("active", pump)
-    state.js_on_change("shown", pump)
+    pump(state, parts.frame, parts.play, parts.step)
     shown = CustomJS(args={"state": state, "now": now}, code=SHOWN)
     state.js_on_change("shown", shown)
     state.js_on_change("query", shown)
     state.js_on_change("csv", CustomJS(args={"state": state}, code=DOWNLOAD))
     parts.mode.js_on_change("active", CustomJS(args={"tools": list(tools)}, code=TOOL))
-    turn = "const u = new URL(location.href); u.searchParams.set('theme', '%s'); location.replace(u.href)"
-    parts.theme.js_on_click(CustomJS(code=turn % ("light" if parts.theme.label.startswith("Light") else "dark")))

@@ -16,7 +16,7 @@ from rgbmidic.typing import FloatImage
 from rgbmidic.view.draft import Draft
 from rgbmidic.view.picture import grey_picture
 
-__all__ = ["RAW", "Footage", "inspected", "pictures"]
+__all__ = ["RAW", "Footage", "inspected", "pictures", "side_by_side"]
 
 RAW = "raw frame"
 
@@ -81,6 +81,15 @@ def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, npt.ND
         for name, index in zip(images.names, inspection.reflection_index, strict=True):
             found[f"reflection index: {name}"] = np.asarray(255 * np.clip(np.nan_to_num(index), 0, 1), dtype=np.uint8)
     return {name: _placed(picture, inspection.origin, shape) for name, picture in found.items()}
+
+
+def side_by_side(
+    inspection: Inspection, named: dict[str, npt.NDArray[np.uint8]], raw: npt.NDArray[np.uint8]
+) -> list[dict[str, npt.NDArray[np.uint8]]]:
+    """Rows of pictures: the raw frame, the separated lights, their reflection index."""
+    lights = len(inspection.images.names)
+    pairs = list(named.items())
+    return [{RAW: raw}, *(dict(pairs[start : start + lights]) for start in range(0, len(pairs), lights))]
 
 
 def _stretched(values: FloatImage) -> npt.NDArray[np.uint8]:
