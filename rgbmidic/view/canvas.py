@@ -28,11 +28,19 @@ from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.address import Mark
 from rgbmidic.view.picture import Window
 
-__all__ = ["Canvas"]
+__all__ = ["Canvas", "small"]
 
 _MARGIN = 0.06
+_BAR = 80
+"""Px of the screen for the colour bar, whose numbers change with the frame."""
 _SOON = 40
 """Ms that a view which moves waits for its next move."""
+
+
+def small(plot: Any) -> None:
+    """Let the letters at the axes of a plot be those of the page, light or dark."""
+    for axis in plot.axis:
+        axis.update(major_label_text_font_size="12px", axis_label_text_font_size="12px")
 
 
 class Canvas:
@@ -71,6 +79,7 @@ class Canvas:
             title=" ",
             sizing_mode="stretch_both",
             min_border=4,
+            min_border_right=_BAR,
             x_axis_label="x (px)",
             y_axis_label="y (px)",
             tools=[],
@@ -80,7 +89,8 @@ class Canvas:
         self._image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")}, name="image")
         self.plot.image_rgba("image", "x", "y", "dw", "dh", source=self._image)
         self.colours = LinearColorMapper(palette=["#000000"], low=0, high=1, name="colours")
-        self.bar = ColorBar(color_mapper=self.colours, width=14)
+        self.bar = ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
+        small(self.plot)
         self.plot.add_layout(self.bar, "right")
         self.marks = ColumnDataSource({"x": [], "y": [], "kind": []}, name="marks")
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}

@@ -10,17 +10,29 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import ColumnDataSource, Div, Select, Span
+from bokeh.models import (
+    BoxZoomTool,
+    ColumnDataSource,
+    Div,
+    HoverTool,
+    PanTool,
+    ResetTool,
+    Select,
+    Span,
+    WheelZoomTool,
+)
 from bokeh.plotting import figure
 
 from rgbmidic.results import Histories, Result
 from rgbmidic.view import curves
 from rgbmidic.view.address import Mark
+from rgbmidic.view.canvas import small
 from rgbmidic.view.timeline import NOW
 
 __all__ = ["CurvePanel"]
 
 _PLAIN = "#888888"
+_NONE = "Curves of what is marked on the field"
 
 
 class CurvePanel:
@@ -121,19 +133,22 @@ def _probe(name: str) -> str:
 
 
 def _plot() -> tuple[Any, ColumnDataSource, ColumnDataSource]:
+    wheel, hover = WheelZoomTool(visible=False), HoverTool(visible=False)
     plot = figure(
         sizing_mode="stretch_both",
         min_border=4,
-        tools="pan,wheel_zoom,box_zoom,reset,save,hover",
+        tools=[PanTool(), wheel, BoxZoomTool(), ResetTool(), hover],
+        title=_NONE,
         toolbar_location="above",
     )
-    plot.toolbar.logo = None
+    plot.toolbar.logo, plot.toolbar.active_scroll = None, wheel
+    small(plot)
     lines = ColumnDataSource(_columns([], "xs ys colour name"), name="lines")
     bands = ColumnDataSource(_columns([], "xs ys colour"), name="bands")
     plot.patches("xs", "ys", source=bands, fill_color="colour", fill_alpha=0.25, line_alpha=0)
     drawn = plot.multi_line("xs", "ys", source=lines, line_color="colour", line_width=1.5, legend_field="name")
     plot.x_range.renderers = plot.y_range.renderers = [drawn]  # the values rule, not the widest band
-    plot.hover.renderers, plot.hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
+    hover.renderers, hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
     plot.legend.visible, plot.legend.label_text_font_size, plot.legend.ncols = False, "11px", 2
     plot.add_layout(plot.legend[0], "below")
     return plot, lines, bands

@@ -23,7 +23,7 @@ from bokeh.models import (
     Toggle,
 )
 
-__all__ = ["DOWNLOAD", "TOOL", "Asked", "Controls", "controls", "pump", "sheet", "theme_button", "wire"]
+__all__ = ["TOOL", "Asked", "Controls", "controls", "pump", "sheet", "theme_button", "wire"]
 
 _DARK = """
 :host { color: #e6e9ec; }
@@ -54,14 +54,22 @@ SHOWN = """
 now.setv({location: state.shown}, {sync: false});
 history.replaceState(null, "", "?frame=" + state.shown + (state.query && "&" + state.query));
 """
-DOWNLOAD = """
+_KEEP = """
+const keep = (blob, name) => {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  URL.revokeObjectURL(link.href);
+};
+"""
+KEEP_CSV = f"""{_KEEP}
 if (!state.csv) return;
-const link = document.createElement("a");
-link.href = URL.createObjectURL(new Blob([state.csv], {type: "text/csv"}));
-link.download = "history.csv";
-link.click();
-URL.revokeObjectURL(link.href);
+keep(new Blob([state.csv], {{type: "text/csv"}}), "history.csv");
 state.csv = "";
+"""
+KEEP_PNG = f"""{_KEEP}
+Bokeh.index.get_one(plot).export("png").to_blob().then((blob) => keep(blob, "history.png"));
 """
 
 
@@ -93,6 +101,7 @@ class Controls:
     curve: Select
     clear: Button
     csv: Button
+    png: Button
     told: Div
     theme: Button
     frame: Slider
@@ -127,6 +136,7 @@ def controls(frames: int, *, dark: bool) -> Controls:
     sheets = [sheet(dark=dark)]
     wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
     half: dict[str, Any] = {"stylesheets": sheets, "width": 112}
+    third: dict[str, Any] = {"stylesheets": sheets, "width": 74}
     last = max(frames - 1, 1)
     return Controls(
         head=Div(**wide),
@@ -147,8 +157,9 @@ def controls(frames: int, *, dark: bool) -> Controls:
         under=Div(name="under", **wide),
         mode=RadioButtonGroup(labels=["Move", "Point", "Gauge", "Line", "Strain"], active=0, name="mode", **wide),
         curve=Select(title="Curve", name="curve", **wide),
-        clear=Button(label="Remove all", **half),
-        csv=Button(label="Save CSV", name="save_csv", **half),
+        clear=Button(label="Clear", **third),
+        csv=Button(label="Save CSV", **third),
+        png=Button(label="Save PNG", **third),
         told=Div(name="told", **wide),
         theme=theme_button(dark=dark, **wide),
         frame=Slider(title="Frame", name="frame", start=0, end=last, step=1, value=0, disabled=frames < 2, **wide),
@@ -157,11 +168,12 @@ def controls(frames: int, *, dark: bool) -> Controls:
     )
 
 
-def wire(state: Asked, parts: Controls, tools: Sequence[Any], now: Span) -> None:
-    """What happens in the browser itself; `now` marks the frame that is shown."""
+def wire(state: Asked, parts: Controls, tools: Sequence[Any], now: Span, curves: Any) -> None:
+    """What happens in the browser itself; `now` marks the frame that is shown, `curves` is a plot."""
     pump(state, parts.frame, parts.play, parts.step)
     shown = CustomJS(args={"state": state, "now": now}, code=SHOWN)
     state.js_on_change("shown", shown)
     state.js_on_change("query", shown)
-    state.js_on_change("csv", CustomJS(args={"state": state}, code=DOWNLOAD))
+    state.js_on_change("csv", CustomJS(args={"state": state}, code=KEEP_CSV))
+    parts.png.js_on_click(CustomJS(args={"plot": curves}, code=KEEP_PNG))
     parts.mode.js_on_change("active", CustomJS(args={"tools": list(tools)}, code=TOOL))

@@ -67,7 +67,7 @@ class ResultPage:
         self.timeline = TimeLine(len(result), look.frame)
         self.curves = CurvePanel(document, chosen=look.curve, select=p.curve, told=p.told, hint=_HELP)
         self._begin()
-        wire(self.asked, self.parts, self.canvas.tools, self.timeline.now)
+        wire(self.asked, self.parts, self.canvas.tools, self.timeline.now, self.curves.plot)
         self._listen()
 
     @property
@@ -76,7 +76,7 @@ class ResultPage:
         p = self.parts
         side = column(
             p.words, p.field, p.over, p.opacity, p.range, row(p.low, p.high), p.symmetric, p.directions,
-            p.mode, p.curve, row(p.clear, p.csv), p.told, p.theme, sizing_mode="stretch_width",
+            p.mode, p.curve, row(p.clear, p.csv, p.png), p.told, p.theme, sizing_mode="stretch_width",
         )  # fmt: skip
         player = row(p.play, p.step, p.frame, sizing_mode="stretch_width")
         drawn = {"plot": self.canvas.plot, "course": self.timeline.plot, "curves": self.curves.plot}
@@ -251,7 +251,9 @@ class ResultPage:
             self.parts.head.text = self._title()
 
     def _title(self) -> str:
-        return f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {self.course.words()}"
+        return (
+            f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {self.course.words(int(self.result.finished.sum()))}"
+        )
 
     def _grow(self) -> None:
         """Take in what a run has added; who looks at the last frame goes on with it."""

@@ -87,7 +87,7 @@ class SetupPage:
         """The parts of the page by the names that its template gives their places."""
         p = self.parts
         beside = column(p.told, p.file, p.write, p.out, p.go, p.ran, self.tiles.plot, sizing_mode="stretch_width")
-        return {"side": p.side, "plot": self.canvas.plot, "curves": beside, "player": p.player}
+        return {"head": p.head, "side": p.side, "plot": self.canvas.plot, "curves": beside, "player": p.player}
 
     def _listen(self) -> None:
         p, tools = self.parts, list(self.canvas.tools)
@@ -203,12 +203,14 @@ class SetupPage:
         return self.draft.changed(changes)
 
     def _reopen(self) -> None:
-        self.draft = self._changed()
-        self.footage = Footage.of(self.draft)
+        """Take what the page says, once it can be read."""
+        draft = self._changed()
+        self.draft, self.footage = draft, Footage.of(draft)
         self.show()
 
     def _write(self) -> None:
-        self.draft = self._changed().at(Path(self.parts.file.value))
+        self._reopen()
+        self.draft = self.draft.at(Path(self.parts.file.value))
         self.draft.write()
         self.parts.told.text = f"{html.escape(str(self.draft.file))} is written."
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ __all__ = ["SetupControls", "setup_controls"]
 class SetupControls:
     """What is set beside the frame, and the words."""
 
+    head: Div
     words: Div
     picture: Select
     glare: Checkbox
@@ -69,6 +71,7 @@ def setup_controls(draft: Draft, last: int, out: Path, *, dark: bool) -> SetupCo
     size = draft.section("mesh").get("element_size", ELEMENT_SIZE)
     calibration = str(draft.section("calibration").get("file", ""))
     return SetupControls(
+        head=Div(text=f"<b>{html.escape(str(draft.file))}</b> &nbsp; a test to set up", **wide),
         words=Div(name="words", **wide),
         picture=Select(title="Picture", name="picture", options=[RAW], value=RAW, **wide),
         glare=Checkbox(label="mark saturated samples", active=True, stylesheets=sheets),

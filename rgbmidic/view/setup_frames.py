@@ -86,10 +86,10 @@ def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, npt.ND
 def side_by_side(
     inspection: Inspection, named: dict[str, npt.NDArray[np.uint8]], raw: npt.NDArray[np.uint8]
 ) -> list[dict[str, npt.NDArray[np.uint8]]]:
-    """Rows of pictures: the raw frame, the separated lights, their reflection index."""
+    """Rows of pictures: the raw frame and the separated lights, their reflection index."""
     lights = len(inspection.images.names)
-    pairs = list(named.items())
-    return [{RAW: raw}, *(dict(pairs[start : start + lights]) for start in range(0, len(pairs), lights))]
+    pairs = [(RAW, raw), *((name.replace("reflection index", "index"), picture) for name, picture in named.items())]
+    return [dict(row) for row in (pairs[: lights + 1], pairs[lights + 1 :]) if row]
 
 
 def _stretched(values: FloatImage) -> npt.NDArray[np.uint8]:

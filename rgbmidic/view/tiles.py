@@ -24,25 +24,34 @@ class Tiles:
     def __init__(self) -> None:
         self._shown = ColumnDataSource({name: [] for name in _COLUMNS}, name="tiles")
         self.plot = figure(
-            sizing_mode="stretch_width",
+            sizing_mode="scale_width",
             x_range=Range1d(0, 1),
             y_range=Range1d(1, 0),
             tools=[],
             toolbar_location=None,
             min_border=0,
             visible=False,
+            background_fill_color=None,
+            border_fill_color=None,
+            outline_line_color=None,
         )
         self.plot.axis.visible = self.plot.grid.visible = False
         greys = [f"#{level:02x}{level:02x}{level:02x}" for level in range(256)]
         self._drawn = self.plot.image("image", "x", "y", "dw", 1, source=self._shown, palette=greys)
         self._drawn.glyph.color_mapper.update(low=0, high=255)
-        self.plot.text("x", "y", "name", source=self._shown, text_font_size="11px", text_baseline="bottom", y_offset=-1)
+        letters = {"text_font_size": "11px", "text_color": "#808890", "text_baseline": "bottom", "y_offset": -1}
+        self.plot.text("x", "y", "name", source=self._shown, **letters)
 
     def show(self, rows: Sequence[Mapping[str, npt.NDArray[np.uint8]]]) -> None:
-        """Show rows of pictures (H, W) of one size by their names."""
+        """Show rows of pictures (H, W) of one size by their names, the ends of the rows one below the other."""
         height, width = next(iter(rows[0].values())).shape
         tall = height / width
-        places = [(name, picture, x, y) for y, row in enumerate(rows) for x, (name, picture) in enumerate(row.items())]
+        across = max(map(len, rows))
+        places = [
+            (name, picture, x, y)
+            for y, row in enumerate(rows)
+            for x, (name, picture) in enumerate(row.items(), start=across - len(row))
+        ]
         size = (_WIDE, max(1, round(_WIDE * tall)))
         self._drawn.glyph.dh = tall
         self._shown.data = {
@@ -52,6 +61,6 @@ class Tiles:
             "dw": [1.0] * len(places),
             "name": [name for name, *_ in places],
         }
-        across, down = max(map(len, rows)), len(rows) * (tall + _GAP)
+        down = len(rows) * (tall + _GAP)
         self.plot.x_range.end, self.plot.y_range.start = across * (1 + _GAP / 2), down
         self.plot.update(visible=True, aspect_ratio=across * (1 + _GAP / 2) / down)

@@ -10,6 +10,7 @@ from bokeh.plotting import figure
 from rgbmidic.errors import ResultError
 from rgbmidic.results import Result
 from rgbmidic.typing import FloatArray
+from rgbmidic.view.canvas import small
 
 __all__ = ["NOW", "Course", "TimeLine"]
 
@@ -19,7 +20,7 @@ _NOT_YET = -1
 _DAMAGED = 3
 """Status of a frame whose record cannot be read."""
 _FAULTS = {1: "#e69f00", 2: "#d1495b", _DAMAGED: "#d1495b"}
-NOW = {"dimension": "height", "line_color": "#d1495b", "line_width": 1.5}
+NOW = {"dimension": "height", "line_color": "#8e5bd0", "line_width": 2}
 """How the frame in view is marked."""
 
 
@@ -54,14 +55,15 @@ class Course:
                 values = {"status": _DAMAGED, "node_status": np.ones(1)}
             self.status[frame], self.share[frame] = values["status"], np.mean(values["node_status"] == 0)
 
-    def words(self) -> str:
-        """How many frames ended how."""
+    def words(self, finished: int) -> str:
+        """How many frames are `finished`, and how they ended."""
         counts = {
             word: int((self.status == code).sum())
             for code, word in ((1, "not converged"), (2, "failed"), (_DAMAGED, "damaged"))
         }
-        told = [f"{self.known} of {len(self.status)} frames measured"]
-        return ", ".join(told + [f"{count} {word}" for word, count in counts.items() if count])
+        told = [f"{finished} of {len(self.status)} frames measured"]
+        ends = [] if self.known >= finished else [f"{self.known} looked through"]
+        return ", ".join(told + ends + [f"{count} {word}" for word, count in counts.items() if count])
 
 
 class TimeLine:
@@ -95,6 +97,7 @@ class TimeLine:
             min_border=2,
         )
         self.plot.yaxis.ticker = [0, 50, 100]
+        small(self.plot)
         self.plot.varea("x", 0, "y", source=self._shares, fill_color="#6baed6", fill_alpha=0.6)
         self.plot.segment("x", 0, "x", 100, source=self._faults, line_color="colour", line_width=2)
         self.now = Span(location=now, **NOW)

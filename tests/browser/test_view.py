@@ -94,6 +94,9 @@ def test_curves_of_a_gauge_that_is_set_and_dragged_are_those_of_history(driver, 
     )
     page.driver.execute_script(*click("Save CSV"))
     assert page.until("window.saved").splitlines()[0].startswith("frame,number,status,gauge_1_extension_px")
+    page.do("window.saved = ''")
+    page.driver.execute_script(*click("Save PNG"))
+    assert "PNG" in page.until("window.saved")[:8]
 
 
 def ends(page):

@@ -193,5 +193,5 @@ def test_the_time_line_tells_failed_frames_and_lost_nodes(tmp_path):
         assert course.known == 3
     assert course.status.tolist() == [0, 2, 1, -1]
     np.testing.assert_allclose(course.share[:3], [(r.node_status == 0).mean() for r in records])
-    assert course.words() == "3 of 4 frames measured, 1 not converged, 1 failed"
+    assert course.words(3) == "3 of 4 frames measured, 1 not converged, 1 failed"
     store.release()
