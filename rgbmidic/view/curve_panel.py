@@ -32,7 +32,6 @@ from rgbmidic.view.timeline import NOW
 __all__ = ["CurvePanel"]
 
 _PLAIN = "#888888"
-_NONE = "Curves of what is marked on the field"
 
 
 class CurvePanel:
@@ -76,6 +75,7 @@ class CurvePanel:
     def _have(self, number: int, task: Future[Histories | None] | None, shown: Callable[[], None]) -> None:
         if number != self._number:
             return
+        before = self._probes
         try:
             self.histories = None if task is None else task.result()
             remarks = () if self.histories is None else self.histories.remarks
@@ -83,12 +83,19 @@ class CurvePanel:
         except Exception as error:  # a probe outside the region and the like: told where the probes are
             self.histories = None
             self._told.text = f'<span style="color:var(--warn)">{html.escape(str(error))}</span>'
-        groups = [] if self.histories is None else list(curves.groups(self.histories))
-        self._select.options = groups
-        if groups and self._select.value not in groups:
-            self._select.value = self._chosen if self._chosen in groups else groups[0]
+        groups = {} if self.histories is None else curves.groups(self.histories)
+        self._select.options = list(groups)
+        # the chosen quantity stays unless a new probe does not tell it
+        wanted = [name for name, own in groups.items() if {_probe(told.name) for told in own} - before] or list(groups)
+        current = self._select.value or self._chosen
+        self._select.value = current if current in wanted or not wanted else wanted[0]
         self.draw()
         shown()
+
+    @property
+    def _probes(self) -> set[str]:
+        """Names of what is read off."""
+        return set() if self.histories is None else {_probe(told.name) for told in self.histories.quantities}
 
     def draw(self) -> None:
         """Draw the chosen curve of all probes."""
@@ -138,7 +145,7 @@ def _plot() -> tuple[Any, ColumnDataSource, ColumnDataSource]:
         sizing_mode="stretch_both",
         min_border=4,
         tools=[PanTool(), wheel, BoxZoomTool(), ResetTool(), hover],
-        title=_NONE,
+        title="Curves",
         toolbar_location="above",
     )
     plot.toolbar.logo, plot.toolbar.active_scroll = None, wheel

@@ -136,7 +136,7 @@ def controls(frames: int, *, dark: bool) -> Controls:
     sheets = [sheet(dark=dark)]
     wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
     half: dict[str, Any] = {"stylesheets": sheets, "width": 112}
-    third: dict[str, Any] = {"stylesheets": sheets, "width": 74}
+    third: dict[str, Any] = {"stylesheets": sheets, "width": 72}
     last = max(frames - 1, 1)
     return Controls(
         head=Div(**wide),

@@ -14,7 +14,8 @@ __all__ = ["Tiles"]
 
 _WIDE = 260
 """Columns of a small picture."""
-_GAP = 0.12
+_STEP, _GAP = 1.06, 0.2
+"""From one to the next, and the room for a name over each, in widths of one."""
 _COLUMNS = ("image", "x", "y", "dw", "name")
 
 
@@ -56,11 +57,11 @@ class Tiles:
         self._drawn.glyph.dh = tall
         self._shown.data = {
             "image": [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for _, picture, *_ in places],
-            "x": [x * (1 + _GAP / 2) for *_, x, _ in places],
+            "x": [x * _STEP for *_, x, _ in places],
             "y": [y * (tall + _GAP) + _GAP for *_, y in places],
             "dw": [1.0] * len(places),
             "name": [name for name, *_ in places],
         }
         down = len(rows) * (tall + _GAP)
-        self.plot.x_range.end, self.plot.y_range.start = across * (1 + _GAP / 2), down
-        self.plot.update(visible=True, aspect_ratio=across * (1 + _GAP / 2) / down)
+        self.plot.x_range.end, self.plot.y_range.start = across * _STEP, down
+        self.plot.update(visible=True, aspect_ratio=across * _STEP / down)

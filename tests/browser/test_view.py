@@ -97,6 +97,9 @@ def test_curves_of_a_gauge_that_is_set_and_dragged_are_those_of_history(driver, 
     page.do("window.saved = ''")
     page.driver.execute_script(*click("Save PNG"))
     assert "PNG" in page.until("window.saved")[:8]
+    page.do("model('mode').active = 1")
+    page.pointer(("click", 60, 30))
+    page.until("model('curve').value === 'u (px)' && model('lines').data.name[0] === 'point 1 u'")
 
 
 def ends(page):
