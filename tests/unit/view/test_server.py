@@ -105,6 +105,13 @@ def test_the_server_listens_to_this_machine_only(address):
         assert other.connect_ex(("127.0.0.2", parts.port)) != 0
 
 
+def test_a_second_viewer_of_a_result_has_an_address_of_its_own(tmp_path):
+    path = make_result(tmp_path / "result").path
+    with serving(path) as one, serving(path) as other:
+        assert ask(one, "GET", urlsplit(one).path)[0] == ask(other, "GET", urlsplit(other).path)[0] == 200
+        assert ask(one, "GET", urlsplit(other).path)[0] == 404
+
+
 def bad_inputs(folder):
     (folder / "empty").mkdir()
     made = make_result(folder / "damaged", frames=2)
