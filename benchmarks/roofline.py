@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rgbmidic._kernels import correlation as kernels
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients
 from rgbmidic._kernels.threads import set_threads
 from rgbmidic._kernels.unmix import unmix
@@ -66,19 +65,18 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     mesh = Tri3Mesh.from_region(region, 25)
     reference, deformed = Reference.prepare(image, region, mesh=mesh), Deformed.prepare(image)
     motion = (mesh.nodes - size / 2) @ np.array([[0.01, 0.035], [-0.035, 0.01]])
-    pixels, elements = reference.pixels, len(mesh.elements)
-    owned, count = pixels.rows.size, size * size
-    warped, weight = np.empty((2, owned), np.float32)
+    owned, count, elements = reference.pixels.rows.size, size * size, len(mesh.elements)
+    difference, weight = np.empty((2, owned), np.float32)
     values, weights = reference.values[0], reference.pixel_weights[0]
     coefficients = np.empty((size + 2 * PAD,) * 2, np.float32)
     moments: FloatArray = np.empty((elements, 6))
+    compared = values, motion, difference, weight, moments
     channels, known = random.uniform(0, 200, (3, count)).astype(np.float32), np.ones((3, count), dtype=bool)
     lights, lit = np.empty_like(channels), np.empty_like(known)
     matrix, needed = np.eye(3, dtype=np.float32) + np.float32(0.1), np.eye(3, dtype=bool)
     return [
         ("right-hand side", owned, 20, lambda: reference.right_side(deformed, 0, values, weights, motion)),
-        ("warp and weights", owned, 20, lambda: reference.bring_back(deformed, 0, motion, warped, weight)),
-        ("moments", owned, 12, lambda: kernels.element_moments(values, warped, weight, pixels.offsets, moments)),
+        ("comparison", owned, 20, lambda: reference.bring_back(deformed, 0, *compared)),
         ("Hessian", owned, 20, lambda: reference.hessian_blocks(0, weights)),
         ("spline coefficients", count, 16, lambda: bspline_coefficients(image[0], coefficients)),
         ("unmixing, 3 lights", count, 30, lambda: unmix(channels, known, matrix, needed, lights, lit)),

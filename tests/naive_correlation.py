@@ -13,6 +13,8 @@ __all__ = [
     "element_hessian",
     "element_moments",
     "element_right_side",
+    "element_squares",
+    "element_sums",
     "element_vector",
     "interpolate_nodal",
     "pull_back",
@@ -90,19 +92,17 @@ def warp(coefficients, pixels, mesh, displacement):
 
 
 def element_right_side(coefficients, reference, gradient, weight, pixels, mesh, displacement):
-    """Sums (E, 3, 2) of w (f - g) grad f phi, and (E, 3) of w r^2, w and the number of weighted pixels outside."""
-    out, sums = np.zeros((len(mesh.elements), 3, 2)), np.zeros((len(mesh.elements), 3))
+    """Sums (E, 3, 2) of w (f - g) grad f phi."""
+    out = np.zeros((len(mesh.elements), 3, 2))
     for e, i in owned(pixels):
         x, y = moved(pixels, mesh, displacement, e, i)
         if not inside(pixels.shape, x, y):
-            sums[e, 2] += weight[i] > 0
             continue
         residual = float(reference[i]) - spline(coefficients, x, y)[0]
         for a, phi in enumerate(shape_functions(pixels, e, i)):
             for c in range(2):
                 out[e, a, c] += float(weight[i]) * residual * float(gradient[c][i]) * phi
-        sums[e, :2] += float(weight[i]) * residual**2, float(weight[i])
-    return out, sums
+    return out
 
 
 def element_hessian(gradient, weight, pixels):
@@ -116,13 +116,31 @@ def element_hessian(gradient, weight, pixels):
     return out
 
 
-def element_moments(reference, warped, weight, pixels):
-    """Sums (E, 6) of w, w f, w g, w f f, w f g, w g g over pixels with weight and a finite g."""
+def element_moments(reference, difference, weight, pixels):
+    """Sums (E, 6) of w, w f, w g, w f f, w f g, w g g for g = f - difference."""
     out = np.zeros((len(pixels.offsets) - 1, 6))
     for e, i in owned(pixels):
-        f, g, w = float(reference[i]), float(warped[i]), float(weight[i])
-        if w != 0 and np.isfinite(g):
-            out[e] += w, w * f, w * g, w * f * f, w * f * g, w * g * g
+        f, w = float(reference[i]), float(weight[i])
+        g = f - float(difference[i])
+        out[e] += w, w * f, w * g, w * f * f, w * f * g, w * g * g
+    return out
+
+
+def element_squares(difference, weight, pixels):
+    """Sums (k, E, 3) of w r^2, of w and of the pixels with weight."""
+    out = np.zeros((len(weight), len(pixels.offsets) - 1, 3))
+    for e, i in owned(pixels):
+        w, r = weight[:, i].astype(float), difference[:, i].astype(float)
+        out[:, e] += np.stack([w * r * r, w, w > 0], axis=1)
+    return out
+
+
+def element_sums(values, factor, pixels):
+    """Sums (n, E, 2) of fields and of them times a factor."""
+    out = np.zeros((len(values), len(pixels.offsets) - 1, 2))
+    for e, i in owned(pixels):
+        v = values[:, i].astype(float)
+        out[:, e] += np.stack([v, v * float(factor[i])], axis=1)
     return out
 
 

@@ -17,12 +17,13 @@ from rgbmidic._kernels.threads import over_ranges
 __all__ = [
     "BLOCK",
     "bring_back",
-    "curvature_deviation",
     "element_hessian",
-    "element_moments",
     "element_right_side",
+    "element_squares",
+    "element_sums",
     "element_vector",
     "interpolate_nodal",
+    "subtract_curvature",
 ]
 
 _SIXTH = np.float32(1.0 / 6.0)
@@ -112,22 +113,21 @@ def _element_motion(displacement, elements, barycentric, origin, e):
 @compiled(fastmath=_FAST)
 def element_right_side(
     start, stop, coefficients, reference, gradient_x, gradient_y, weight, runs, run_offsets, origin, elements,
-    barycentric, displacement, out, sums,
+    barycentric, displacement, out,
 ):  # fmt: skip
     """Right-hand side of one light, element by element.
 
     `coefficients` of the deformed image; `reference`, `gradient_x`, `gradient_y`, `weight` (P,) float32 per owned
     pixel; `runs` (R, 4) int32, `run_offsets` (E + 1,) and `origin` (E, 2) as in `rgbmidic.mesh.PixelMap`; `barycentric`
     (E, 3, 3) float64 with the shape function ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2)
-    float64. `out` (E, 3, 2) receives ``sum w (f - g(x + u)) grad f phi``; `sums` (E, 3) receives ``sum w r^2``,
-    ``sum w`` and the number of pixels with weight whose position has left the image.
+    float64. `out` (E, 3, 2) receives ``sum w (f - g(x + u)) grad f phi``; pixels that have left the image do not count.
     """
     height, width = coefficients.shape[0] - 2 * PAD, coefficients.shape[1] - 2 * PAD
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         low_x, low_y = np.float32(-base_x), np.float32(-base_y)
         high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
-        sx = sxx = sxy = sy = syx = syy = rest = total = lost = _ZERO
+        sx = sxx = sxy = sy = syx = syy = _ZERO
         for run in range(run_offsets[e], run_offsets[e + 1]):
             slot, left = np.int64(runs[run, 0]), np.int64(runs[run, 1])
             x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
@@ -135,7 +135,6 @@ def element_right_side(
                 px = ux + fxx * x + fxy * y
                 py = uy + fyx * x + fyy * y
                 if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
-                    lost += _ONE if weight[slot] != _ZERO else _ZERO
                     slot, left, x = slot + 1, left - 1, x + _ONE
                     continue
                 cx, cy = np.floor(px), np.floor(py)
@@ -157,8 +156,6 @@ def element_right_side(
                     difference = reference[i0 + i] - g if own else _ZERO
                     w = weight[i0 + i] if own else _ZERO
                     pull = w * difference
-                    rest += pull * difference
-                    total += w
                     along = pull * gradient_x[i0 + i]
                     across = pull * gradient_y[i0 + i]
                     pull_x += along
@@ -176,7 +173,6 @@ def element_right_side(
             b0, b1, b2 = barycentric[e, a, 0], barycentric[e, a, 1], barycentric[e, a, 2]
             out[e, a, 0] = b0 * sx + b1 * sxx + b2 * sxy
             out[e, a, 1] = b0 * sy + b1 * syx + b2 * syy
-        sums[e, 0], sums[e, 1], sums[e, 2] = rest, total, lost
 
 
 @over_ranges("out")
@@ -245,14 +241,15 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
 @over_ranges("elements")
 @compiled(fastmath=_FAST)
 def bring_back(
-    start, stop, coefficients, deformed_weight, partial, reference_weight, runs, run_offsets, origin, elements,
-    barycentric, displacement, out, weight,
+    start, stop, coefficients, deformed_weight, partial, reference, reference_weight, runs, run_offsets, origin,
+    elements, barycentric, displacement, difference, weight, moments,
 ):  # fmt: skip
-    """Deformed image and weights of one light brought back to the reference at the owned pixels.
+    """Deformed image and weights of one light brought back and compared with the reference at the owned pixels.
 
-    `out` (P,) float32 receives g(x + u), NaN outside the image; `weight` (P,) float32 the `reference_weight` (P,) times
-    the `deformed_weight` (H, W) at the displaced position (bilinear), 0 outside and beside excluded pixels. `partial`
-    (h + 1, w + 1) int32 tells where that is other than 1: how many such blocks of `BLOCK` px lie above and to the left.
+    `difference` (P,) float32 receives ``f - g(x + u)``, 0 outside the image; `weight` (P,) float32 the
+    `reference_weight` (P,) times the `deformed_weight` (H, W) at the displaced position (bilinear), 0 outside and
+    beside excluded pixels. `partial` (h + 1, w + 1) int32 tells where that is other than 1: how many such blocks of
+    `BLOCK` px lie above and to the left. `moments` (E, 6) receives the sums of w, w f, w g, w f f, w f g, w g g.
     """
     height, width = deformed_weight.shape
     for e in range(start, stop):
@@ -270,7 +267,7 @@ def bring_back(
                 left_x, right_x = min(left_x, px), max(right_x, px)
                 top_y, bottom_y = min(top_y, py), max(bottom_y, py)
                 if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
-                    out[slot] = np.nan
+                    difference[slot] = _ZERO
                     slot, left, x = slot + 1, left - 1, x + _ONE
                     continue
                 cx, cy = np.floor(px), np.floor(py)
@@ -278,7 +275,7 @@ def bring_back(
                 tx, ty = px - cx, py - cy
                 n = _span(left, tx, ty, fxx, fyx, column, width)
                 filled = (n + _LANES - 1) // _LANES * _LANES  # as in `element_right_side`
-                if slot + filled > out.size or column + filled + 3 >= width + 2 * PAD:
+                if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
                 i0, r, c = np.uint64(slot), np.uint64(row + PAD - 1), np.uint64(column + PAD - 1)
                 k0, k1 = coefficients[r, c:], coefficients[r + np.uint64(1), c:]
@@ -287,27 +284,41 @@ def bring_back(
                     t = np.float32(np.int32(i))
                     g = _spline(k0, k1, k2, k3, i, tx + (fxx - _ONE) * t, ty + fyx * t)
                     if np.int32(i) < np.int32(n):
-                        out[i0 + i] = g
+                        difference[i0 + i] = reference[i0 + i] - g
                 right_x = max(right_x, px + fxx * np.float32(n))
                 top_y, bottom_y = min(top_y, py + fyx * np.float32(n)), max(bottom_y, py + fyx * np.float32(n))
                 slot, left, x = slot + n, left - n, x + np.float32(n)
         if run_offsets[e] == run_offsets[e + 1]:
+            moments[e] = 0.0
             continue
         first, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
         inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
         if inside and not _any_partial(partial, base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y):
             for i in range(np.uint64(first), np.uint64(end)):
                 weight[i] = reference_weight[i]
-            continue
-        for run in range(run_offsets[e], run_offsets[e + 1]):
-            x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
-            for i in range(runs[run, 0], runs[run, 0] + runs[run, 1]):
-                px = ux + fxx * x + fxy * y
-                py = uy + fyx * x + fyy * y
-                within = px >= low_x and py >= low_y and px <= high_x and py <= high_y
-                mean = _beside(deformed_weight, base_x, base_y, px, py) if within else _ZERO
-                weight[i] = reference_weight[i] * mean
-                x += _ONE
+        else:
+            for run in range(run_offsets[e], run_offsets[e + 1]):
+                x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
+                for i in range(runs[run, 0], runs[run, 0] + runs[run, 1]):
+                    px = ux + fxx * x + fxy * y
+                    py = uy + fyx * x + fyy * y
+                    within = px >= low_x and py >= low_y and px <= high_x and py <= high_y
+                    mean = _beside(deformed_weight, base_x, base_y, px, py) if within else _ZERO
+                    weight[i] = reference_weight[i] * mean
+                    x += _ONE
+        total = f1 = g1 = f2 = fg = g2 = 0.0
+        for i in range(np.uint64(first), np.uint64(end)):
+            f, w = reference[i], weight[i]
+            g = f - difference[i]
+            wf, wg = w * f, w * g
+            total += w
+            f1 += wf
+            g1 += wg
+            f2 += wf * f
+            fg += wf * g
+            g2 += wg * g
+        moments[e, 0], moments[e, 1], moments[e, 2] = total, f1, g1
+        moments[e, 3], moments[e, 4], moments[e, 5] = f2, fg, g2
 
 
 @helper()
@@ -333,26 +344,34 @@ def _beside(weight, base_x, base_y, px, py):
     return (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
 
 
-@over_ranges("out")
+@over_ranges("offsets")
 @compiled(fastmath=_FAST)
-def element_moments(start, stop, reference, warped, weight, offsets, out):
-    """Weighted moments of reference and warped deformed image: ``out`` (E, 6) receives the sums of
-    w, w f, w g, w f f, w f g, w g g over the pixels with weight and a finite g."""
-    for e in range(start, stop):
-        total = f1 = g1 = f2 = fg = g2 = 0.0
-        for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-            g = warped[i]
-            w = weight[i]
-            if w == _ZERO or not np.isfinite(g):
-                continue
-            f = reference[i]
-            total += w
-            f1 += w * f
-            g1 += w * g
-            f2 += w * f * f
-            fg += w * f * g
-            g2 += w * g * g
-        out[e, 0], out[e, 1], out[e, 2], out[e, 3], out[e, 4], out[e, 5] = total, f1, g1, f2, fg, g2
+def element_squares(start, stop, difference, weight, offsets, out):
+    """Sums over an element's pixels of ``w r^2``, of w and of the pixels with weight: ``out`` (k, E, 3) for a
+    `difference` and `weight` (k, P)."""
+    for light in range(len(weight)):
+        r, w = difference[light], weight[light]
+        for e in range(start, min(stop, offsets.size - 1)):
+            square = total = number = _ZERO
+            for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
+                square += w[i] * r[i] * r[i]
+                total += w[i]
+                number += _ONE if w[i] > _ZERO else _ZERO
+            out[light, e, 0], out[light, e, 1], out[light, e, 2] = square, total, number
+
+
+@over_ranges("offsets")
+@compiled(fastmath=_FAST)
+def element_sums(start, stop, values, factor, offsets, out):
+    """Sums of fields (n, P) over an element's pixels, and of their products with one factor (P,): ``out`` (n, E, 2)."""
+    for n in range(len(values)):
+        v = values[n]
+        for e in range(start, min(stop, offsets.size - 1)):
+            total = product = _ZERO
+            for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
+                total += v[i]
+                product += v[i] * factor[i]
+            out[n, e, 0], out[n, e, 1] = total, product
 
 
 @over_ranges("out")
@@ -398,23 +417,38 @@ def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, 
 
 
 @over_ranges("elements")
-@compiled()
-def curvature_deviation(start, stop, nodes, elements, curvature, local_x, local_y, offsets, barycentric, out):
-    """Deviation of a curved field from its linear interpolant, ``out`` (2, P) float32.
+@compiled(fastmath=_FAST)
+def subtract_curvature(
+    start, stop, difference, gradient_x, gradient_y, nodes, elements, carried, curvature, local_x, local_y, offsets,
+    barycentric, out,
+):  # fmt: skip
+    """Residual less what the curved field has over its own linear fit: ``out`` (k, P) receives ``difference - grad f .
+    d``, all (k, P) float32.
 
     `curvature` (N, 2, 3) float64 holds the second derivatives (xx, xy, yy) of both components at the nodes; along an
-    edge that is the mean of its ends: ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H_ab (x_a - x_b)``, continuous.
+    edge that is the mean of its ends. Over its linear interpolant the field has the continuous
+    ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H_ab (x_a - x_b)``; its linear fit has `carried` (N, 2) at the nodes.
     """
     for e in range(start, stop):
+        sag, nodal = np.empty((2, 3), dtype=np.float32), np.empty((2, 3), dtype=np.float32)
         for c in range(2):
-            half_01 = _half_sag(nodes, elements[e, 0], elements[e, 1], curvature, c)
-            half_12 = _half_sag(nodes, elements[e, 1], elements[e, 2], curvature, c)
-            half_20 = _half_sag(nodes, elements[e, 2], elements[e, 0], curvature, c)
+            for a in range(3):
+                sag[c, a] = _half_sag(nodes, elements[e, a], elements[e, (a + 1) % 3], curvature, c)
+                nodal[c, a] = carried[elements[e, a], c]
+        b = barycentric[e]
+        b00, b01, b02 = np.float32(b[0, 0]), np.float32(b[0, 1]), np.float32(b[0, 2])
+        b10, b11, b12 = np.float32(b[1, 0]), np.float32(b[1, 1]), np.float32(b[1, 2])
+        for light in range(len(difference)):
+            given, gx, gy, less = difference[light], gradient_x[light], gradient_y[light], out[light]
             for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-                l0 = barycentric[e, 0, 0] + barycentric[e, 0, 1] * local_x[i] + barycentric[e, 0, 2] * local_y[i]
-                l1 = barycentric[e, 1, 0] + barycentric[e, 1, 1] * local_x[i] + barycentric[e, 1, 2] * local_y[i]
-                l2 = 1.0 - l0 - l1
-                out[c, i] = half_01 * l0 * l1 + half_12 * l1 * l2 + half_20 * l2 * l0
+                l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
+                l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
+                l2 = _ONE - l0 - l1
+                dx = sag[0, 0] * l0 * l1 + sag[0, 1] * l1 * l2 + sag[0, 2] * l2 * l0
+                dy = sag[1, 0] * l0 * l1 + sag[1, 1] * l1 * l2 + sag[1, 2] * l2 * l0
+                dx -= nodal[0, 0] * l0 + nodal[0, 1] * l1 + nodal[0, 2] * l2
+                dy -= nodal[1, 0] * l0 + nodal[1, 1] * l1 + nodal[1, 2] * l2
+                less[i] = given[i] - gx[i] * dx - gy[i] * dy
 
 
 @helper()

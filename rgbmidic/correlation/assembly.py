@@ -22,24 +22,22 @@ class Assembly:
 
     Attributes
     ----------
-    unknowns : ndarray, shape (E, 6), int64
-        Unknowns of each element.
-    slots : ndarray, shape (36 E,), int64
-        Position of each entry of the element matrices in the data of the assembled matrix.
-    indices, indptr : ndarray
-        Structure of the assembled matrix (compressed columns).
+    entries, own : csr_matrix, shape (nonzeros, 27 E), (3 N, 27 E)
+        Sum element blocks into the data of the assembled matrix, and into entries xx, xy, yy of the nodes' own blocks.
+    corners : csr_matrix, shape (2 N, 6 E)
+        Sums element vectors into that of the unknowns.
     smoothness : csc_matrix, shape (2 N, 2 N)
-        Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal; in that structure.
+        Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal; in the structure of the
+        assembled matrices.
     diagonal : ndarray
         The unit matrix's data in it.
     nodal_area : ndarray, shape (N,), float64
         A third of the area of the elements around each node, square px.
     """
 
-    unknowns: npt.NDArray[np.int64]
-    slots: npt.NDArray[np.int64]
-    indices: npt.NDArray[np.int32]
-    indptr: npt.NDArray[np.int32]
+    entries: sp.csr_matrix
+    own: sp.csr_matrix
+    corners: sp.csr_matrix
     smoothness: sp.csc_matrix
     diagonal: FloatArray
     nodal_area: FloatArray
@@ -52,15 +50,17 @@ class Assembly:
         rows = np.repeat(unknowns, 6, axis=1).ravel()
         columns = np.tile(unknowns, 6).ravel()
         keys, slots = np.unique(columns * size + rows, return_inverse=True)
+        part = np.arange(27 * len(mesh.elements)).reshape(-1, 3, 3, 3)
+        full = part[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
+        own = 3 * mesh.elements[..., None] + np.arange(3)
         indptr = np.searchsorted(keys, np.arange(size + 1) * size)
         structure = (keys % size).astype(np.int32), indptr.astype(np.int32)
         laplacian, data = sp.coo_matrix(_laplacian(mesh)), np.zeros(len(keys))
         data[np.searchsorted(keys, laplacian.col.astype(np.int64) * size + laplacian.row)] = laplacian.data
         return cls(
-            unknowns=unknowns,
-            slots=slots.ravel(),
-            indices=structure[0],
-            indptr=structure[1],
+            entries=_sums(slots.ravel(), full.ravel(), (len(keys), part.size)),
+            own=_sums(own.ravel(), np.einsum("eaad->ead", part).ravel(), (3 * len(mesh.nodes), part.size)),
+            corners=_sums(unknowns.ravel(), np.arange(unknowns.size), (size, unknowns.size)),
             smoothness=sp.csc_matrix((data, *structure), shape=(size, size)),
             diagonal=(keys % size == keys // size).astype(np.float64),
             nodal_area=mesh.to_nodes(mesh.areas / 3),
@@ -69,27 +69,27 @@ class Assembly:
     @property
     def size(self) -> int:
         """Number of unknowns, twice the number of nodes."""
-        return len(self.indptr) - 1
+        return self.smoothness.shape[0]
 
-    def matrix(self, blocks: FloatArray) -> sp.csc_matrix:
-        """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N)."""
-        full = blocks[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
-        sums = np.bincount(self.slots, weights=full.ravel(), minlength=len(self.indices))
-        return self.with_structure(sums.astype(np.float64, copy=False))
-
-    def with_structure(self, data: FloatArray) -> sp.csc_matrix:
-        """The matrix of these data in the structure of the assembled ones."""
-        return sp.csc_matrix((data, self.indices, self.indptr), shape=(self.size, self.size))
+    def matrix(self, blocks: FloatArray, more: FloatArray | float = 0.0) -> sp.csc_matrix:
+        """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N); `more` is
+        added to its data."""
+        matrix = self.smoothness.copy()
+        matrix.data = self.entries @ blocks.ravel() + more
+        return matrix
 
     def node_blocks(self, blocks: FloatArray) -> FloatArray:
         """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""
-        corners, own = self.unknowns[:, ::2].ravel() // 2, np.einsum("eaad->dea", blocks).reshape(3, -1)
-        return np.stack([np.bincount(corners, weights=part, minlength=self.size // 2) for part in own])
+        return np.ascontiguousarray((self.own @ blocks.ravel()).reshape(-1, 3).T)
 
     def vector(self, parts: FloatArray) -> FloatArray:
         """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""
-        sums = np.bincount(self.unknowns.ravel(), weights=parts.ravel(), minlength=self.size)
-        return np.asarray(sums, dtype=np.float64)
+        return np.asarray(self.corners @ parts.ravel())
+
+
+def _sums(rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64], shape: tuple[int, int]) -> sp.csr_matrix:
+    """The matrix that adds up entries: 1 at each pair of a row and a column."""
+    return sp.csr_matrix((np.ones(rows.size), (rows, columns)), shape=shape)
 
 
 def factorise(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:

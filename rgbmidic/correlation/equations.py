@@ -50,11 +50,14 @@ class Equations:
         Of the surface around each node.
     functions : ndarray, shape (2 N, m)
         The rigid functions in the axes of the reference.
-    hessian, smoothness : csc_matrix, shape (2 N, 2 N)
+    blocks : ndarray, shape (E, 3, 3, 3)
+        Element blocks of the Hessian.
+    smoothness : float
+        Factor on the smoothness of the `Assembly`.
     node_blocks : ndarray, shape (3, N)
         Entries xx, xy and yy of the nodes' own blocks of the Hessian.
     solve
-        Solves ``(hessian + smoothness) x = b``.
+        Solves the normal equations with it.
     border, border_solved : ndarray, shape (2 N, (k - 1) m)
         Hessian of each further light times the rigid functions, and the solution for it.
     schur : ndarray
@@ -68,9 +71,9 @@ class Equations:
     weights: FloatImage
     rotation: FloatArray
     functions: FloatArray
-    hessian: sp.csc_matrix
+    blocks: FloatArray
     node_blocks: FloatArray
-    smoothness: sp.csc_matrix
+    smoothness: float
     solve: Callable[[FloatArray], FloatArray]
     border: FloatArray
     border_solved: FloatArray
@@ -96,24 +99,24 @@ class Equations:
         functions = _turned_back(rotation, functions)
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
         blocks = np.sum(per_light, axis=0)
-        hessian, own = assembly.matrix(blocks), assembly.node_blocks(blocks)
+        own = assembly.node_blocks(blocks)
         textured, scale = _observability(own, assembly.nodal_area, SEEN if given is None else _INFORMED)
         if given is not None:
             texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
             textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
-        smoothness = assembly.with_structure(_SMOOTHNESS * scale * assembly.smoothness.data)
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
-        anchor = 1e-9 * scale * assembly.diagonal
-        solve = factorise(assembly.with_structure(hessian.data + smoothness.data + anchor))
-        border, corner = _border([assembly.matrix(blocks) for blocks in per_light[1:]], functions)
+        held = scale * (_SMOOTHNESS * assembly.smoothness.data + 1e-9 * assembly.diagonal)
+        solve = factorise(assembly.matrix(blocks, held))
+        coupled = per_light[1:] if functions.shape[1] else []
+        border, corner = _border([assembly.matrix(blocks) for blocks in coupled], functions)
         solved = solve(border) if border.shape[1] else border
         return cls(
             weights=weights,
             rotation=rotation,
             functions=functions,
-            hessian=hessian,
+            blocks=blocks,
             node_blocks=own,
-            smoothness=smoothness,
+            smoothness=_SMOOTHNESS * scale,
             solve=solve,
             border=border,
             border_solved=solved,
@@ -124,7 +127,7 @@ class Equations:
 
     def information(self, reference: Reference) -> FloatArray:
         """Texture times weight around each node, over its area, (N,): what the inverse variance of a node goes with."""
-        return np.asarray(self.hessian.diagonal().reshape(-1, 2).sum(axis=1) / reference.assembly.nodal_area)
+        return np.asarray((self.node_blocks[0] + self.node_blocks[2]) / reference.assembly.nodal_area)
 
     def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solve for the motion of the nodes (N, 2) and of the rigid functions ((k - 1) m,)."""
@@ -155,7 +158,7 @@ def _rotation(gradient: FloatArray) -> FloatArray:
 def _border(hessians: list[sp.csc_matrix], functions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Coupling of the nodes with the rigid unknowns of the further lights, and these with themselves."""
     count = functions.shape[1]
-    columns = [hessian @ functions for hessian in hessians] if count else []
+    columns = [hessian @ functions for hessian in hessians]
     corner = np.zeros((count * len(columns),) * 2)
     for i, column in enumerate(columns):
         part = slice(i * count, (i + 1) * count)

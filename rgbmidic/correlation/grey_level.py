@@ -30,9 +30,7 @@ def corrected_values(residual: Residual, kind: Literal["none", "global", "local"
     reference = residual.reference
     if kind == "none":
         return reference.values
-    known = np.isfinite(residual.warped)
-    weights, warped = np.where(known, residual.weights, np.float32(0)), np.nan_to_num(residual.warped)
-    lights = zip(reference.values, warped, weights, strict=True)
+    lights = zip(reference.values, residual.warped, residual.weights, strict=True)
     if kind == "global":
         return np.stack([_one_gain(f, g, weight.astype(np.float64)) for f, g, weight in lights])
     return np.stack([_gain_field(reference, f, g, weight) for f, g, weight in lights])

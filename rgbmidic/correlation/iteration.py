@@ -48,22 +48,17 @@ class Estimate:
         Motion of each node in every iteration, px.
     longest : float
         Largest motion of a textured node, or by a light's rigid motion, in the last iteration, px.
-    squares : ndarray, shape (k, 3)
-        Sums of w r^2, of w and of lost pixels before the last iteration.
     """
 
     displacement: FloatArray
     rigid: FloatArray
     increments: tuple[FloatArray, ...] = ()
     longest: float = float("inf")
-    squares: FloatArray
 
     @classmethod
     def start(cls, problem: Problem, initial: FloatArray) -> Estimate:
         """From a displacement (N, 2), without rigid motions."""
-        lights = len(problem.reference.images)
-        rigid = np.zeros((lights, problem.functions.shape[1]))
-        return cls(displacement=initial, rigid=rigid, squares=np.zeros((lights, 3)))
+        return cls(displacement=initial, rigid=np.zeros((len(problem.reference.images), problem.functions.shape[1])))
 
     def history(self, nodes: BoolArray | None = None) -> FloatArray:
         """Largest motion of `nodes` (N,), or of all, in every iteration, px; shape (iterations,)."""
@@ -102,7 +97,7 @@ def iterate(
 
 def _stepped(problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate) -> Estimate:
     """One Gauss-Newton iteration."""
-    right_side, rigid_side, squares = _right_sides(problem, equations, values, estimate)
+    right_side, rigid_side = _right_sides(problem, equations, values, estimate)
     motion, shifts = equations.increment(right_side, rigid_side)
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
@@ -117,24 +112,23 @@ def _stepped(problem: Problem, equations: Equations, values: FloatImage, estimat
         rigid=rigid,
         increments=(*estimate.increments, length),
         longest=longest,
-        squares=squares,
     )
 
 
 def _right_sides(
     problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Right-hand sides of the nodes (2 N,) and of the rigid functions ((k - 1) m,), and each light's sums (k, 3)."""
-    total = -equations.turned_back((equations.smoothness @ estimate.displacement.ravel())[:, None]).ravel()
-    squares, rigid = np.zeros_like(estimate.squares), []
+) -> tuple[FloatArray, FloatArray]:
+    """Right-hand sides of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
+    bend = problem.reference.assembly.smoothness @ estimate.displacement.ravel()
+    total = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
+    rigid = []
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
-        vector, squares[light] = problem.reference.right_side(
-            problem.deformed, light, values[light], equations.weights[light], displacement
-        )
+        given = values[light], equations.weights[light], displacement
+        vector = problem.reference.right_side(problem.deformed, light, *given)
         total += vector
         if light:
             rigid.append(equations.functions.T @ vector)
-    return total, np.concatenate(rigid) if rigid else np.empty(0), squares
+    return total, np.concatenate(rigid) if rigid else np.empty(0)
 
 
 def _light_displacements(problem: Problem, estimate: Estimate) -> list[FloatArray]:

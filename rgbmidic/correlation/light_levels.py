@@ -15,6 +15,8 @@ _LEAST = 12
 """Pixels of an element that must be known in both states."""
 _ENOUGH = 36
 """Pixels of an element that are looked at, about."""
+_MANY = 400
+"""Elements that are looked at, about: the median over them is known to 6 % of their scatter."""
 
 
 def brightness_change(
@@ -40,17 +42,20 @@ def brightness_change(
         Gain and offset (grey levels); NaN where no element is seen in both states.
     """
     mesh, pixels = reference.mesh, reference.pixels
+    count = len(mesh.elements)
     motion = displacement[mesh.elements].mean(axis=1)
-    every = slice(None, None, max(1, pixels.rows.size // (_ENOUGH * len(mesh.elements))))
-    owner = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))[every]
+    chosen = np.zeros(count, dtype=bool)
+    chosen[:: max(1, count // _MANY)] = True
+    slots = np.flatnonzero(np.repeat(chosen, np.diff(pixels.offsets)))
+    slots = slots[:: max(1, slots.size // (_ENOUGH * int(chosen.sum())))]
+    owner = np.searchsorted(pixels.offsets, slots, side="right") - 1
     step = np.round(np.nan_to_num(motion)).astype(np.int64)[owner]
-    rows, columns = pixels.rows[every], pixels.columns[every]
+    rows, columns = pixels.rows[slots], pixels.columns[slots]
     there = rows + step[:, 1], columns + step[:, 0]
     height, width = first.shape[1:]
     inside = (there[0] >= 0) & (there[0] < height) & (there[1] >= 0) & (there[1] < width)
     inside &= np.isfinite(motion).all(axis=1)[owner]
     moved = np.clip(there[0], 0, height - 1), np.clip(there[1], 0, width - 1)
-    count = len(mesh.elements)
     return np.array(
         [_gain_and_offset(f[rows, columns], g[moved], inside, owner, count) for f, g in zip(first, second, strict=True)]
     )

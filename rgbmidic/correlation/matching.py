@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic._kernels.correlation import element_moments
 from rgbmidic.correlation.precision import Precision
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["correlation", "correlation_around", "matching_elements", "misfit"]
 
@@ -69,22 +68,20 @@ def _median_around(mesh: Tri3Mesh, values: FloatArray, textured: BoolArray, chos
 
 def _light_precision(residual: Residual, precision: Precision | None) -> FloatArray:
     """Mean precision (k, E) of each light in each element, over that of the most precise; 1 where it is not known."""
-    pixels = residual.reference.pixels
+    reference = residual.reference
     if precision is None or len(residual.values) == 1:
-        return np.ones((len(residual.values), len(pixels.origin)))
-    mean = np.stack([pixels.by_element(factor) for factor in precision.factor])
+        return np.ones((len(residual.values), len(reference.mesh.elements)))
+    mean = reference.sums(precision.factor, precision.bend)[..., 0]
     return np.asarray(mean / np.maximum(mean.max(axis=0), 1e-300))
 
 
-def misfit(residual: Residual, weights: FloatImage, measured: BoolArray) -> FloatArray:
+def misfit(mesh: Tri3Mesh, squares: FloatArray, measured: BoolArray) -> FloatArray:
     """Weighted rms residual around each node (N,), over its median: 1 is ordinary, 3 is suspicious.
 
-    `weights` (k, P) are those of the solve, in units of the inverse variance of the residual.
+    `squares` (k, E, 3) are those of `Residual` with the weights of the solve, in units of the inverse variance of the
+    residual.
     """
-    mesh, pixels = residual.reference.mesh, residual.reference.pixels
-    lights = zip(weights, residual.difference, strict=True)
-    sums = [(pixels.by_element(own * difference**2), pixels.by_element(own > 0)) for own, difference in lights]
-    square, count = (mesh.to_nodes(np.sum(part, axis=0)) for part in zip(*sums, strict=True))
+    square, _, count = (mesh.to_nodes(part) for part in squares.sum(axis=0).T)
     around = square / np.maximum(count, 1.0)
     typical = float(np.median(around[measured])) if measured.any() else 0.0
     return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)
@@ -92,16 +89,7 @@ def misfit(residual: Residual, weights: FloatImage, measured: BoolArray) -> Floa
 
 def _centred_products(residual: Residual, precision: FloatArray) -> FloatArray:
     """Sums (3, E) over the lights, each with its `precision` (k, E), of the centred products f g, f f and g g."""
-    offsets = residual.reference.pixels.offsets
-    moments = np.zeros((len(offsets) - 1, 6))
-    products = np.zeros((3, len(moments)))
-    lights = zip(residual.values, residual.warped, residual.weights, precision, strict=True)
-    for value, warped, weight, share in lights:
-        element_moments(value, warped, weight, offsets, moments)
-        total, f, g, f2, product, g2 = moments.T
-        total = np.maximum(total, 1e-30)
-        products += share * np.stack([product - f * g / total, f2 - f * f / total, g2 - g * g / total])
-    return products
+    return np.asarray([(precision * part).sum(axis=0) for part in residual.centred_products()])
 
 
 def correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.correlation import element_hessian
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.solution import NodeStatus
@@ -137,14 +138,17 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
     """Entries xx, xy, yy (3, N) of the own blocks of the chosen `nodes` (N,) in the Hessian that noise alone has: what
     the residual, which holds the noise of both images, differs by from pixel to pixel."""
     reference, pixels = residual.reference, residual.reference.pixels
-    around = np.repeat(nodes[reference.mesh.elements].any(axis=1), np.diff(pixels.offsets))
+    elements = nodes[reference.mesh.elements].any(axis=1)
+    around = np.repeat(elements, np.diff(pixels.offsets))
+    offsets = np.concatenate([[0], np.cumsum(np.diff(pixels.offsets)[elements])])
     top, left, _, _ = pixels.bounds
     row, column = pixels.rows[around] - top, pixels.columns[around] - left
-    total = np.zeros((len(reference.mesh.elements), 3, 3, 3))
-    slope_x, slope_y = np.zeros((2, around.size), dtype=np.float32)
-    for weight, window in zip(weights, pixels.window(residual.difference / np.float32(np.sqrt(2))), strict=True):
-        image = np.pad(window, ((0, 1), (0, 1)))
+    place = pixels.local_x[around], pixels.local_y[around], offsets, pixels.barycentric[elements]
+    own, total = np.zeros((int(elements.sum()), 3, 3, 3)), np.zeros((elements.size, 3, 3, 3))
+    for weight, difference in zip(weights, residual.difference, strict=True):
+        image = np.pad(pixels.window(difference[None] / np.float32(np.sqrt(2)))[0], ((0, 1), (0, 1)))
         here = image[row, column]
-        slope_x[around], slope_y[around] = image[row, column + 1] - here, image[row + 1, column] - here
-        total += reference.blocks(weight, slope_x, slope_y)
+        slopes = image[row, column + 1] - here, image[row + 1, column] - here
+        element_hessian(*slopes, weight[around], *place, own)
+        total[elements] += own
     return reference.assembly.node_blocks(total)

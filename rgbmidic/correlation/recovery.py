@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic._kernels.correlation import curvature_deviation, interpolate_nodal
 from rgbmidic.correlation.assembly import factorise
-from rgbmidic.mesh import PixelMap, Tri3Mesh
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import quadratic_fit
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["Recovery", "linear_fit_offset", "mass_matrix"]
 
@@ -66,17 +65,10 @@ class Recovery:
         x, y = self.slope_x @ fitted, self.slope_y @ fitted
         return np.stack([x[:, 0], y[:, 1], (y[:, 0] + x[:, 1]) / 2], axis=1)
 
-    def deviation(self, mesh: Tri3Mesh, pixels: PixelMap, fitted: FloatArray, offset: FloatArray) -> FloatImage:
-        """What the curved field has over its own linear fit at the owned pixels, px; shape (2, P)."""
-        carried = sum(
-            part[:, None] * (operator @ fitted) for part, operator in zip(offset.T, self.curvature, strict=True)
-        )
+    def bend(self, fitted: FloatArray, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the linear fit has at the nodes beyond the field (N, 2), and its second derivatives (N, 2, 3)."""
         second = np.stack([operator @ fitted for operator in self.curvature], axis=-1)
-        geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
-        linear, bent = np.empty((2, 2, pixels.rows.size), dtype=np.float32)
-        interpolate_nodal(np.asarray(carried), mesh.elements, *geometry, linear)
-        curvature_deviation(mesh.nodes, mesh.elements, second, *geometry, bent)
-        return np.asarray(bent - linear)
+        return np.einsum("nt,nct->nc", offset, second), second
 
 
 def linear_fit_offset(mesh: Tri3Mesh) -> FloatArray:

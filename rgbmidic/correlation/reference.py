@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.correlation import BLOCK, bring_back, element_hessian, element_right_side
+from rgbmidic._kernels.correlation import BLOCK, bring_back, element_hessian, element_right_side, element_sums
 from rgbmidic._kernels.interpolation import PAD
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
@@ -152,37 +152,43 @@ class Reference:
         return self.blocks(weight, self.gradient_x[light], self.gradient_y[light])
 
     def bring_back(
-        self, deformed: Deformed, light: int, displacement: FloatArray, out: FloatImage, weight: FloatImage
+        self,
+        deformed: Deformed,
+        light: int,
+        values: FloatImage,
+        displacement: FloatArray,
+        difference: FloatImage,
+        weight: FloatImage,
+        moments: FloatArray,
     ) -> None:
-        """A light's deformed image brought back by a nodal displacement (N, 2), g(x + u) at the owned pixels, into
-        `out` (P,), and its weight, the reference's times the deformed image's there, into `weight` (P,)."""
+        """A light's deformed image brought back by a nodal displacement (N, 2) and compared with reference grey levels
+        `values` (P,): `difference` (P,), `weight` (P,), the reference's times the deformed image's there, and the
+        `moments` (E, 6), as in `Residual`."""
         images = (
             deformed.coefficients[light],
             deformed.weights[light],
             deformed.partial[light],
+            values,
             self.pixel_weights[light],
         )
-        bring_back(*images, *self._geometry(), displacement, out, weight)
+        bring_back(*images, *self._geometry(), displacement, difference, weight, moments)
 
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """A light's right-hand side (2 N,) for reference grey levels `values` (P,), and its sums
-        (w r^2, w, lost pixels)."""
-        parts = np.zeros((len(self.mesh.elements), 3, 2))
-        sums = np.zeros((len(self.mesh.elements), 3))
+    ) -> FloatArray:
+        """A light's right-hand side (2 N,) for reference grey levels `values` (P,)."""
+        parts = np.empty((len(self.mesh.elements), 3, 2))
+        gradient = self.gradient_x[light], self.gradient_y[light]
         element_right_side(
-            deformed.coefficients[light],
-            values,
-            self.gradient_x[light],
-            self.gradient_y[light],
-            weight,
-            *self._geometry(),
-            displacement,
-            parts,
-            sums,
+            deformed.coefficients[light], values, *gradient, weight, *self._geometry(), displacement, parts
         )
-        return self.assembly.vector(parts), np.asarray(sums.sum(axis=0))
+        return self.assembly.vector(parts)
+
+    def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:
+        """Sums over each element of fields (n, P), and of them times a `factor` (P,); shape (n, E, 2)."""
+        out = np.empty((len(values), len(self.mesh.elements), 2))
+        element_sums(values, factor, self.pixels.offsets, out)
+        return out
 
     def _geometry(self) -> tuple[AnyArray, ...]:
         pixels = self.pixels
@@ -197,12 +203,14 @@ class Reference:
 
 def _prepare(images: FloatImage, weights: FloatImage | None, prefilter: str) -> tuple[FloatImage, FloatImage]:
     """Filtered images without holes, and the weight of each pixel, 0 where it or its neighbourhood is invalid."""
-    valid = np.isfinite(images)
-    if weights is not None:
-        valid &= weights > 0
-    ready = np.stack([apply_prefilter(fill_holes(image, np.isfinite(image)), prefilter) for image in images])
-    usable = np.stack([usable_pixels(known, prefilter) for known in valid]).astype(np.float32)
-    return ready, usable if weights is None else usable * weights
+    ready, usable = np.empty_like(images), np.empty_like(images)
+    for light, image in enumerate(images):
+        known = np.isfinite(image)
+        ready[light] = apply_prefilter(fill_holes(image, known), prefilter)
+        if weights is not None:
+            known &= weights[light] > 0
+        usable[light] = usable_pixels(known, prefilter)
+    return ready, usable if weights is None else np.multiply(usable, weights, out=usable)
 
 
 def _partial_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.correlation import element_moments, element_vector
+from rgbmidic._kernels.correlation import element_vector
 from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.correlation.images import usable_reach
 from rgbmidic.correlation.matching import correlation
@@ -118,13 +118,9 @@ class Renewal:
         NaN where a node has no displacement, and where no light sees the element in both images.
         """
         residual, known = _residual(self.reference, deformed, solution.displacement - self.displacement)
-        best, moments = np.full(known.size, -np.inf), np.zeros((known.size, 6))
-        for value, warped, weight in zip(residual.values, residual.warped, residual.weights, strict=True):
-            element_moments(value, warped, weight, self.reference.pixels.offsets, moments)
-            total, f, g, f2, product, g2 = moments.T
-            some = np.maximum(total, 1e-30)
-            own = correlation(product - f * g / some, f2 - f * f / some, g2 - g * g / some)
-            best = np.where(total > 0, np.maximum(best, own), best)
+        lights = zip(*residual.centred_products(), strict=True)
+        own = np.array([correlation(fg, ff, gg) for fg, ff, gg in lights])
+        best = np.where(residual.moments[..., 0] > 0, own, -np.inf).max(axis=0)
         return np.where(known & (best > -np.inf), best, np.nan)
 
     @staticmethod

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rgbmidic._kernels.correlation import element_squares, subtract_curvature
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.typing import FloatArray, FloatImage
 
@@ -23,36 +24,62 @@ class Residual:
         The reference state.
     values : ndarray, shape (k, P), float32
         Grey levels f of the reference, corrected for brightness.
-    warped : ndarray, shape (k, P), float32
-        Grey levels g(x + u); NaN outside the image.
     weights : ndarray, shape (k, P), float32
-        Weights given, brought back by the displacement.
+        Weights given, brought back by the displacement; 0 where g is not known.
     difference : ndarray, shape (k, P), float32
         f - g(x + u); 0 where g is not known.
+    moments : ndarray, shape (k, E, 6)
+        Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
     """
 
     reference: Reference
     values: FloatImage
-    warped: FloatImage
     weights: FloatImage
-    difference: FloatImage = field(init=False)
-
-    def __post_init__(self) -> None:
-        difference = self.values - self.warped
-        difference[np.isnan(difference)] = 0
-        object.__setattr__(self, "difference", difference)
+    difference: FloatImage
+    moments: FloatArray
 
     @classmethod
     def at(
         cls, reference: Reference, deformed: Deformed, values: FloatImage, displacements: Sequence[FloatArray]
     ) -> Residual:
         """At one nodal displacement (N, 2) per light, for reference grey levels `values` (k, P)."""
-        warped, weights = np.empty_like(values), np.empty_like(values)
+        difference, weights = np.empty_like(values), np.empty_like(values)
+        moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
-            reference.bring_back(deformed, light, displacement, warped[light], weights[light])
-        return cls(reference=reference, values=values, warped=warped, weights=weights)
+            out = difference[light], weights[light], moments[light]
+            reference.bring_back(deformed, light, values[light], displacement, *out)
+        return cls(reference=reference, values=values, weights=weights, difference=difference, moments=moments)
 
-    def without(self, deviation: FloatImage) -> Residual:
-        """The same, less what a displacement known to be missing (2, P), in px, leaves in it."""
-        x, y = self.reference.gradient_x * deviation[0], self.reference.gradient_y * deviation[1]
-        return replace(self, values=self.values - x - y)
+    @property
+    def warped(self) -> FloatImage:
+        """Grey levels g(x + u), (k, P); those of f where it is not known."""
+        return self.values - self.difference
+
+    def squares(self, weights: FloatImage) -> FloatArray:
+        """Sums over each element of w r^2, of w and of the pixels with weight, for the solve's `weights` (k, P);
+        shape (k, E, 3)."""
+        out = np.empty((len(weights), len(self.reference.mesh.elements), 3))
+        element_squares(self.difference, weights, self.reference.pixels.offsets, out)
+        return out
+
+    def centred_products(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Sums f g, f f and g g over each element, of what each light's f and g are beyond their means in it, (k, E)."""
+        total, f, g, ff, fg, gg = np.moveaxis(self.moments, -1, 0)
+        total = np.maximum(total, 1e-30)
+        return fg - f * g / total, ff - f * f / total, gg - g * g / total
+
+    def without(self, carried: FloatArray, curvature: FloatArray) -> Residual:
+        """The same, less what a curved field has over its own linear fit.
+
+        Parameters
+        ----------
+        carried : ndarray, shape (N, 2)
+            What the fit has at the nodes beyond the field, px.
+        curvature : ndarray, shape (N, 2, 3)
+            Second derivatives xx, xy, yy of the field at the nodes, 1/px.
+        """
+        known, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
+        images = self.difference, known.gradient_x, known.gradient_y
+        field = known.material.nodes, known.material.elements, carried, curvature
+        subtract_curvature(*images, *field, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, out)
+        return replace(self, difference=out)

@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.equations import Equations, rigid_functions
 from rgbmidic.correlation.iteration import Estimate, Problem, UnsolvableError, compare, iterate
 from rgbmidic.correlation.matching import misfit
@@ -90,7 +91,8 @@ def solve(
         functions=rigid_functions(reference.mesh.nodes, options.rigid),
     )
     try:
-        return _conclude(problem, *_passes(problem, Estimate.start(problem, initial)))
+        with one_blas_thread():
+            return _conclude(problem, *_passes(problem, Estimate.start(problem, initial)))
     except UnsolvableError as error:
         return Solution.failed(reference.mesh, len(reference.images), str(error), error.history)
 
@@ -123,10 +125,10 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
     UnsolvableError
         Nothing is left to be measured.
     """
-    weights = weighting.weights
-    if not weights.any():
+    seen = weighting.seen
+    if not seen.any():
         raise UnsolvableError(_nothing_left(weighting), estimate)
-    if problem.functions.shape[1] and not weights[0].any():
+    if problem.functions.shape[1] and not seen[0]:
         raise UnsolvableError(
             "the first light sees nothing, and the rigid motions of the others are counted from it: "
             "put a light first that sees, or measure without rigid motions",
@@ -134,7 +136,9 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
         )
     given = None if weighting.precision is None else weighting.given
     try:
-        equations = Equations.build(problem.reference, weights, problem.functions, estimate.displacement, given)
+        equations = Equations.build(
+            problem.reference, weighting.weights, problem.functions, estimate.displacement, given
+        )
     except RuntimeError as error:  # what SuperLU raises on a matrix that is singular in double precision
         raise UnsolvableError(f"the equations cannot be solved: {error}", estimate) from None
     if not equations.textured.any():
@@ -159,14 +163,14 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
     recovery = Recovery.over(reference.material, used, equations.information(reference), reference.linear_offset)
     fitted = estimate.displacement
-    deviation = recovery.deviation(reference.material, reference.pixels, fitted, reference.linear_offset)
-    residual = weighting.residual.without(deviation)
+    residual = weighting.residual.without(*recovery.bend(fitted, reference.linear_offset))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
-    node_status, misfits = _judged(estimate, equations, weighting, mismatched, std)
+    squares = weighting.residual.squares(equations.weights)
+    misfits = misfit(mesh, squares, equations.textured)
+    node_status = _judged(estimate, equations, weighting, mismatched, std, misfits)
     measured = node_status == NodeStatus.MEASURED
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rms = np.sqrt(estimate.squares[:, 0] / estimate.squares[:, 1])
+    square, total, _ = squares.sum(axis=1).T
     history = estimate.history(measured)
     converged = bool(history[-1] <= options.tolerance)
     return Solution(
@@ -182,23 +186,27 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
         reason="" if converged else f"the last iteration still moved a node by {history[-1]:.3g} px",
         rigid=estimate.rigid,
-        residual=rms,
+        residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
         weight_share=_shares(equations.weights),
         history=history,
     )
 
 
 def _judged(
-    estimate: Estimate, equations: Equations, weighting: Weighting, mismatched: BoolArray, std: FloatArray
-) -> tuple[npt.NDArray[np.uint8], FloatArray]:
-    """Status and misfit of every node (N,).
+    estimate: Estimate,
+    equations: Equations,
+    weighting: Weighting,
+    mismatched: BoolArray,
+    std: FloatArray,
+    misfits: FloatArray,
+) -> npt.NDArray[np.uint8]:
+    """Status of every node (N,).
 
     Raises
     ------
     UnsolvableError
         No node is measured.
     """
-    misfits = misfit(weighting.residual, equations.weights, equations.textured)
     evidence = Evidence(
         textured=equations.textured,
         one_sided=one_sided_texture(equations, weighting.residual),
@@ -214,10 +222,11 @@ def _judged(
             "the texture runs in one direction only: what lies along it cannot be measured" if one_sided else NO_MATCH,
             estimate,
         )
-    return node_status, misfits
+    return node_status
 
 
 def _shares(weights: FloatImage) -> FloatArray:
-    """Mean share (k,) of each light in the sum of the weights (k, P)."""
-    total = weights.sum(axis=0)
-    return np.asarray((weights / np.where(total > 0, total, np.float32(1))).mean(axis=1, dtype=np.float64))
+    """Mean share (k,) of each light in the sum of the weights (k, P), over about 100 000 pixels."""
+    some = weights[:, :: max(1, weights.shape[1] // 100_000)]
+    total = some.sum(axis=0)
+    return np.asarray((some / np.where(total > 0, total, np.float32(1))).mean(axis=1, dtype=np.float64))

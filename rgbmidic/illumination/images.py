@@ -55,7 +55,7 @@ class IlluminationImages:
         valid = np.asarray(self.valid, dtype=bool) & np.isfinite(values)
         if len(self.names) != len(values):
             raise InputError(f"{len(values)} illumination images cannot carry the {len(self.names)} names {self.names}")
-        object.__setattr__(self, "values", np.where(valid, values, np.float32(np.nan)))
+        object.__setattr__(self, "values", values if valid.all() else np.where(valid, values, np.float32(np.nan)))
         object.__setattr__(self, "valid", valid)
 
     @classmethod

@@ -45,10 +45,11 @@ def normalise(images: FloatImage, sigma: float, full_scale: float) -> FloatImage
     out = np.empty_like(images)
     for image, normalised in zip(images, out, strict=True):
         mean = local_mean(image, sigma)
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            np.divide(image, mean, out=normalised)
             seen = mean > DARK * full_scale
-        np.divide(image, mean, out=normalised, where=seen)
-        normalised[~seen] = np.nan
+        if not seen.all():
+            normalised[~seen] = np.nan
     return out
 
 
@@ -67,7 +68,8 @@ def _blur(image: FloatImage, sigma: float) -> FloatImage:
     if sigma < _WIDE:
         return _gaussian(image, sigma)
     height, width = image.shape
-    even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    odd = height % 2, width % 2
+    even = cv2.copyMakeBorder(image, 0, odd[0], 0, odd[1], cv2.BORDER_REPLICATE) if any(odd) else image
     half = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
     blurred = _gaussian(np.asarray(half), np.sqrt(sigma**2 - _RESIZED) / 2)
     return np.asarray(cv2.resize(blurred, even.shape[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width])

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.grid import block_index, from_image, to_image
+from rgbmidic._kernels.grid import block_sums, from_grid, from_image, to_image
 from rgbmidic._kernels.mesh import claim_pixels, list_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
@@ -46,6 +45,10 @@ class PixelMap:
         Element e owns the runs ``run_offsets[e]:run_offsets[e + 1]``.
     bounds : tuple of int
         First row, first column, height and width of the smallest rectangle around the owned pixels.
+    lines : ndarray, shape (R, 4), int32
+        First slot, number of pixels, row and column in `bounds` of every run, in the order of rows and columns.
+    line_offsets : ndarray, shape (height + 1,), int64
+        Row r of `bounds` has the lines ``line_offsets[r]:line_offsets[r + 1]``.
     """
 
     rows: npt.NDArray[np.int32]
@@ -59,6 +62,8 @@ class PixelMap:
     runs: npt.NDArray[np.int32] = field(init=False)
     run_offsets: npt.NDArray[np.int64] = field(init=False)
     bounds: tuple[int, int, int, int] = field(init=False)
+    lines: npt.NDArray[np.int32] = field(init=False)
+    line_offsets: npt.NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
         top, left = int(self.rows.min()), int(self.columns.min())
@@ -69,6 +74,10 @@ class PixelMap:
         runs = np.stack([first, length, self.local_x[first], self.local_y[first]], axis=1).astype(np.int32)
         object.__setattr__(self, "runs", runs)
         object.__setattr__(self, "run_offsets", np.searchsorted(first, self.offsets).astype(np.int64))
+        lines = np.stack([first, length, self.rows[first] - top, self.columns[first] - left], axis=1)
+        lines = lines[np.lexsort((lines[:, 3], lines[:, 2]))].astype(np.int32)
+        object.__setattr__(self, "lines", lines)
+        object.__setattr__(self, "line_offsets", np.searchsorted(lines[:, 2], np.arange(size[0] + 1)))
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
@@ -118,55 +127,45 @@ class PixelMap:
         sums[filled] = np.add.reduceat(values, self.offsets[:-1][filled], dtype=np.float64)
         return sums
 
-    def blocks(self, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
-        """Number of the block of `side` px in which each owned pixel lies (P,), and the grid of blocks (rows,
-        columns) over `bounds`."""
-        return _blocks(self, side)
+    def grid(self, side: int) -> tuple[int, int]:
+        """Rows and columns of the blocks of `side` px that cover `bounds`."""
+        _, _, height, width = self.bounds
+        return -(-height // side), -(-width // side)
+
+    def blocks(self, side: int) -> npt.NDArray[np.int32]:
+        """Number of the block of `side` px in which each owned pixel lies (P,), row after row of that grid."""
+        top, left, _, _ = self.bounds
+        return (self.rows - top) // side * self.grid(side)[1] + (self.columns - left) // side
+
+    def block_sums(self, values: FloatImage, side: int) -> FloatImage:
+        """Sums of `values` (n, P) over such blocks, shape (n, rows, columns)."""
+        out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
+        block_sums(values, self.lines, self.line_offsets, side, out)
+        return out
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
-        size = grids.shape[2] * side, grids.shape[1] * side
         out = np.empty((len(grids), self.rows.size), dtype=np.float32)
-        for grid, values in zip(grids.astype(np.float32), out, strict=True):
-            values[:] = self.from_window(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR)[None])[0]
+        from_grid(self.lines, np.ascontiguousarray(grids, dtype=np.float32), side, out)
         return out
 
-    def window(self, values: FloatImage, side: int = 1) -> FloatImage:
-        """`values` (n, P) as images of the rectangle `bounds`, grown to whole blocks of `side` px on the right and
-        below; 0 where no pixel is owned."""
-        top, left, height, width = self.bounds
-        images = np.zeros((len(values), -(-height // side) * side, -(-width // side) * side), dtype=np.float32)
-        to_image(self.runs, self.rows, self.columns, top, left, values, images)
+    def window(self, values: FloatImage) -> FloatImage:
+        """`values` (n, P) as images of the rectangle `bounds`; 0 where no pixel is owned."""
+        images = np.zeros((len(values), *self.bounds[2:]), dtype=np.float32)
+        to_image(self.lines, values, images)
         return images
 
     def from_window(self, images: FloatImage) -> FloatImage:
         """Such images (n, h, w) at the owned pixels (n, P)."""
-        top, left, _, _ = self.bounds
         out = np.empty((len(images), self.rows.size), dtype=np.float32)
-        from_image(self.runs, self.rows, self.columns, top, left, images, out)
+        from_image(self.lines, images, out)
         return out
-
-    def block_means(self, values: FloatImage, side: int) -> FloatImage:
-        """Sums of `values` (P,) over such blocks, over the pixels of a block, shape (rows, columns)."""
-        image = self.window(values[None], side)[0]
-        size = image.shape[1] // side, image.shape[0] // side
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
         """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""
         image = np.full(self.shape, fill, dtype=np.float32)
         image[self.rows, self.columns] = values
         return image
-
-
-@lru_cache(maxsize=2)
-def _blocks(pixels: PixelMap, side: int) -> tuple[npt.NDArray[np.int32], tuple[int, int]]:
-    """Kept for the two sides that every frame of a test needs."""
-    top, left, height, width = pixels.bounds
-    grid = -(-height // side), -(-width // side)
-    index = np.empty(pixels.rows.size, dtype=np.int32)
-    block_index(pixels.rows, pixels.columns, top, left, side, grid[1], index)
-    return index, grid
 
 
 def _run_starts(

@@ -56,25 +56,21 @@ def quadratic_fit(
     offset : ndarray, shape (N, 3), optional
         What the given values have beyond a field whose second derivative xx, xy or yy is 1, square px; 0 without.
     """
-    share, node, other, start = _window(mesh, used.tobytes())
-    basis = _basis(mesh, node, other, offset)
-    square = _WIDTH**2 / share[node]  # at an edge the window holds as much of the mesh as inside
-    weight = np.exp(-(basis[1] ** 2 + basis[2] ** 2) / (2 * square))
+    other, known, weight = _window(mesh, used.tobytes())
+    basis = _basis(mesh, used.tobytes(), None if offset is None else offset.tobytes())
     if information is not None:
-        own, theirs = information[node], information[other]
-        weight *= np.divide(theirs, own + theirs, out=np.full_like(own, 0.5), where=own + theirs > 0)
-    weighted = weight * basis
-    normal = np.empty((len(start), 6, 6))
-    for i in range(6):
-        for j in range(i + 1):
-            normal[:, i, j] = normal[:, j, i] = np.add.reduceat(weighted[i] * basis[j], start)
+        own, theirs = np.broadcast_to(information[:, None], other.shape), information[other]
+        weight = weight * np.divide(theirs, own + theirs, out=np.full(other.shape, 0.5), where=own + theirs > 0)
+    weighted = weight[:, None] * basis
+    normal = weighted @ basis.transpose(0, 2, 1)
     normal[:, range(1, 6), range(1, 6)] += _RIDGE
-    inverse = np.linalg.inv(normal)
-    operators = []
-    for term, power in enumerate((0, 1, 1, 2, 2, 2)):
-        values = sum(weighted[i] * inverse[:, term, i][node] for i in range(6)) / mesh.size**power
-        operators.append(sp.csr_matrix((values, other, np.append(start, other.size)), shape=(len(start),) * 2))
-    return tuple(operators)
+    fits = np.linalg.inv(normal) @ weighted
+    structure = other[known], np.concatenate([[0], np.cumsum(known.sum(axis=1))])
+    count = len(mesh.nodes)
+    return tuple(
+        sp.csr_matrix((fits[:, term][known] / mesh.size**power, *structure), shape=(count, count))
+        for term, power in enumerate((0, 1, 1, 2, 2, 2))
+    )
 
 
 def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray]) -> FloatImage:
@@ -97,11 +93,19 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
 
 
 @lru_cache(maxsize=1)
-def _window(mesh: Tri3Mesh, used: bytes) -> tuple[FloatArray, Index, Index, Index]:
-    """The share of the full angle around each node, and the pairs of nodes: kept, for most frames use all elements."""
+def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, BoolArray, FloatArray]:
+    """The nodes around each, itself where a row has fewer, which are no such filling, and their weights; (N, W). Kept,
+    for most frames use all elements."""
     elements = np.frombuffer(used, dtype=bool)
     share = _surrounded(mesh, elements)
-    return share, *_pairs(mesh, elements, share)
+    reach = _reached(mesh, elements, share)
+    number = np.diff(reach.indptr)
+    known = np.arange(number.max()) < number[:, None]
+    other = np.repeat(np.arange(number.size)[:, None], known.shape[1], axis=1)
+    other[known] = reach.indices
+    square = ((mesh.nodes[other] - mesh.nodes[:, None]) ** 2).sum(axis=2) / mesh.size**2
+    # at an edge the window holds as much of the mesh as inside
+    return other, known, np.where(known, np.exp(-square * share[:, None] / (2 * _WIDTH**2)), 0.0)
 
 
 def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
@@ -114,24 +118,24 @@ def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
     return np.asarray(np.where(share > 0, share, 1.0))
 
 
-def _basis(mesh: Tri3Mesh, node: Index, other: Index, offset: FloatArray | None) -> FloatArray:
-    """The polynomials 1, x, y, xx/2, xy, yy/2 about each node at the others, in sides of an element: (6, pairs)."""
-    x, y = (mesh.nodes[other] - mesh.nodes[node]).T / mesh.size
-    basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
+@lru_cache(maxsize=1)
+def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
+    """The polynomials 1, x, y, xx/2, xy, yy/2 about each node at those around, in sides of an element: (N, 6, W)."""
+    other = _window(mesh, used)[0]
+    x, y = np.moveaxis(mesh.nodes[other] - mesh.nodes[:, None], 2, 0) / mesh.size
+    basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)
     if offset is not None:
-        basis[3:] += offset[other].T / mesh.size**2
+        basis[:, 3:] += np.frombuffer(offset).reshape(-1, 3)[other].transpose(0, 2, 1) / mesh.size**2
     return basis
 
 
-def _pairs(mesh: Tri3Mesh, used: BoolArray, share: FloatArray) -> tuple[Index, Index, Index]:
-    """Pairs (node, other) of nodes at most two edges of `used` elements apart, each node with itself, in the order of
-    the first; and where each node's pairs start. No way leads round the tip of a crack to its other side."""
+def _reached(mesh: Tri3Mesh, used: BoolArray, share: FloatArray) -> sp.csr_matrix:
+    """The nodes at most two edges of `used` elements away from each, itself with them, as the entries of its row. No
+    way leads round the tip of a crack to its other side."""
     count = len(mesh.nodes)
     corners = mesh.elements[used]
     rows, columns = np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel()
     beside = sp.csr_matrix((np.ones(rows.size, dtype=np.int32), (rows, columns)), shape=(count, count))
     beside = beside + sp.eye(count, dtype=np.int32, format="csr")
     through = beside.multiply(~(mesh.on_boundary & (share > _TIP))[:, None])
-    reach = sp.csr_matrix(beside + beside @ through)
-    start, other = (np.asarray(part, dtype=np.intp) for part in (reach.indptr, reach.indices))
-    return np.repeat(np.arange(count), np.diff(start)), other, start[:-1]
+    return sp.csr_matrix(beside + beside @ through)

@@ -22,7 +22,7 @@ def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | Non
     Displacement is told at the textured nodes, strain where all nodes around are textured, too.
     """
     reference, textured = residual.reference, equations.textured
-    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights))
+    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
     if recovery is None:
         asked = [(displacement_functionals(len(textured)), textured)]
     else:

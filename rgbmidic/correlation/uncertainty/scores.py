@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.grid import block_sums, score_sums
+from rgbmidic._kernels.grid import score_sums
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.blocks import BLOCK, block_side
@@ -34,26 +34,24 @@ _PRIOR = 0.1
 def displacing_share(reference: Reference, difference: FloatImage, used: BoolArray, variance: FloatImage) -> FloatImage:
     """Variance of the scores of a residual `difference` (P,) over what white noise of that `variance` (P,) would give:
     with the gradient of that of the lights, where `used` (k, P), that gives most; (P,)."""
-    most = np.full(variance.size, _LEAST_RATIO, dtype=np.float32)
+    inverse, ratios = 1 / variance, []
     for light, own in enumerate(used):
-        weight = np.divide(own, variance, dtype=np.float32)
-        x, y, part, count = _score_sums(reference, difference[None], weight[None], BLOCK, light)[0]
-        ratios = _score_ratios(x, y, part, count, BLOCK)
-        np.maximum(most, reference.pixels.from_blocks((ratios[0] + ratios[2])[None], BLOCK)[0], out=most)
-    return most
+        x, y, part, count = _score_sums(reference, difference[None], (inverse * own)[None], BLOCK, light)[0]
+        xx, _, yy = _score_ratios(x, y, part, count, BLOCK)
+        ratios.append(xx + yy)
+    most = np.maximum(np.max(ratios, axis=0), _LEAST_RATIO)
+    return np.asarray(reference.pixels.from_blocks(most[None], BLOCK)[0])
 
 
-def score_covariance(residual: Residual, weights: FloatImage) -> FloatArray:
-    """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P)."""
+def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArray) -> FloatArray:
+    """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P), and with
+    its Hessian's element blocks `texture` (E, 3, 3, 3)."""
     reference = residual.reference
-    used = np.asarray(weights.any(axis=0), dtype=np.float32)
+    used = np.asarray(weights.max(axis=0) > 0, dtype=np.float32)
     side = block_side(reference.pixels, reference.mesh.size)
     x, y, information, _ = _score_sums(reference, residual.difference, weights, side).sum(axis=0)
-    index, shape = reference.pixels.blocks(side)
-    count = np.zeros((1, information.size), dtype=np.float32)
-    block_sums(used[None], index, count)
-    ratios = _score_ratios(x, y, information, count.reshape(shape).astype(np.float64), side)
-    texture = np.sum([reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)], axis=0)
+    count = reference.pixels.block_sums(used[None], side)[0]
+    ratios = _score_ratios(x, y, information, count.astype(np.float64), side)
     along_x, _, along_y = _per_element(reference, ratios, side) / reference.unfitted
     share = _share_along_x(reference, texture)
     along_x, along_y = along_x / share, along_y / (1 - share)
@@ -75,11 +73,11 @@ def _score_sums(
 ) -> FloatArray:
     """Sums (n, 4, rows, columns) over blocks of the scores in x and y of n lights from the `first`, their information,
     and pixels."""
-    index, shape = reference.pixels.blocks(side)
-    sums = np.zeros((len(weights), 4, shape[0] * shape[1]))
+    pixels, sums = reference.pixels, np.empty((len(weights), 4, *reference.pixels.grid(side)))
     lights = slice(first, first + len(weights))
-    score_sums(difference, weights, reference.gradient_x[lights], reference.gradient_y[lights], index, sums)
-    return sums.reshape(len(weights), 4, *shape)
+    gradient = reference.gradient_x[lights], reference.gradient_y[lights]
+    score_sums(difference, weights, *gradient, pixels.lines, pixels.line_offsets, side, sums)
+    return sums
 
 
 def _score_ratios(x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray, side: int) -> FloatArray:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.special import erf
 
-from rgbmidic._kernels.render import filter_columns, trace_rows
+from rgbmidic._kernels.render import trace_rows
 from rgbmidic.scene.in_plane import AffineField, InPlaneField, material_from_spatial
 from rgbmidic.scene.light import NOMINAL_DISTANCE, Light
 from rgbmidic.scene.projection import intersect, truth
@@ -112,9 +112,8 @@ def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> Fl
             rows, first, taps, pad, lens, frame, body, identity if affine is None else affine, material, positions,
             *scene.surface.parameters(),
         )  # fmt: skip
-        band = np.empty((len(lights), bottom - top, width), dtype=np.float32)
-        filter_columns(band, rows.reshape(len(lights), -1, width), n, taps)
-        out[:, top:bottom] = band
+        lines = rows.reshape(len(lights), -1, width)
+        out[:, top:bottom] = sum(tap * lines[:, q : q + (bottom - top) * n : n] for q, tap in enumerate(taps))
     return out
 
 
@@ -133,7 +132,7 @@ def _aperture(blur: float, samples: int) -> tuple[int, FloatArray]:
     else:
         scale = 1 / (math.sqrt(2) * blur)
         weights = erf((offset + 0.5) * scale) - erf((offset - 0.5) * scale)
-    return pad, weights / weights.sum()
+    return pad, (weights / weights.sum()).astype(np.float32)
 
 
 def _subpixel_material(scene: Scene, state: State, light: Light, first: int, rows: int, pad: int) -> FloatArray:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rgbmidic._kernels.grid import block_sums, score_sums
+from rgbmidic._kernels.grid import product_sums, score_sums
+from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 
@@ -25,36 +26,74 @@ def expected_blocks(pixels, side):
     return (pixels.rows - top) // side, (pixels.columns - left) // side
 
 
+def expected_sums(pixels, fields, side):
+    row, column = expected_blocks(pixels, side)
+    assert pixels.grid(side) == (row.max() + 1, column.max() + 1)
+    np.testing.assert_array_equal(pixels.blocks(side), row * (column.max() + 1) + column)
+    wanted = np.zeros((len(fields), *pixels.grid(side)))
+    np.add.at(wanted, (slice(None), row, column), fields)
+    return wanted
+
+
 @pytest.mark.parametrize("side", [4, 13])
 def test_sums_over_blocks(pixels, side):
-    random = np.random.default_rng(0)
-    values = random.normal(size=(2, pixels.rows.size)).astype(np.float32)
-    index, shape = pixels.blocks(side)
-    row, column = expected_blocks(pixels, side)
-    assert shape == (row.max() + 1, column.max() + 1)
-    wanted = np.zeros((2, *shape))
-    np.add.at(wanted, (slice(None), row, column), values)
-    out = np.zeros((2, shape[0] * shape[1]))
-    block_sums(values, index, out)
-    np.testing.assert_allclose(out.reshape(wanted.shape), wanted, atol=1e-4)
+    values = np.random.default_rng(0).normal(size=(2, pixels.rows.size)).astype(np.float32)
+    np.testing.assert_allclose(pixels.block_sums(values, side), expected_sums(pixels, values, side), atol=1e-4)
+
+
+def test_sums_of_products_of_two_fields(pixels):
+    random = np.random.default_rng(2)
+    a, b = values = random.normal(size=(2, pixels.rows.size)).astype(np.float32)
+    v, w = weights = np.maximum(random.normal(size=values.shape), 0).astype(np.float32)
+    out = np.zeros((2, 2, 2, *pixels.grid(4)), dtype=np.float32)
+    product_sums(values, weights, pixels.lines, pixels.line_offsets, 4, out)
+    shared = np.sqrt(v * w)
+    fields = np.stack([v * a * a, v, shared * a * b, shared, w * b * b, w])
+    wanted = expected_sums(pixels, fields, 4).reshape(3, 2, *pixels.grid(4))
+    np.testing.assert_allclose(np.stack([out[0, 0], out[1, 0], out[1, 1]]), wanted, atol=1e-4)
 
 
 def test_sums_of_scores(pixels):
     random = np.random.default_rng(1)
     residual, gx, gy = random.normal(size=(3, 3, pixels.rows.size)).astype(np.float32)
     weight = np.maximum(random.normal(size=residual.shape), 0).astype(np.float32)
-    index, shape = pixels.blocks(9)
-    out = np.zeros((3, 4, shape[0] * shape[1]))
-    score_sums(residual, weight, gx, gy, index, out)
+    out = np.zeros((3, 4, *pixels.grid(9)))
+    score_sums(residual, weight, gx, gy, pixels.lines, pixels.line_offsets, 9, out)
     fields = np.stack([weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2), weight > 0], axis=1)
-    wanted = np.zeros_like(out)
-    np.add.at(wanted, (slice(None), slice(None), index), fields)
-    np.testing.assert_allclose(out, wanted, atol=1e-3)
+    wanted = expected_sums(pixels, fields.reshape(12, -1), 9)
+    np.testing.assert_allclose(out, wanted.reshape(out.shape), atol=1e-3)
 
 
-def test_a_grid_of_blocks_is_interpolated_between_their_centres(pixels):
-    side = 6
-    _, shape = pixels.blocks(side)
+def test_the_same_bits_on_one_and_three_threads(pixels):
+    values = np.random.default_rng(3).uniform(size=(2, pixels.rows.size)).astype(np.float32)
+
+    def found(number):
+        set_threads(number)
+        sums, scores = np.zeros((2, 2, 2, *pixels.grid(4)), np.float32), np.zeros((2, 4, *pixels.grid(9)))
+        product_sums(values, values, pixels.lines, pixels.line_offsets, 4, sums)
+        score_sums(values, values, values, values, pixels.lines, pixels.line_offsets, 9, scores)
+        blocks = pixels.block_sums(values, 5)
+        return sums, scores, blocks, pixels.from_blocks(blocks, 5), pixels.window(values)
+
+    before = threads()
+    try:
+        for one, three in zip(found(1), found(3), strict=True):
+            np.testing.assert_array_equal(one, three)
+    finally:
+        set_threads(before)
+
+
+def test_the_image_of_a_field_comes_back(pixels):
+    values = np.random.default_rng(4).normal(size=(2, pixels.rows.size)).astype(np.float32)
+    top, left, _, _ = pixels.bounds
+    image = pixels.window(values)
+    np.testing.assert_array_equal(image[:, pixels.rows - top, pixels.columns - left], values)
+    np.testing.assert_array_equal(pixels.from_window(image), values)
+
+
+@pytest.mark.parametrize("side", [6, 13])
+def test_a_grid_of_blocks_is_interpolated_between_their_centres(pixels, side):
+    shape = pixels.grid(side)
     top, left, _, _ = pixels.bounds
     y, x = (side * (np.arange(n) + 0.5) - 0.5 for n in shape)
     plane = (3 + 0.2 * y[:, None] - 0.1 * x).astype(np.float32)
