@@ -20,8 +20,8 @@ _NOT_YET = -1
 _DAMAGED = 3
 """Status of a frame whose record cannot be read."""
 _FAULTS = {1: "#e69f00", 2: "#d1495b", _DAMAGED: "#d1495b"}
-NOW = {"dimension": "height", "line_color": "#8e5bd0", "line_width": 2}
-"""How the frame in view is marked."""
+NOW = {"dimension": "height", "level": "overlay", "line_color": "#8e5bd0", "line_width": 2}
+"""How the frame in view is marked: over all else, which is not painted again when it moves."""
 
 
 class Course:
