@@ -63,7 +63,7 @@ class Residual:
         return out
 
     def centred_products(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Sums f g, f f and g g over each element, of what each light's f and g are beyond their means in it, (k, E)."""
+        """Sums f g, f f and g g over each element, of what f and g are beyond their means in it, (k, E)."""
         total, f, g, ff, fg, gg = np.moveaxis(self.moments, -1, 0)
         total = np.maximum(total, 1e-30)
         return fg - f * g / total, ff - f * f / total, gg - g * g / total
