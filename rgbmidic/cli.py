@@ -238,6 +238,22 @@ def report(
 
 
 @app.command()
+def view(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="Result folder, also one that still grows; a TEST.toml; raw frames.")
+    ],
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
+) -> None:
+    """Look at a result, or set a test up, in the browser: the address is printed, only this machine is served.
+
+    Ctrl-C ends it.
+    """
+    serve = command.optional("rgbmidic.view", "view").serve
+    serve(path, port=port, browser=browser, tell=lambda address: print(address, flush=True))
+
+
+@app.command()
 def history(
     folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],

@@ -6,14 +6,15 @@ import logging
 import re
 import sys
 import traceback
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from rgbmidic.errors import InputError, RgbmidicError
 
 if TYPE_CHECKING:
     import typer
 
-__all__ = ["FAILURE", "execute", "fail", "help_where_alone", "main", "read_place", "read_shape"]
+__all__ = ["FAILURE", "execute", "fail", "help_where_alone", "main", "optional", "read_place", "read_shape"]
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 
@@ -65,6 +66,22 @@ def help_where_alone(context: typer.Context) -> None:
     """Print the help of a group of commands where none of them is named."""
     if context.invoked_subcommand is None:
         print(context.get_help())
+
+
+def optional(module: str, extra: str) -> Any:
+    """A module that needs packages of an extra.
+
+    Raises
+    ------
+    InputError
+        They are not installed.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("rgbmidic"):
+            raise
+        raise InputError(f'this command needs {error.name}: pip install "rgbmidic[{extra}]"') from None
 
 
 def read_place(text: str, option: str, form: str) -> tuple[float, ...]:

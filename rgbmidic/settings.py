@@ -149,7 +149,7 @@ class IlluminationSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegionSettings:
-    """The region of interest (``[region]``): exactly one of the three.
+    """The region of interest (``[region]``): exactly one of rectangle, polygon and mask, without the holes.
 
     Attributes
     ----------
@@ -159,15 +159,18 @@ class RegionSettings:
         Corners (x, y) in px.
     mask
         Image file; non-zero pixels belong to the region.
+    holes
+        Polygons, each of corners (x, y) in px, whose pixels do not belong to it.
     """
 
     rectangle: tuple[float, float, float, float] | None = None
     polygon: tuple[tuple[float, float], ...] | None = None
     mask: Path | None = None
+    holes: tuple[tuple[tuple[float, float], ...], ...] = ()
 
     def __post_init__(self) -> None:
         _check_bounds(self, "region")
-        kinds = [entry.name for entry in fields(self)]
+        kinds = ["rectangle", "polygon", "mask"]
         if (stated := sum(getattr(self, kind) is not None for kind in kinds)) != 1:
             raise ConfigurationError(f"[region] needs exactly one of {', '.join(kinds)}; given are {stated}")
         if self.rectangle is not None and not (
@@ -178,6 +181,9 @@ class RegionSettings:
             )
         if self.polygon is not None and len(self.polygon) < 3:
             raise ConfigurationError(f"region.polygon needs at least three corners [x, y], not {len(self.polygon)}")
+        for number, hole in enumerate(self.holes):
+            if len(hole) < 3:
+                raise ConfigurationError(f"region.holes[{number}] needs at least three corners [x, y], not {len(hole)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,20 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import QUANTITIES, FrameRecord, Origin, Result, ResultStore
 from rgbmidic.timing import STAGES
 
-__all__ = ["LIGHTS", "MESH", "NODES", "make_origin", "make_result", "random_record"]
+__all__ = ["LIGHTS", "MESH", "NODES", "make_origin", "make_result", "random_record", "smooth_record"]
 
 LIGHTS = ("red", "green", "blue")
 MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 5, 110, 75), (80, 120)), 20)
 NODES = len(MESH.nodes)
+
+
+def smooth_record(index: int) -> FrameRecord:
+    """A field that every probe can read, of a stretch that grows with the frames."""
+    x, y = MESH.nodes.T
+    u, v = 0.002 * index * (x - 60), 0.001 * index * (y - 40)
+    both = {"u": u, "v": v, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.02)}
+    more = {"exx": np.full(NODES, 0.002 * index), "misfit": np.ones(NODES), "light_share": np.full((NODES, 3), 1 / 3)}
+    return FrameRecord.of(nodes=NODES, lights=3, number=index, status=0, node_status=np.zeros(NODES), **both, **more)
 
 
 def random_record(seed: int) -> FrameRecord:
@@ -57,11 +67,18 @@ def random_record(seed: int) -> FrameRecord:
     return FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values)
 
 
-def make_result(path: Path, *, frames: int = 2, overwrite: bool = False, **options: Any) -> Result:
-    """A finished result of random records."""
+def make_result(
+    path: Path,
+    *,
+    frames: int = 2,
+    overwrite: bool = False,
+    record: Callable[[int], FrameRecord] | None = None,
+    **options: Any,
+) -> Result:
+    """A finished result, of random records unless stated."""
     store = ResultStore.create(path, make_origin(frames, **options), overwrite=overwrite)
     for index in range(frames):
-        store.write_frame(index, random_record(index))
+        store.write_frame(index, (record or random_record)(index))
     store.finish()
     return Result.open(path)
 

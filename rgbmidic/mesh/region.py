@@ -85,15 +85,26 @@ class Region:
         points = np.asarray(corners, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
             raise RegionError(f"a polygon is at least three finite corners (x, y) in px; given is {corners!r}")
-        mask = np.zeros(shape, dtype=np.uint8)
-        shift = 8  # fixed-point bits of OpenCV's coordinates
-        cv2.fillPoly(mask, [np.round(points * 2**shift).astype(np.int32)], 1, shift=shift)
+        mask = _filled(points, shape)
         if not mask.any():
             raise RegionError(
                 f"the region's polygon {points.tolist()} does not overlap the image of {shape[1]} x {shape[0]} px"
             )
         _tell_clipped("polygon", points, shape)
-        return cls(mask=mask.astype(bool))
+        return cls(mask=mask)
+
+    def without(self, holes: Sequence[npt.ArrayLike]) -> Region:
+        """The region without the pixels of some polygons, each of corners (x, y) in px, shape (M, 2).
+
+        Raises
+        ------
+        RegionError
+            Nothing is left.
+        """
+        if not len(holes):
+            return self
+        inside = [_filled(np.asarray(corners, dtype=np.float64), self.mask.shape) for corners in holes]
+        return Region(mask=self.mask & ~np.logical_or.reduce(inside))
 
     @classmethod
     def from_mask(cls, mask: npt.ArrayLike, shape: tuple[int, int] | None = None) -> Region:
@@ -108,6 +119,14 @@ class Region:
         if shape is not None and pixels.shape != shape:
             raise RegionError(f"the mask is {pixels.shape[::-1]} px (width, height), the images are {shape[::-1]}")
         return cls(mask=pixels != 0)
+
+
+def _filled(points: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+    """The pixels (H, W) of a polygon with corners (M, 2)."""
+    mask = np.zeros(shape, dtype=np.uint8)
+    shift = 8  # fixed-point bits of OpenCV's coordinates
+    cv2.fillPoly(mask, [np.round(points * 2**shift).astype(np.int32)], 1, shift=shift)
+    return mask.astype(bool)
 
 
 def _tell_clipped(what: str, points: FloatArray, shape: tuple[int, int]) -> None:

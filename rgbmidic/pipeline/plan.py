@@ -113,6 +113,11 @@ def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
     RegionError
         The region is empty, outside the image, or the mask image has another size.
     """
+    return _outlined(settings, shape).without(settings.holes)
+
+
+def _outlined(settings: RegionSettings, shape: tuple[int, int]) -> Region:
+    """The region, its holes included."""
     if settings.rectangle is not None:
         return Region.from_rectangle(settings.rectangle, shape)
     if settings.polygon is not None:

@@ -13,7 +13,7 @@ from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import Histories
 from rgbmidic.typing import FloatArray
 
-__all__ = ["history_rows", "write_histories"]
+__all__ = ["history_csv", "history_rows", "write_histories"]
 
 
 def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
@@ -29,7 +29,7 @@ def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
 
 
 def write_histories(histories: Histories, out: Path | str, *, overwrite: bool = False) -> None:
-    """Write histories as CSV: a header line whose names carry the units, then one row a frame; empty: no value.
+    """Write `history_csv` into a file.
 
     Raises
     ------
@@ -38,10 +38,11 @@ def write_histories(histories: Histories, out: Path | str, *, overwrite: bool = 
     """
     out = Path(out)
     check_file(out, overwrite=overwrite)
-    write_complete(out, lambda file: _write(histories, file))
+    write_complete(out, lambda file: history_csv(histories, file))
 
 
-def _write(histories: Histories, file: BinaryIO) -> None:
+def history_csv(histories: Histories, file: BinaryIO) -> None:
+    """Write histories as CSV: a header line whose names carry the units, then one row a frame; empty: no value."""
     columns: dict[str, FloatArray] = {}
     if histories.times is not None:
         columns["time_s"] = histories.times

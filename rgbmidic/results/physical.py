@@ -78,6 +78,13 @@ class Physical:
             times, units = np.arange(len(result), dtype=np.float64), replace(units, timed=False)
         return cls(result=result, scale=scale, units=units, times=times, mesh=mesh)
 
+    @classmethod
+    def untimed(cls, result: Result, scale: ScaleSettings) -> Self:
+        """Without the times, which take a look at every frame: for who reads single frames, or a result that grows."""
+        mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
+        times = np.arange(len(result), dtype=np.float64)
+        return cls(result=result, scale=scale, units=Units.of(scale, timed=False), times=times, mesh=mesh)
+
     @cached_property
     def gauges(self) -> StrainGauges:
         """Virtual strain gauges around the nodes, the shortest there are."""
@@ -121,11 +128,15 @@ class Physical:
         for component in ("u", "v"):
             pair = self.units.lengths(record.values[component], record.values[f"{component}_std"])
             values |= zip((component, f"{component}_std"), pair, strict=True)
-        strain = self.gauges.strain(record.u, record.v, record.u_std, record.v_std)
-        values |= {entry.name: _part(strain, entry) for entry in _STRAIN}
+        values |= self.strain(record.u, record.v, record.u_std, record.v_std)
         elements = self._element_strain(record)
         values |= {entry.name: _part(elements, entry) for entry in _ELEMENT_STRAIN}
         return values
+
+    def strain(self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) -> dict[str, FloatArray]:
+        """The strain at the nodes by name, from the displacements (N,) of one frame in px."""
+        strain = self.gauges.strain(u, v, u_std, v_std)
+        return {entry.name: _part(strain, entry) for entry in _STRAIN}
 
     def _element_strain(self, record: FrameRecord) -> Strain:
         """Strain of the linear field in each element, without its uncertainty."""

@@ -110,3 +110,16 @@ def test_a_mask_is_its_non_zero_pixels_and_must_have_the_images_size():
         Region.from_mask(np.zeros(SHAPE), SHAPE)
     with pytest.raises(RegionError, match=r"one \(H, W\) image"):
         Region.from_mask(np.ones((3, *SHAPE)))
+
+
+def test_holes_are_left_out_and_the_rest_stays():
+    region = Region.from_rectangle((2, 2, 30, 20), (40, 40))
+    holes = [[(5, 5), (9, 5), (9, 9), (5, 9)], [(20, 10), (24, 10), (24, 14)]]
+    left = region.without(holes)
+    assert not left.mask[5:10, 5:10].any()
+    inside = np.logical_or(*(Region.from_polygon(hole, (40, 40)).mask for hole in holes))
+    assert (left.mask == (region.mask & ~inside)).all()
+    assert left.rectangle is None
+    assert region.without([]) is region
+    with pytest.raises(RegionError, match="empty"):
+        region.without([[(0, 0), (39, 0), (39, 39), (0, 39)]])

@@ -1,0 +1,171 @@
+"""The plot that shows a window of the image: it tells when another part is in view, and takes marks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from bokeh.core.property.descriptors import UnsetValueError
+from bokeh.document import Document
+from bokeh.events import RangesUpdate
+from bokeh.models import (
+    BoxZoomTool,
+    ColorBar,
+    ColumnDataSource,
+    LinearColorMapper,
+    PanTool,
+    PointDrawTool,
+    Range1d,
+    ResetTool,
+    SaveTool,
+    WheelZoomTool,
+)
+from bokeh.plotting import figure
+
+from rgbmidic.typing import AnyArray, FloatArray
+from rgbmidic.view.address import Mark
+from rgbmidic.view.picture import Window
+
+__all__ = ["Canvas", "small"]
+
+_MARGIN = 0.06
+_BAR = 80
+"""Px of the screen for the colour bar, whose numbers change with the frame."""
+_SOON = 40
+"""Ms that a view which moves waits for its next move."""
+
+
+def small(plot: Any) -> None:
+    """Let the letters at the axes of a plot be those of the page, light or dark."""
+    for axis in plot.axis:
+        axis.update(major_label_text_font_size="12px", axis_label_text_font_size="12px")
+
+
+class Canvas:
+    """The plot, and what is drawn on it.
+
+    Parameters
+    ----------
+    document
+        Of the page.
+    kinds
+        Of the marks that can be set, a tool for each.
+    edges
+        (left, top, right, bottom) of what is in view at first, px.
+    redraw
+        Called when another part, or another size, is in view.
+
+    Attributes
+    ----------
+    plot, marks, tools
+        The plot, the marks on it, and its tools: to move it, then one for each of `kinds`.
+    window
+        What is in view.
+    wanted
+        Edges of what shall be in view, before the plot's shape adds to it.
+    """
+
+    def __init__(
+        self, document: Document, kinds: Sequence[str], edges: Sequence[float], redraw: Callable[[], None]
+    ) -> None:
+        left, top, right, bottom = self.wanted = tuple(map(float, edges))
+        self.window = Window(left=left, top=top, right=right, bottom=bottom, width=800, height=600).fitted()
+        self._document, self._redraw, self._coming = document, redraw, False
+        self.plot = figure(
+            x_range=Range1d(self.window.left, self.window.right),
+            y_range=Range1d(self.window.bottom, self.window.top),
+            title=" ",
+            sizing_mode="stretch_both",
+            min_border=4,
+            min_border_right=_BAR,
+            x_axis_label="x (px)",
+            y_axis_label="y (px)",
+            tools=[],
+            toolbar_location="above",
+        )
+        self.plot.grid.visible = False
+        self._image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")}, name="image")
+        self.plot.image_rgba("image", "x", "y", "dw", "dh", source=self._image)
+        self.colours = LinearColorMapper(palette=["#000000"], low=0, high=1, name="colours")
+        self.bar = ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
+        small(self.plot)
+        self.plot.add_layout(self.bar, "right")
+        self.marks = ColumnDataSource({"x": [], "y": [], "kind": []}, name="marks")
+        dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
+        self._dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
+        pan, wheel = PanTool(), WheelZoomTool(zoom_on_axis=False)
+        draw = [
+            PointDrawTool(renderers=[self._dots], default_overrides={"kind": kind}, visible=False) for kind in kinds
+        ]
+        self.tools = (pan, *draw)
+        self.plot.add_tools(pan, wheel, BoxZoomTool(match_aspect=True), ResetTool(), SaveTool(filename="field"), *draw)
+        self.plot.toolbar.active_drag, self.plot.toolbar.active_scroll, self.plot.toolbar.logo = pan, wheel, None
+        self.plot.on_event(RangesUpdate, self._moved)
+        for name in ("inner_width", "inner_height"):
+            self.plot.on_change(name, lambda attr, old, new: self.resize())
+
+    @staticmethod
+    def around(points: FloatArray) -> tuple[float, ...]:
+        """Edges of a view of points (N, 2) with a margin."""
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = _MARGIN * float((high - low).max())
+        return (*(low - margin).tolist(), *(high + margin).tolist())
+
+    def show(self, image: AnyArray) -> None:
+        """Show a picture of the window, (rows, columns), uint32."""
+        w = self.window
+        place = {"x": [w.left], "y": [w.top], "dw": [w.right - w.left], "dh": [w.bottom - w.top]}
+        self._image.data = {"image": [image], **place}
+
+    def colour(self, ends: tuple[float, float], colours: Sequence[str], title: str) -> None:
+        """What the colours mean."""
+        self.plot.title.text = title
+        self.colours.update(low=ends[0], high=ends[1])
+        if self.colours.palette != list(colours):  # which takes as long to check as a frame to paint
+            self.colours.palette = list(colours)
+
+    @property
+    def set(self) -> list[Mark]:
+        """The marks as they are on the plot."""
+        data = self.marks.data
+        return [Mark(str(k), float(x), float(y)) for x, y, k in zip(data["x"], data["y"], data["kind"], strict=True)]
+
+    def place(self, marks: Sequence[Mark]) -> None:
+        """Put marks on the plot."""
+        if list(marks) != self.set:
+            data = {"x": [m.x for m in marks], "y": [m.y for m in marks], "kind": [m.kind for m in marks]}
+            self.marks.data = data
+
+    def resize(self) -> None:
+        """Take the size that the browser tells."""
+        try:
+            width, height = self.plot.inner_width, self.plot.inner_height
+        except UnsetValueError:  # it has not told yet
+            return
+        if min(width, height) > 1 and (width, height) != (self.window.width, self.window.height):
+            left, top, right, bottom = self.wanted
+            edges = {"left": left, "top": top, "right": right, "bottom": bottom}
+            self._set(replace(self.window, **edges, width=width, height=height))
+
+    def _moved(self, event: Any) -> None:
+        (left, right), (top, bottom) = sorted((event.x0, event.x1)), sorted((event.y0, event.y1))
+        new = replace(self.window, left=left, top=top, right=right, bottom=bottom)
+        if not np.allclose(new.edges, self.window.edges, rtol=0, atol=1e-6 * (right - left)):
+            self.wanted = new.edges
+            self._set(new)
+
+    def _set(self, window: Window) -> None:
+        """Show another window, once for all that comes within a few ms."""
+        self.window = window.fitted()
+        if not np.allclose(self.window.edges, window.edges):
+            self.plot.x_range.update(start=self.window.left, end=self.window.right)
+            self.plot.y_range.update(start=self.window.bottom, end=self.window.top)
+        if not self._coming:
+            self._coming = True
+            self._document.add_timeout_callback(self._come, _SOON)
+
+    def _come(self) -> None:
+        self._coming = False
+        self._redraw()

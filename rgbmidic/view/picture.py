@@ -1,0 +1,200 @@
+"""What the screen shows of a field: a window of the image, its pixels, colours and the triangles over it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.picture import paint_field
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.typing import AnyArray, FloatArray
+
+__all__ = ["AROUND", "Window", "element_at", "grey_picture", "paint", "palette", "palette_name"]
+
+_LARGEST = 2_000_000
+"""Pixels of a picture that is sent to the screen: all of a window of 1920 x 1080, less than all of a larger one."""
+_COLOURS = 256
+AROUND = {False: 235, True: 30}
+"""Grey level outside the image, by whether the page is dark."""
+_PALETTES = {"displacement": "viridis", "strain": "viridis", "positive": "plasma", "share": "cividis"}
+_STATUS = ("#2c7fb8", "#bdbdbd", "#d95f0e", "#fec44f")
+"""Measured, not seen, decorrelated, filled: told apart without telling red from green."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """The part of the image that the screen shows.
+
+    Attributes
+    ----------
+    left, top, right, bottom
+        Edges in px of the image, where the centre of the first pixel is (0, 0).
+    width, height
+        Pixels of the screen.
+    """
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+    width: int
+    height: int
+
+    @property
+    def edges(self) -> tuple[float, float, float, float]:
+        """Left, top, right, bottom."""
+        return self.left, self.top, self.right, self.bottom
+
+    def fitted(self) -> Window:
+        """The same centre with as many screen pixels to a px in both directions, nothing of it cut off."""
+        step = max((self.right - self.left) / self.width, (self.bottom - self.top) / self.height)
+        x, y = (self.left + self.right) / 2, (self.top + self.bottom) / 2
+        half_x, half_y = step * self.width / 2, step * self.height / 2
+        return Window(
+            left=x - half_x,
+            top=y - half_y,
+            right=x + half_x,
+            bottom=y + half_y,
+            width=self.width,
+            height=self.height,
+        )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of the picture."""
+        shrink = max(1.0, (self.width * self.height / _LARGEST) ** 0.5)
+        return max(int(self.height / shrink), 2), max(int(self.width / shrink), 2)
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Px of the image to a pixel of the picture, along x and y."""
+        rows, columns = self.size
+        return (self.right - self.left) / columns, (self.bottom - self.top) / rows
+
+    def place(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Column and row of points (N, 2) in the picture."""
+        across, down = self.steps
+        return (points[:, 0] - self.left) / across - 0.5, (points[:, 1] - self.top) / down - 0.5
+
+
+def paint(
+    window: Window,
+    picture: AnyArray,
+    field: tuple[FloatArray, npt.NDArray[np.int32], FloatArray] | None,
+    ends: tuple[float, float],
+    colours: Sequence[str],
+    *,
+    opacity: float,
+    stepped: bool = False,
+    around: int = 40,
+) -> npt.NDArray[np.uint32]:
+    """A field over a grey picture as the window shows it.
+
+    Parameters
+    ----------
+    window
+        Part of the image and size of the screen.
+    picture : ndarray, shape (H, W), uint8
+        The image.
+    field
+        Places (N, 2) of the nodes in px, elements (E, 3), values (N,); None: the picture alone.
+    ends
+        Values of the first and the last colour.
+    colours
+        As ``"#rrggbb"``.
+    opacity
+        Of the field, from 0 to 1.
+    stepped
+        Whether values between those of two nodes mean nothing.
+    around
+        Grey level outside the image.
+
+    Returns
+    -------
+    ndarray, shape (rows, columns), uint32
+        Red, green, blue, 255, the lowest byte first; the first row is the top.
+    """
+    grey = _resampled(window, picture, around)
+    out = np.empty(grey.shape, dtype=np.uint32)
+    nodes, elements, values = field or (np.zeros((1, 2)), np.zeros((0, 3), dtype=np.int32), np.zeros(1))
+    x, y = window.place(nodes)
+    share = round(256 * (1 - opacity))
+    paint_field(out, grey, x, y, elements, values, *map(float, ends), _packed(tuple(colours), share), share, stepped)
+    return out
+
+
+def _resampled(window: Window, picture: AnyArray, around: int) -> npt.NDArray[np.uint8]:
+    """The image in the window, reduced by whole factors first, so that nothing fine turns into moiré."""
+    across, down = window.steps
+    factor = max(1, int(min(across, down)))
+    small = picture
+    if factor > 1:
+        rows, columns = (size // factor * factor for size in picture.shape)
+        small = cv2.resize(picture[:rows, :columns], (columns // factor, rows // factor), interpolation=cv2.INTER_AREA)
+    x, y = window.left + across / 2, window.top + down / 2
+    shift = (factor - 1) / 2
+    to_image = np.array(
+        [[across / factor, 0, (x - shift) / factor], [0, down / factor, (y - shift) / factor]], dtype=np.float64
+    )
+    rows, columns = window.size
+    smooth = cv2.INTER_LINEAR if min(across, down) > 0.5 else cv2.INTER_NEAREST
+    flags = smooth | cv2.WARP_INVERSE_MAP
+    out = cv2.warpAffine(small, to_image, (columns, rows), flags=flags, borderValue=float(around))
+    return np.asarray(out, dtype=np.uint8)
+
+
+@cache
+def _packed(colours: tuple[str, ...], share: int) -> npt.NDArray[np.uint32]:
+    rgb = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours], dtype=np.uint32)
+    red, green, blue = (rgb * (256 - share) >> 8).T
+    return np.asarray(red | green << 8 | blue << 16 | 0xFF000000, dtype=np.uint32)
+
+
+def palette_name(kind: str, *, symmetric: bool) -> str:
+    """Name of the colours that suit a kind of field, as matplotlib names them; all are safe for the colour-blind."""
+    if kind == "codes":
+        return kind
+    return {"angle": "twilight"}.get(kind) or ("RdBu_r" if symmetric else _PALETTES[kind])
+
+
+@cache
+def palette(name: str) -> tuple[str, ...]:
+    """The colours of a palette as ``"#rrggbb"``."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return _STATUS if name == "codes" else tuple(map(to_hex, colormaps[name](np.linspace(0, 1, _COLOURS))))
+
+
+def grey_picture(frame: Mosaic | ChannelFrame) -> npt.NDArray[np.uint8]:
+    """A raw frame as one grey picture, stretched: the mean of its channels, of the cell around each mosaic sample."""
+    if isinstance(frame, Mosaic):
+        image = cv2.blur(frame.values.astype(np.float32), (2, 2))
+    else:
+        image = frame.values.mean(axis=0, dtype=np.float32)
+    low, high = np.percentile(image[::4, ::4], [1, 99])
+    return np.asarray(np.clip(255 * (image - low) / max(high - low, 1e-6), 0, 255), dtype=np.uint8)
+
+
+def element_at(
+    nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
+) -> tuple[npt.NDArray[np.int32], FloatArray] | None:
+    """Nodes (3,) of the element that holds a point, and what each counts there; None outside."""
+    a, b, c = (nodes[elements[:, corner]] for corner in range(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        area = _cross(b - a, c - a)
+        second, third = _cross(np.array([x, y]) - a, c - a) / area, _cross(b - a, np.array([x, y]) - a) / area
+        inside = np.flatnonzero(np.minimum(np.minimum(second, third), 1 - second - third) >= -1e-9)
+    if not len(inside):
+        return None
+    e = inside[0]
+    return elements[e], np.array([1 - second[e] - third[e], second[e], third[e]])
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -1,0 +1,183 @@
+"""The server of the viewer: for this machine only, behind an address that nobody guesses, without any other file."""
+
+from __future__ import annotations
+
+import html
+import logging
+import secrets
+import webbrowser
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bokeh.application import Application
+from bokeh.application.handlers.function import FunctionHandler
+from bokeh.core.templates import get_env
+from bokeh.document import Document
+from bokeh.model import Model
+from bokeh.models import Div
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.util import bind_sockets
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop
+from tornado.web import ErrorHandler
+
+from rgbmidic.errors import InputError, ResultError, RgbmidicError
+from rgbmidic.results import Result
+from rgbmidic.results.provenance import PROVENANCE
+from rgbmidic.view.address import Look
+from rgbmidic.view.fields import Fields
+from rgbmidic.view.page import ResultPage
+from rgbmidic.view.runner import Run
+from rgbmidic.view.timeline import Course
+
+__all__ = ["serve", "start"]
+
+_HOST = "127.0.0.1"
+_FORGOTTEN = 15_000
+"""Ms after which what a closed page held is let go."""
+_THEMES = {"dark": "dark_minimal"}
+
+
+class _Application(BokehTornado):  # type: ignore[misc]  # see pyproject.toml
+    """Bokeh's server, whose pages load no more scripts than they need: a third of them."""
+
+    def resources(self, absolute_url: str | bool | None = None) -> Any:
+        return super().resources(absolute_url).clone(components=["bokeh", "bokeh-widgets"])
+
+
+def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[str], None] = print) -> None:
+    """Show a result in the browser until the process is interrupted.
+
+    Parameters
+    ----------
+    path
+        Result folder; a run may still add to it.
+    port
+        0: any that is free.
+    browser
+        Whether to open the browser.
+    tell
+        Is given the address.
+
+    Raises
+    ------
+    ResultError
+        The folder is not a result, or is damaged.
+    InputError
+        The port is in use.
+    """
+    for library in ("bokeh", "tornado"):  # what they say of a strange request is for programmers
+        logging.getLogger(library).setLevel(logging.CRITICAL)
+    server, address = start(path, port=port)
+    tell(address)
+    if browser:
+        server.io_loop.add_callback(webbrowser.open, address)
+    try:
+        server.io_loop.start()
+    finally:
+        server.stop()
+
+
+def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
+    """A server that answers once its loop runs, and its address; errors as `serve`."""
+    pages = _pages(path)
+    token = secrets.token_urlsafe(24)
+    try:
+        sockets, port = bind_sockets(_HOST, port)
+    except OSError as error:
+        raise InputError(
+            f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another --port, or none"
+        ) from None
+    application = _Application(
+        {route: Application(FunctionHandler(page)) for route, page in pages.items()},
+        prefix=f"/{token}",
+        sign_sessions=True,
+        secret_key=secrets.token_bytes(32),
+        extra_websocket_origins=[f"{_HOST}:{port}"],
+        unused_session_lifetime_milliseconds=_FORGOTTEN,
+        check_unused_sessions_milliseconds=_FORGOTTEN,
+        include_headers=[],
+        include_cookies=[],
+    )
+    application.add_handlers(".*", [(".*%00.*", ErrorHandler, {"status_code": 404})])  # no name of a file
+    http = HTTPServer(application)
+    http.add_sockets(sockets)
+    server = BaseServer(IOLoop.current(), application, http)
+    server.start()
+    return server, f"http://{_HOST}:{port}/{token}/"
+
+
+def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
+    """What is served: a result, or a test that is set up and the result of its run; bad input is told at once."""
+    courses: dict[tuple[Path, int], Course] = {}
+    if (path / PROVENANCE).exists():
+        Result.open(path, partial=True)
+        return {"/": partial(_told, partial(_fill, path, courses))}
+    from rgbmidic.view.draft import Draft
+    from rgbmidic.view.setup import SetupPage
+    from rgbmidic.view.setup_frames import Footage
+
+    Footage.of(Draft.of(path))
+    runs: list[Run] = []
+
+    def setup(document: Document) -> None:
+        theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
+        page = SetupPage(document, Draft.of(path), runs, dark=theme == "dark")
+        _place(document, page.roots, f"rgbmidic: {path.name}", theme)
+
+    def result(document: Document) -> None:
+        if not runs:
+            raise ResultError("no run was started yet")
+        _fill(runs[-1].out, courses, document)
+
+    return {"/": partial(_told, setup), "/result": partial(_told, result)}
+
+
+def _told(fill: Callable[[Document], None], document: Document) -> None:
+    """A page, or what is wrong in one line of it."""
+    try:
+        fill(document)
+    except RgbmidicError as error:
+        document.clear()
+        _place(document, {"head": Div(text=html.escape(str(error)))}, "rgbmidic", "")
+
+
+def _query(document: Document) -> dict[str, list[bytes]]:
+    context = document.session_context
+    return {} if context is None or context.request is None else context.request.arguments
+
+
+def _fill(path: Path, courses: dict[tuple[Path, int], Course], document: Document) -> None:
+    """The page of a result as it is now, looked at as the address says."""
+    result = Result.open(path, partial=True)
+    there = np.flatnonzero(result.finished)
+    last = int(there[-1]) if len(there) else 0
+    names = list(Fields.of(result).all)
+    look = Look.from_query(_query(document), frames=len(result), names=names, frame=last)
+    course = courses.setdefault((path, len(result)), Course(len(result)))
+    page = ResultPage(document, result, look, course)
+    _place(document, page.roots, f"rgbmidic: {result.path.name}", look.theme)
+
+
+def _place(document: Document, roots: Mapping[str, Model], title: str, theme: str) -> None:
+    """Put the parts of a page into its frame, with its style and its keys."""
+    with document.models.freeze():  # else all models are counted anew for each
+        for name, root in roots.items():
+            root.name = name
+            document.add_root(root)
+    if theme in _THEMES:
+        document.theme = _THEMES[theme]
+    document.title = title
+    page, style, script = (
+        files("rgbmidic.view").joinpath(name).read_text(encoding="utf-8")
+        for name in ("page.html", "page.css", "keys.js")
+    )
+    document.template = get_env().from_string(page)
+    document.template_variables.update(
+        theme=theme if theme in ("light", "dark") else "", areas=list(roots), style=style, script=script
+    )

@@ -1,0 +1,228 @@
+"""The page that sets a test up: frames, region with holes, mesh and uncertainty to expect, TEST.toml, the run."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bokeh.document import Document
+from bokeh.events import DocumentReady
+from bokeh.layouts import column
+from bokeh.models import ColumnDataSource, CustomJS
+
+from rgbmidic.lab.inspection import Inspection
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.plan import read_region
+from rgbmidic.report.style import colour_range
+from rgbmidic.settings import RegionSettings, read_section
+from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.draft import Draft
+from rgbmidic.view.models import TOOL, Asked, pump
+from rgbmidic.view.outline import HOLES, OUTLINES, marks_of
+from rgbmidic.view.picture import AROUND, paint, palette
+from rgbmidic.view.runner import Run
+from rgbmidic.view.setup_controls import setup_controls
+from rgbmidic.view.setup_frames import RAW, Footage, inspected, pictures, side_by_side
+from rgbmidic.view.sketch import Sketch
+from rgbmidic.view.tiles import Tiles
+from rgbmidic.view.words import guarded, warning
+
+__all__ = ["SetupPage"]
+
+_MOST_EDGES = 20_000
+"""Elements whose edges are drawn: more are a grey surface."""
+_TICK = 500
+"""Ms between two looks at the run."""
+_EXPECTED = "expected uncertainty"
+_GLARE = np.uint32(0xFF2030FF)
+_OTHER = f"if (cb_obj.active === null) return; {TOOL}; other.active = null"
+_HELP = (
+    "1. Choose a shape and click on the frame: Rectangle (two opposite corners), Polygon, Circle (centre, then "
+    "a place on it); holes likewise. Marks can be dragged; Backspace removes a chosen one.<br>2. Choose the element "
+    "size.<br>3. <b>Inspect</b> tells what uncertainty to expect.<br>4. Write the file, and run it."
+)
+
+
+class SetupPage:
+    """One opened page.
+
+    Parameters
+    ----------
+    document
+        Of the visitor.
+    draft
+        The test as far as it is known.
+    runs
+        The runs that pages have started, the last of which is told; this one's come to it, so that they can be served.
+    dark
+        Whether the page is dark.
+    """
+
+    def __init__(self, document: Document, draft: Draft, runs: list[Run], *, dark: bool) -> None:
+        self.document, self.draft, self.dark, self.runs = document, draft, dark, runs
+        self.footage = Footage.of(draft)
+        self.pictures: dict[str, Any] = {}
+        self.inspection: Inspection | None = None
+        reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
+        self.asked = Asked(name="state", asked=reference, shown=reference)
+        self.parts = setup_controls(draft, len(self.footage.series) - 1, out, dark=dark)
+        self.tiles, self._reader = Tiles(), ThreadPoolExecutor(1)
+        rows, columns = self.footage.shape
+        self.canvas = Canvas(document, (*OUTLINES, *HOLES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
+        self._edges = ColumnDataSource({"xs": [], "ys": []})
+        self.canvas.plot.multi_line(
+            "xs", "ys", source=self._edges, line_color="#ffd166", line_width=0.7, line_alpha=0.7
+        )
+        marks = () if draft.region is None else marks_of(draft.region)
+        self.sketch = Sketch(document, self.canvas, marks, self._remesh)
+        self._listen()
+
+    @property
+    def roots(self) -> dict[str, Any]:
+        """The parts of the page by the names that its template gives their places."""
+        p = self.parts
+        beside = column(p.told, p.file, p.write, p.out, p.go, p.ran, self.tiles.plot, sizing_mode="stretch_width")
+        return {"head": p.head, "side": p.side, "plot": self.canvas.plot, "curves": beside, "player": p.player}
+
+    def _listen(self) -> None:
+        p, tools = self.parts, list(self.canvas.tools)
+        for model, key in ((self.asked, "asked"), (p.picture, "value"), (p.glare, "active")):
+            model.on_change(key, lambda attr, old, new: self.show())
+        p.size.on_change("value", lambda attr, old, new: self._remesh())
+        p.calibration.on_change("value", lambda attr, old, new: self._guarded(self._reopen))
+        for button, act in (
+            (p.undo, self.sketch.undo), (p.next, self.sketch.next_hole), (p.clear, self.sketch.clear),
+            (p.inspect, self._inspect), (p.write, self._write), (p.go, self._run),
+        ):  # fmt: skip
+            button.on_click(partial(self._guarded, act))
+        pump(self.asked, p.frame, p.play, p.step)
+        p.mode.js_on_change("active", CustomJS(args={"tools": tools[:4], "other": p.hole}, code=_OTHER))
+        p.hole.js_on_change("active", CustomJS(args={"tools": tools[4:], "other": p.mode}, code=_OTHER))
+        self.document.on_event(DocumentReady, lambda event: self._ready())
+        self.document.add_periodic_callback(self._tick, _TICK)
+        self.document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
+
+    def _ready(self) -> None:
+        self.canvas.resize()
+        self.show()
+        self.sketch.draw()
+
+    def _guarded(self, act: Callable[[], None]) -> None:
+        guarded(act, self._complain)
+
+    def _complain(self, text: str) -> None:
+        self.parts.told.text = warning(text)
+
+    def show(self) -> None:
+        """Draw the picture."""
+        self._guarded(self._draw)
+        self.asked.shown = self.asked.asked
+
+    def _draw(self) -> None:
+        index = min(self.asked.asked, len(self.footage.series) - 1)
+        name = html.escape(self.footage.series.name(index))
+        self.parts.words.text = f"Frame {index} of {len(self.footage.series) - 1}: {name}"
+        raw, full = self.footage.raw(index)
+        chosen = self.parts.picture.value
+        picture = self.pictures.get(chosen, raw)
+        field, ends = None, (0.0, 1.0)
+        if chosen == _EXPECTED and self.inspection is not None:
+            ends = colour_range(self.inspection.std[np.isfinite(self.inspection.std)])
+            field = (self.inspection.nodes, self.inspection.elements, self.inspection.std)
+        colours, window = palette("plasma"), self.canvas.window
+        image = paint(window, picture, field, ends, colours, opacity=0.8, around=AROUND[self.dark])
+        if self.parts.glare.active:
+            over = paint(window, full.astype(np.uint8) * 255, None, ends, colours, opacity=0, around=0)
+            image = np.where((over & 0xFF) > 64, _GLARE, image)
+        self.canvas.show(image)
+        self.canvas.colour(ends, colours, f"{chosen} (px)" if field else chosen)
+        self.canvas.bar.visible = field is not None
+
+    def _remesh(self) -> None:
+        """Draw the mesh that the region gets."""
+        self._edges.data = {"xs": [], "ys": []}
+        self._guarded(self._make_mesh)
+
+    def _make_mesh(self) -> None:
+        content = self.sketch.region
+        if content is None or not self.parts.size.value:
+            self.parts.told.text = _HELP
+            return
+        mesh = Tri3Mesh.from_region(self._region(content), float(self.parts.size.value))
+        self.parts.told.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
+        if len(mesh.elements) <= _MOST_EDGES:
+            corners = mesh.nodes[mesh.elements][:, [0, 1, 2, 0]]
+            self._edges.data = {"xs": list(corners[..., 0]), "ys": list(corners[..., 1])}
+
+    def _region(self, content: dict[str, Any]) -> Region:
+        return read_region(read_section(RegionSettings, "region", content), self.footage.shape)
+
+    def _inspect(self) -> None:
+        """Look at the frame in view as `rgbmidic inspect` does, beside the page."""
+        content = self.sketch.region
+        if content is None:
+            self.parts.told.text = "Draw the region first."
+            return
+        self.parts.told.text = "inspecting …"
+        index, size = int(self.parts.frame.value), float(self.parts.size.value)
+        task = self._reader.submit(lambda: inspected(self.footage, index, self._region(content), size))
+        have = partial(self._guarded, partial(self._have, task, index))
+        task.add_done_callback(lambda _: self.document.add_next_tick_callback(have))
+
+    def _have(self, task: Future[Inspection], index: int) -> None:
+        found = self.inspection = task.result()
+        self.pictures = pictures(found, self.footage.shape)
+        self.tiles.show(side_by_side(found, self.pictures, self.footage.raw(index)[0]))
+        self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
+        known = found.std[np.isfinite(found.std)]
+        expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
+        lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
+        self.parts.told.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
+        if self.parts.picture.value == _EXPECTED:
+            self.show()
+        else:
+            self.parts.picture.value = _EXPECTED
+
+    def _changed(self) -> Draft:
+        """The draft with all that the page says."""
+        p, content, end = self.parts, self.sketch.region, len(self.footage.series) - 1
+        frames: dict[str, Any] = {"first": int(p.first.value) or None}
+        frames["last"] = None if int(p.last.value) == end else int(p.last.value)
+        if int(p.reference.value) != self.draft.frames.reference[0]:
+            frames["reference"] = [int(p.reference.value)]
+        changes: dict[str, dict[str, Any]] = {"frames": frames, "mesh": {"element_size": float(p.size.value)}}
+        if p.calibration.value:
+            changes["calibration"] = {"file": p.calibration.value}
+        if content is not None:
+            changes["region"] = {"mask": None, **{key: content.get(key) for key in ("rectangle", "polygon", "holes")}}
+        return self.draft.changed(changes)
+
+    def _reopen(self) -> None:
+        """Take what the page says, once it can be read."""
+        draft = self._changed()
+        self.draft, self.footage = draft, Footage.of(draft)
+        self.show()
+
+    def _write(self) -> None:
+        self._reopen()
+        self.draft = self.draft.at(Path(self.parts.file.value))
+        self.draft.write()
+        self.parts.told.text = f"{html.escape(str(self.draft.file))} is written."
+
+    def _run(self) -> None:
+        if self.runs and self.runs[-1].going:
+            self.parts.told.text = "The run still goes on."
+            return
+        self._write()
+        self.runs.append(Run.start(self.draft.file, Path(self.parts.out.value)))
+
+    def _tick(self) -> None:
+        if self.runs:
+            run = self.runs[-1]
+            link = '<br><a id="result" href="result">look at the result as it grows</a>' if run.begun else ""
+            self.parts.ran.text = html.escape(run.words()) + link

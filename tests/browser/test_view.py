@@ -1,0 +1,156 @@
+"""The viewer in a real browser: what the page shows is what the result holds, and nobody else is served."""
+
+from __future__ import annotations
+
+import re
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+from results import NODES, make_origin, make_result, smooth_record
+from viewer import MISSING, Page, chromium, click, serving
+
+from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.results.probing import read_histories
+from rgbmidic.settings import ProbeSettings
+from rgbmidic.view.fields import Fields, robust_range
+
+pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
+RIGHT, LEFT = "\ue014", "\ue012"
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """Seven frames, of which the fourth failed."""
+    store = ResultStore.create(tmp_path_factory.mktemp("view") / "result", make_origin(7))
+    for index in range(7):
+        failed = FrameRecord.failed("no start <was> found", nodes=NODES, lights=3, number=index)
+        store.write_frame(index, failed if index == 3 else smooth_record(index))
+    store.finish()
+    return Result.open(store.path)
+
+
+@pytest.fixture(scope="module")
+def address(result):
+    with serving(result.path) as told:
+        yield told
+
+
+@pytest.fixture(scope="module")
+def driver():
+    with chromium() as one:
+        yield one
+
+
+def shown(page, frame):
+    """The words on the page once it shows a frame."""
+    page.until(f"model('state').shown === {frame} && model('words').text.startsWith('Frame {frame} ')")
+    return page.run("model('words').text")
+
+
+def test_frames_are_scrubbed_and_the_address_holds_what_is_shown(driver, address, result):
+    page = Page(driver, address)
+    assert "converged" in shown(page, 6)
+    page.keys(LEFT, LEFT)
+    shown(page, 4)
+    page.keys(LEFT)
+    assert "failed: no start &lt;was&gt; found" in shown(page, 3)
+    page.do("model('quantity').value = 'v'")
+    page.do("model('frame').value = 2")
+    shown(page, 2)
+    low, high = robust_range(Fields.of(result).read("v", 2))
+    mapper = "model('colours')"
+    page.until(f"{mapper}.low === {low!r} && {mapper}.high === {high!r}")
+    held = parse_qs(urlsplit(driver.current_url).query)
+    assert held == {"frame": ["2"], "field": ["v"]}
+    again = Page(driver, driver.current_url)
+    shown(again, 2)
+    assert again.run("model('quantity').value") == "v"
+
+
+def test_the_value_under_the_pointer_is_that_of_the_array(driver, address, result):
+    page = Page(driver, f"{address}?frame=5&field=u")
+    shown(page, 5)
+    node = int(np.argmin(np.hypot(*(result.nodes - [70, 45]).T)))
+    page.pointer(("move", *result.nodes[node]))
+    text = page.until("model('under').text")
+    x, y, u, std = (float(n) for n in re.findall(r"-?[\d.]+(?:e-?\d+)?", text))
+    assert np.hypot(x - result.nodes[node, 0], y - result.nodes[node, 1]) < 0.5
+    assert u == pytest.approx(0.002 * 5 * (x - 60), abs=1e-3)
+    assert std == pytest.approx(0.01)
+
+
+def test_curves_of_a_gauge_that_is_set_and_dragged_are_those_of_history(driver, address, result):
+    page = Page(driver, f"{address}?frame=6")
+    page.do("model('mode').active = 2")
+    page.pointer(("click", 25, 40))
+    page.pointer(("click", 95, 40))
+    check_gauge(page, result)
+    page.pointer(("press", *ends(page)[1]), ("move", 90, 50), ("release", 80, 60))
+    page.until("model('marks').data.y[1] > 55")
+    check_gauge(page, result)
+    page.do(
+        "window.saved = ''; URL.createObjectURL = (blob) => { blob.text().then((t) => window.saved = t); return '#'; }"
+    )
+    page.driver.execute_script(*click("Save CSV"))
+    assert page.until("window.saved").splitlines()[0].startswith("frame,number,status,gauge_1_extension_px")
+    page.do("window.saved = ''")
+    page.driver.execute_script(*click("Save PNG"))
+    assert "PNG" in page.until("window.saved")[:8]
+    page.do("model('mode').active = 1")
+    page.pointer(("click", 60, 30))
+    page.until("model('curve').value === 'u (px)' && model('lines').data.name[0] === 'point 1 u'")
+
+
+def ends(page):
+    data = page.run("[Array.from(model('marks').data.x), Array.from(model('marks').data.y)]")
+    return list(zip(*data, strict=True))
+
+
+def check_gauge(page, result):
+    """The curve on the page and its band are what `rgbmidic history` reads at the marks of the page."""
+    place = tuple(value for end in ends(page) for value in end)
+    expected = read_histories(result, ProbeSettings(gauges=(place,)))["gauge_1_extension"]
+    last = f"{expected.values[-1]:.9g}"
+    page.until(f"model('lines').data.ys.length === 1 && Math.abs(model('lines').data.ys[0][6] - {last}) < 1e-6")
+    curve = page.run("Array.from(model('lines').data.ys[0]).map((v) => Number.isFinite(v) ? v : null)")
+    np.testing.assert_allclose([np.nan if v is None else v for v in curve], expected.values, atol=1e-9)
+    first = page.run("Array.from(model('bands').data.ys[1])")  # behind the failed frame
+    np.testing.assert_allclose(first[:3], (expected.values - 2 * expected.std)[4:], atol=1e-9)
+
+
+def test_a_result_that_grows_is_followed(driver, tmp_path):
+    store = ResultStore.create(tmp_path / "result", make_origin(4))
+    with serving(store.path) as told:
+        page = Page(driver, told)
+        assert "not measured yet" in shown(page, 0)
+        for index in (0, 1):
+            store.write_frame(index, smooth_record(index))
+        assert "converged" in shown(page, 1)
+        page.until("model('head').text.includes('2 of 4 frames measured')")
+        for index in (2, 3):
+            store.write_frame(index, smooth_record(index))
+        store.finish()
+        shown(page, 3)
+        page.until("model('head').text.includes('4 of 4 frames measured')")
+
+
+def test_nothing_is_asked_of_the_network(driver, address):
+    page = Page(driver, address)
+    asked = page.run("performance.getEntriesByType('resource').map((entry) => entry.name)")
+    assert len(asked) >= 2
+    assert all(name.startswith((address, "data:", "blob:")) for name in asked)
+
+
+def test_a_damaged_frame_is_told_and_the_page_goes_on(driver, tmp_path):
+    made = make_result(tmp_path / "result", frames=3)
+    file = next((made.path / "solution").glob("*.frames"))
+    content = bytearray(file.read_bytes())
+    content[int(made.table.start[1]) + 3] ^= 255
+    file.write_bytes(content)
+    with serving(made.path) as told:
+        page = Page(driver, told)
+        page.do("model('frame').value = 1")
+        page.until("model('words').text.includes('damaged in frame 1')")
+        page.do("model('frame').value = 0")
+        shown(page, 0)

@@ -1,0 +1,148 @@
+"""The server of the viewer: whom it serves, and what it says of bad input."""
+
+from __future__ import annotations
+
+import http.client
+import random
+import re
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from urllib.parse import quote, urlsplit
+
+import pytest
+from results import make_result
+from viewer import serving
+
+from rgbmidic import cli
+from rgbmidic.command import execute
+from rgbmidic.view.address import Look
+
+REQUESTS = 300
+"""Enough for every kind of request below to come a few times; 20,000 were sent once before this was merged."""
+NOISE = "".join(map(chr, range(33, 127))).replace("#", "")
+STEPS = ("..", "%2e%2e", "..%2f", "static", "%00", "etc", "passwd", "js", "//", "ws", "metadata", "\\..\\", "a" * 300)
+METHODS = ("GET", "GET", "GET", "POST", "HEAD", "PUT", "DELETE", "OPTIONS", "PATCH", "BREW")
+RAW = (b"\0" * 100, b"GET", b"GET / HTTP/9.9\r\n\r\n", b"\xff" * 4096, b"GET " + b"a" * 70_000 + b"\r\n\r\n")
+REFUSALS = (400, 403, 404, 405, 414)
+UPGRADE = {
+    "Upgrade": "websocket",
+    "Connection": "Upgrade",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+}
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    with serving(make_result(tmp_path_factory.mktemp("view") / "result").path) as told:
+        yield told
+
+
+def ask(address, method, path, headers=None):
+    """Status and body of the answer to a request that need not keep the rules."""
+    parts = urlsplit(address)
+    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
+    try:
+        connection._validate_path = lambda url: None
+        connection.request(method, path, headers=headers or {})
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+def strange_path(choose, token):
+    """A path without the token, or with it and out of what is served."""
+    tail = [choose.choice([*STEPS, "".join(choose.choices(NOISE, k=6))]) for _ in range(choose.randrange(1, 6))]
+    wrong = choose.choice(["", token[:-1], token.swapcase(), token[:-1] + "%41", f"{token}a", f"x/../{token}x"])
+    return choose.choice([f"/{token}/static/{'/'.join(tail)}", f"/{'/'.join(tail)}", f"/{wrong}/", f"/{wrong}/ws"])
+
+
+def test_strangers_get_nothing_whatever_they_ask(address):
+    """Wrong tokens, paths out of what is served and plain noise: never a page, a traceback or a file."""
+    choose, token = random.Random(7), urlsplit(address).path.strip("/")
+    for _ in range(REQUESTS):
+        path, method = strange_path(choose, token), choose.choice(METHODS)
+        headers = UPGRADE if choose.random() < 0.2 else None
+        status, body = ask(address, method, path, headers)
+        assert status in REFUSALS, (status, method, path)
+        assert len(body) < 300, (path, body)
+        assert not re.search(rb"Traceback|root:|rgbmidic", body), (path, body)
+
+
+@pytest.mark.parametrize("content", RAW, ids=range(len(RAW)))
+def test_what_is_no_request_is_dropped(address, content):
+    parts = urlsplit(address)
+    with socket.create_connection((parts.hostname, parts.port), timeout=0.2) as one, suppress(OSError):
+        one.sendall(content)
+        assert re.fullmatch(rb"(HTTP/1.1 4\d\d .*)?", one.recv(10_000), re.DOTALL)
+
+
+def test_a_page_is_served_whatever_its_query_says(address):
+    choose, names = random.Random(3), list(Look.__dataclass_fields__)
+    for _ in range(2):
+        words = ["".join(choose.choices(NOISE + "\0é", k=choose.randrange(9))) for _ in names]
+        query = "&".join(f"{name}={quote(word)}" for name, word in zip(names, words, strict=True))
+        status, body = ask(address, "GET", f"{urlsplit(address).path}?{query}")
+        assert status == 200
+        assert b"Traceback" not in body
+        assert not any(word.encode() in body for word in words if len(word) > 6)
+
+
+def test_another_page_of_the_web_cannot_speak_with_the_server(address):
+    """A page of another origin that knew the address would still be refused by the socket."""
+    path = f"{urlsplit(address).path}ws"
+    assert ask(address, "GET", path, {**UPGRADE, "Origin": "http://elsewhere.example"})[0] == 403
+
+
+def test_the_server_listens_to_this_machine_only(address):
+    parts = urlsplit(address)
+    assert parts.hostname == "127.0.0.1"
+    with socket.socket() as other:
+        other.settimeout(2)
+        assert other.connect_ex(("127.0.0.2", parts.port)) != 0
+
+
+def test_a_second_viewer_of_a_result_has_an_address_of_its_own(tmp_path):
+    path = make_result(tmp_path / "result").path
+    with serving(path) as one, serving(path) as other:
+        assert ask(one, "GET", urlsplit(one).path)[0] == ask(other, "GET", urlsplit(other).path)[0] == 200
+        assert ask(one, "GET", urlsplit(other).path)[0] == 404
+
+
+def bad_inputs(folder):
+    (folder / "empty").mkdir()
+    made = make_result(folder / "damaged", frames=2)
+    (made.path / "mesh.npz").write_bytes(b"no")
+    (folder / "test.toml").write_text("[frames]\npath = 3\n", encoding="utf-8")
+    make_result(folder / "good", frames=1)
+    yield [str(folder / "none")], "none"
+    yield [str(folder / "empty")], "empty"
+    yield [str(folder / "damaged")], "mesh.npz is damaged"
+    yield [str(folder / "test.toml")], "frames.path"
+    yield [str(folder / "good"), "--port", "70000"], "65535"
+    with socket.socket() as used:
+        used.bind(("127.0.0.1", 0))
+        used.listen()
+        port = str(used.getsockname()[1])
+        yield [str(folder / "good"), "--port", port], f"port {port} of 127.0.0.1 cannot be used"
+
+
+def test_bad_input_is_one_line(tmp_path, capsys):
+    for arguments, expected in bad_inputs(tmp_path):
+        assert execute(cli.app, ["view", *arguments, "--no-browser"]) == 2
+        told = capsys.readouterr()
+        assert told.out == ""
+        assert told.err.startswith("error: ")
+        assert told.err.count("\n") == 1
+        assert expected in told.err
+
+
+def test_nothing_but_the_viewer_loads_what_the_viewer_needs():
+    script = (
+        "import sys, rgbmidic, rgbmidic.cli, rgbmidic.pipeline.run; print({'bokeh', 'tornado'} & sys.modules.keys())"
+    )
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert told.stdout == "set()\n"
