@@ -9,9 +9,9 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from block_numbers import blocks
+from shared_kernel import summed
 
-from rgbmidic._kernels.grid import block_index
+from rgbmidic._kernels.grid import block_sums
 from rgbmidic._kernels.threads import over_ranges, set_threads, threads
 from rgbmidic.errors import InputError
 
@@ -64,18 +64,18 @@ def test_a_failure_in_any_thread_is_told():
 
 def test_many_threads_may_call_at_once():
     with ThreadPoolExecutor(8) as callers:
-        assert all(callers.map(blocks, range(40)))
+        assert all(callers.map(summed, range(40)))
 
 
 @pytest.mark.parametrize("way", sorted({"fork", "spawn"} & set(multiprocessing.get_all_start_methods())))
 def test_other_processes_make_their_own_pool(way):
-    assert blocks(0)
+    assert summed(0)
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(way)) as pool:
-        assert all(pool.map(blocks, range(4), timeout=300))
+        assert all(pool.map(summed, range(4), timeout=300))
 
 
 def test_a_shared_kernel_can_be_sent_to_another_process():
-    assert pickle.loads(pickle.dumps(block_index)) is block_index
+    assert pickle.loads(pickle.dumps(block_sums)) is block_sums
 
 
 def said(value):
