@@ -577,7 +577,7 @@ def _tell_first_run() -> None:
     if not are_compiled():
         _messages.print(
             "first run on this machine: kernels are compiled for its processor as they are needed, in all about "
-            "a minute on two cores; later runs take them from a cache",
+            "half a minute on two cores; later runs take them from a cache",
             soft_wrap=True,
         )
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import fdtri
 
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -196,8 +197,6 @@ def capture_scatter(fit: ColumnFit) -> FloatArray:
 
     The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
     """
-    from scipy.stats import f as fisher
-
     count, channels = fit.residual.shape[:2]
     if count < 2:
         return np.zeros(channels)
@@ -205,7 +204,7 @@ def capture_scatter(fit: ColumnFit) -> FloatArray:
     own = (share - share.mean(axis=0)).transpose(1, 0, 2, 3).reshape(channels, -1)
     noise = (own**2).sum(axis=1) / (count - 1)
     scatter = share.sum(axis=(2, 3)).var(axis=0, ddof=1)
-    limit = fisher.isf(DRIFT_SIGNIFICANCE / channels, count - 1, own.shape[1])
+    limit = fdtri(count - 1, own.shape[1], 1 - DRIFT_SIGNIFICANCE / channels)
     return np.where(scatter > limit * noise, scatter - noise, 0.0)
 
 

@@ -16,6 +16,7 @@ from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.lab.rehearsal import rehearsed
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Separation, measure
 from rgbmidic.results import Result
@@ -127,17 +128,16 @@ def run_demo(
     out.mkdir(parents=True, exist_ok=True)
     states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
     scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")
-    say(
-        f"1 of 5: virtual test, about half a minute: raw DNG frames, calibration captures and the exact truth in {test}"
-    )
-    settings_file = write_dataset(scene, test, progress)
-    (test / "calibration.json").rename(test / "true_calibration.json")
-    say("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does it from the captures with one light at a time")
-    calibrate(test)
+    say(f"1 of 5: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
+    with rehearsed():
+        settings_file = write_dataset(scene, test, progress)
+        (test / "calibration.json").rename(test / "true_calibration.json")
+        say("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from the captures with one light at a time")
+        calibrate(test)
     settings = read_test(settings_file)
-    say(f"3 of 5: measurement, some 5 s: rgbmidic run {settings_file} --out {out / 'result'}")
+    say(f"3 of 5: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")
     result = measure(settings, out / "result", progress=progress)
-    say("4 of 5: the same with each colour alone, for comparison, some 15 s")
+    say("4 of 5: the same with each colour alone, for comparison, some 5 s")
     return _compare(settings, result)
 
 

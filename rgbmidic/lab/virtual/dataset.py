@@ -25,7 +25,7 @@ from rgbmidic.scene.scene import Scene, State
 from rgbmidic.scene.scenefile import DatasetSettings, Experiment, read_scene
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["write_dataset", "write_experiment"]
+__all__ = ["true_calibration", "write_dataset", "write_experiment"]
 
 Frame = Mosaic | ChannelFrame
 Progress = Callable[[int, int, str], None]
@@ -88,7 +88,7 @@ def write_experiment(experiment: Experiment, out: Path, progress: Progress | Non
     displacement = np.stack([truth(scene, state) for state in states])
     _save(out / "truth.npz", displacement=displacement.astype(np.float32), angle_deg=[s.angle_deg for s in states])
     _write_captures(out, scene, settings, at_rest, [int(seed.generate_state(1)[0]) for seed in seeds[1:]])
-    _true_calibration(scene).write(out / "calibration.json")
+    true_calibration(scene).write(out / "calibration.json")
     test = out / "test.toml"
     test.write_text(_test_settings(scene, settings, _region(settings, displacement)), encoding="utf-8")
     return test
@@ -161,7 +161,7 @@ def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest:
             _write_frame(out / folder, index, frame, settings)
 
 
-def _true_calibration(scene: Scene) -> Calibration:
+def true_calibration(scene: Scene) -> Calibration:
     camera = scene.camera
     return Calibration(
         crosstalk=None if camera.kind == "monochrome" else camera.true_crosstalk(scene.lights),

@@ -1,0 +1,68 @@
+"""The measurement in small that compiles the kernels while the demonstration's frames are rendered."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rgbmidic.lab import rehearsal
+
+_REST = """
+import importlib, pkgutil, sys
+from pathlib import Path
+import rgbmidic._kernels
+from rgbmidic.lab import rehearsal
+
+def kernels():
+    names = [one.name for one in pkgutil.iter_modules(rgbmidic._kernels.__path__)]
+    modules = [importlib.import_module(f"rgbmidic._kernels.{name}") for name in names]
+    found = [getattr(value, "__wrapped__", value) for module in modules for value in vars(module).values()]
+    return {(one.py_func.__name__, form) for one in found if hasattr(one, "py_func") for form in one.signatures}
+
+rehearsal._main()
+before = kernels()
+from small_tests import colour_test
+from rgbmidic.pipeline import measure
+test = colour_test(Path(sys.argv[1]) / "test")
+measure(test.settings(), Path(sys.argv[1]) / "result")
+print(len(before), *sorted({name for name, _ in kernels() - before}))
+"""
+
+
+def test_a_measurement_compiles_nothing_that_the_rehearsal_has_not(tmp_path):
+    """But for the renderer, which makes this test's frames."""
+    tests = str(Path(__file__).parents[2])
+    script = f"import sys; sys.path.insert(0, {tests!r})\n{_REST}"
+    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=True)
+    number, *more = done.stdout.split()
+    assert int(number) > 15
+    assert more == ["trace_rows"]
+
+
+def test_what_goes_wrong_meanwhile_ends_the_rehearsal(monkeypatch):
+    monkeypatch.setattr(rehearsal, "are_compiled", lambda: False)
+    started = []
+    monkeypatch.setattr(rehearsal.subprocess, "Popen", _noting(started))
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), rehearsal.rehearsed():
+        raise KeyboardInterrupt
+    assert started[0].returncode != 0
+    assert time.monotonic() - begun < 5
+
+
+def test_nothing_is_started_where_the_kernels_are_compiled(monkeypatch):
+    monkeypatch.setattr(rehearsal, "are_compiled", lambda: True)
+    monkeypatch.setattr(rehearsal.subprocess, "Popen", lambda *_, **__: pytest.fail("started"))
+    with rehearsal.rehearsed():
+        pass
+
+
+def _noting(started):
+    class Noted(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            started.append(self)
+
+    return Noted
