@@ -39,8 +39,10 @@ _LANES = 8
 
 
 @helper(forceinline=True, fastmath=_FAST)
-def _spline(k0, k1, k2, k3, i, tx, ty):
-    """Cubic B-spline value from the i-th to the third next coefficient of four rows, at the fraction (tx, ty)."""
+def _spline(coefficients, first, width, i, tx, ty):
+    """Cubic B-spline value from the coefficients (one row of `width` after the other) at the `first` + i-th, the next
+    three and those below, at the fraction (tx, ty). No view of them is made: each counts its owners, and the threads
+    would wait for each other."""
     t2 = tx * tx
     t3 = t2 * tx
     x3 = t3 * _SIXTH
@@ -53,12 +55,16 @@ def _spline(k0, k1, k2, k3, i, tx, ty):
     y0 = _SIXTH - _HALF * (ty - t2) - y3
     y1 = _TWO_THIRDS - t2 + _HALF * t3
     y2 = _ONE - y0 - y1 - y3
-    j, k, m = i + np.uint32(1), i + np.uint32(2), i + np.uint32(3)
+    a = first + i
+    b = a + width
+    c = b + width
+    d = c + width
+    j, k, m = np.uint64(1), np.uint64(2), np.uint64(3)
     return (
-        y0 * (x0 * k0[i] + x1 * k0[j] + x2 * k0[k] + x3 * k0[m])
-        + y1 * (x0 * k1[i] + x1 * k1[j] + x2 * k1[k] + x3 * k1[m])
-        + y2 * (x0 * k2[i] + x1 * k2[j] + x2 * k2[k] + x3 * k2[m])
-        + y3 * (x0 * k3[i] + x1 * k3[j] + x2 * k3[k] + x3 * k3[m])
+        y0 * (x0 * coefficients[a] + x1 * coefficients[a + j] + x2 * coefficients[a + k] + x3 * coefficients[a + m])
+        + y1 * (x0 * coefficients[b] + x1 * coefficients[b + j] + x2 * coefficients[b + k] + x3 * coefficients[b + m])
+        + y2 * (x0 * coefficients[c] + x1 * coefficients[c + j] + x2 * coefficients[c + k] + x3 * coefficients[c + m])
+        + y3 * (x0 * coefficients[d] + x1 * coefficients[d + j] + x2 * coefficients[d + k] + x3 * coefficients[d + m])
     )
 
 
@@ -123,6 +129,7 @@ def element_right_side(
     float64. `out` (E, 3, 2) receives ``sum w (f - g(x + u)) grad f phi``; pixels that have left the image do not count.
     """
     height, width = coefficients.shape[0] - 2 * PAD, coefficients.shape[1] - 2 * PAD
+    flat, across = coefficients.ravel(), np.uint64(coefficients.shape[1])
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         low_x, low_y = np.float32(-base_x), np.float32(-base_y)
@@ -145,23 +152,21 @@ def element_right_side(
                 filled = (n + _LANES - 1) // _LANES * _LANES
                 if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
-                i0, r, c = np.uint64(slot), np.uint64(row + PAD - 1), np.uint64(column + PAD - 1)
-                k0, k1 = coefficients[r, c:], coefficients[r + np.uint64(1), c:]
-                k2, k3 = coefficients[r + np.uint64(2), c:], coefficients[r + np.uint64(3), c:]
+                i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)
                 pull_x = pull_y = turn_x = turn_y = _ZERO
                 for i in range(np.uint32(filled)):
                     t = np.float32(np.int32(i))
                     own = np.int32(i) < np.int32(n)
-                    g = _spline(k0, k1, k2, k3, i, tx + (fxx - _ONE) * t, ty + fyx * t)
+                    g = _spline(flat, first, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
                     difference = reference[i0 + i] - g if own else _ZERO
                     w = weight[i0 + i] if own else _ZERO
                     pull = w * difference
                     along = pull * gradient_x[i0 + i]
-                    across = pull * gradient_y[i0 + i]
+                    down = pull * gradient_y[i0 + i]
                     pull_x += along
-                    pull_y += across
+                    pull_y += down
                     turn_x += along * t
-                    turn_y += across * t
+                    turn_y += down * t
                 sx += pull_x
                 sy += pull_y
                 sxx += pull_x * x + turn_x
@@ -252,6 +257,7 @@ def bring_back(
     `BLOCK` px lie above and to the left. `moments` (E, 6) receives the sums of w, w f, w g, w f f, w f g, w g g.
     """
     height, width = deformed_weight.shape
+    flat, across = coefficients.ravel(), np.uint64(coefficients.shape[1])
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         low_x, low_y = np.float32(-base_x), np.float32(-base_y)
@@ -277,12 +283,10 @@ def bring_back(
                 filled = (n + _LANES - 1) // _LANES * _LANES  # as in `element_right_side`
                 if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
-                i0, r, c = np.uint64(slot), np.uint64(row + PAD - 1), np.uint64(column + PAD - 1)
-                k0, k1 = coefficients[r, c:], coefficients[r + np.uint64(1), c:]
-                k2, k3 = coefficients[r + np.uint64(2), c:], coefficients[r + np.uint64(3), c:]
+                i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)
                 for i in range(np.uint32(filled)):
                     t = np.float32(np.int32(i))
-                    g = _spline(k0, k1, k2, k3, i, tx + (fxx - _ONE) * t, ty + fyx * t)
+                    g = _spline(flat, first, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
                     if np.int32(i) < np.int32(n):
                         difference[i0 + i] = reference[i0 + i] - g
                 right_x = max(right_x, px + fxx * np.float32(n))
@@ -291,10 +295,10 @@ def bring_back(
         if run_offsets[e] == run_offsets[e + 1]:
             moments[e] = 0.0
             continue
-        first, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
+        begin, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
         inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
         if inside and not _any_partial(partial, base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y):
-            for i in range(np.uint64(first), np.uint64(end)):
+            for i in range(np.uint64(begin), np.uint64(end)):
                 weight[i] = reference_weight[i]
         else:
             for run in range(run_offsets[e], run_offsets[e + 1]):
@@ -307,7 +311,7 @@ def bring_back(
                     weight[i] = reference_weight[i] * mean
                     x += _ONE
         total = f1 = g1 = f2 = fg = g2 = 0.0
-        for i in range(np.uint64(first), np.uint64(end)):
+        for i in range(np.uint64(begin), np.uint64(end)):
             f, w = reference[i], weight[i]
             g = f - difference[i]
             wf, wg = w * f, w * g
