@@ -23,10 +23,8 @@ _ROUNDING = 1e-4
 """Share of a node's texture under which what it sees in its worse direction may be rounding."""
 SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area..."""
-_INFORMED = 0.001, 0.01
-"""...and this share of the median information, its texture over the variance of the residual: at least, where all
-around matches (the nodes that only a reflecting light sees have .003, and are .01 px off); and beside what does not,
-where a node with less was 1.2 px off."""
+_INFORMED = 0.01
+"""...and this share of the median information, its texture over the variance of the residual: 10 times the noise."""
 
 
 def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
@@ -66,8 +64,6 @@ class Equations:
         Schur complement of the rigid unknowns.
     textured : ndarray, shape (N,), bool
         Nodes that see enough texture.
-    informed : ndarray, shape (N,), bool
-        Nodes that see so much of it that they count beside what does not match, too.
     light_share : ndarray, shape (N, k), float64
         Share of each light in what determines a node; 0 where nothing does.
     """
@@ -83,7 +79,6 @@ class Equations:
     border_solved: FloatArray
     schur: FloatArray
     textured: BoolArray
-    informed: BoolArray
     light_share: FloatArray
 
     @classmethod
@@ -105,12 +100,10 @@ class Equations:
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
         blocks = np.sum(per_light, axis=0)
         own = assembly.node_blocks(blocks)
-        share = _observability(own, assembly.nodal_area)
-        least, usual = (SEEN, SEEN) if given is None else _INFORMED
-        textured, scale = share > least, _typical(own, share > least)
+        textured, scale = _observability(own, assembly.nodal_area, SEEN if given is None else _INFORMED)
         if given is not None:
             texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
-            textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area) > SEEN
+            textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
         held = scale * (_SMOOTHNESS * assembly.smoothness.data + 1e-9 * assembly.diagonal)
         solve = factorise(assembly.matrix(blocks, held))
@@ -129,7 +122,6 @@ class Equations:
             border_solved=solved,
             schur=corner - border.T @ solved,
             textured=textured,
-            informed=textured & (share > usual),
             light_share=_light_share(reference, per_light),
         )
 
@@ -181,8 +173,8 @@ def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArra
     return np.asarray(light / np.where(total > 0, total, 1.0))
 
 
-def _observability(own: FloatArray, area: FloatArray) -> FloatArray:
-    """What each node (N,) sees in its worse direction, over the median texture around a node of its area.
+def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[BoolArray, float]:
+    """Which nodes see at least that share of the median texture, and the typical diagonal entry of the Hessian.
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
     """
@@ -192,10 +184,5 @@ def _observability(own: FloatArray, area: FloatArray) -> FloatArray:
     smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only
     density = smallest / area
     typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
-    return density / typical if typical > 0 else np.zeros_like(density)
-
-
-def _typical(own: FloatArray, seen: BoolArray) -> float:
-    """The typical diagonal entry of the Hessian."""
-    half = (own[0] + own[2]) / 2
-    return float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
+    seen = density > least * typical if typical > 0 else np.zeros(len(density), dtype=bool)
+    return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0

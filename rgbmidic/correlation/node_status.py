@@ -37,8 +37,6 @@ class Evidence:
     ----------
     textured : ndarray, shape (N,), bool
         Enough texture is seen around the node, by what precision there is (`Equations`).
-    informed : ndarray, shape (N,), bool
-        So much of it that the node counts beside what does not match (`Equations`).
     one_sided : ndarray, shape (N,), bool
         The texture runs in one direction only (`one_sided_texture`).
     mismatched, near_mismatch : ndarray, shape (N,), bool
@@ -50,7 +48,6 @@ class Evidence:
     """
 
     textured: BoolArray
-    informed: BoolArray
     one_sided: BoolArray
     mismatched: BoolArray
     near_mismatch: BoolArray
@@ -72,11 +69,6 @@ RULES = (
         status=NodeStatus.DECORRELATED,
         because="the elements around it do not match, and the others show too little",
         applies=lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured),
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="elements near it do not match, and it is seen by what is little precise",
-        applies=lambda nodes: nodes.near_mismatch & nodes.textured & ~nodes.informed,
     ),
     Rule(
         status=NodeStatus.NOT_SEEN,

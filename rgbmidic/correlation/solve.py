@@ -209,7 +209,6 @@ def _judged(
     """
     evidence = Evidence(
         textured=equations.textured,
-        informed=equations.informed,
         one_sided=one_sided_texture(equations, weighting.residual),
         mismatched=mismatched,
         near_mismatch=weighting.residual.reference.mesh.beside(mismatched),
