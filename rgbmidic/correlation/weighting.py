@@ -28,9 +28,9 @@ __all__ = [
     "standard_uncertainty",
 ]
 
-FIRST_PASS = 0.05
-"""Increment (px) at which the first pass hands over to the pass with the weights brought back anew: an iteration
-brings the displacement 20 times nearer, and the new weights then move it as far."""
+FIRST_PASS = 0.01
+"""Increment (px) at which the first pass hands over to the pass with the weights brought back anew. At .05 an iteration
+less is needed, but from another start the result differs by up to 2.3e-4 px."""
 _REFINED = {"none": 1, "global": 1, "local": 4}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _STARTED = 0.25
