@@ -10,6 +10,7 @@ import numpy as np
 
 from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.interpolation import _FAST
+from rgbmidic._kernels.texture import expand_row
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["block_sums", "from_grid", "from_image", "product_sums", "score_sums", "to_image"]
@@ -159,28 +160,8 @@ def from_grid(start, stop, lines, grid, side, out):
         for q in range(start, stop):
             if lines[q, 2] != on:
                 on = lines[q, 2]
-                _expand(grid[n], on, side, between, row)
+                expand_row(grid[n], on, side, between, row)
             slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
             source = row[lines[q, 3] :]
             for i in range(number):
                 out[n, slot + i] = source[i]
-
-
-@helper()
-def _expand(grid, row, side, between, out):
-    """Row of pixels `out` from a grid (h, w); `between` (w,) is scratch."""
-    position = min(max((row + 0.5) / side - 0.5, 0.0), grid.shape[0] - 1.0)
-    low = int(position)
-    high = min(low + 1, grid.shape[0] - 1)
-    part = np.float32(position - low)
-    last = between.size - 1
-    for g in range(between.size):
-        between[g] = grid[low, g] + part * (grid[high, g] - grid[low, g])
-    per_pixel = np.float32(1.0 / side)
-    first, ahead = side // 2, np.float32(0.5 - 0.5 * (side % 2))  # of the first pixel beyond a block's centre
-    out[:first] = between[0]
-    for g in range(last):
-        level, slope = between[g], (between[g + 1] - between[g]) * per_pixel
-        for i in range(side):
-            out[first + g * side + i] = level + slope * (np.float32(i) + ahead)
-    out[first + last * side :] = between[last]

@@ -49,11 +49,12 @@ def expand_row(grid, row, block, line, out):
     for j in range(first):
         out[j] = line[0]
     per_pixel = np.float32(1.0 / block)
+    ahead = np.float32(0.5 - 0.5 * (block % 2))  # of the first pixel beyond a block's centre
     for g in range(last):
         start = half + g * block
         level, slope = line[g], (line[g + 1] - line[g]) * per_pixel
         for j in range(min(block, out.size - start)):
-            out[start + j] = level + slope * np.float32(j + 0.5)
+            out[start + j] = level + slope * (np.float32(j) + ahead)
     for j in range(half + last * block, out.size):
         out[j] = line[last]
 
