@@ -8,7 +8,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.correlation import BLOCK, bring_back, element_hessian, element_right_side, element_sums
+from rgbmidic._kernels.correlation import (
+    BLOCK,
+    bring_back,
+    element_hessian,
+    element_right_side,
+    element_sums,
+    element_vector,
+)
 from rgbmidic._kernels.interpolation import PAD
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
@@ -182,6 +189,13 @@ class Reference:
         element_right_side(
             deformed.coefficients[light], values, *gradient, weight, *self._geometry(), displacement, parts
         )
+        return self.assembly.vector(parts)
+
+    def projected(self, light: int, weight: FloatImage, difference: FloatImage) -> FloatArray:
+        """The same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
+        parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
+        geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+        element_vector(weight, difference, self.gradient_x[light], self.gradient_y[light], *geometry, parts)
         return self.assembly.vector(parts)
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:

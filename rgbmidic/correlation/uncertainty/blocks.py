@@ -78,7 +78,7 @@ def unfitted_share(
         held = np.abs(chosen)
         total += float((xx * held).sum(dtype=np.float64) + (yy * held).sum(dtype=np.float64))
         for first, second in ((xx, xy), (xy, yy)):
-            element_vector(first * chosen, second * chosen, *geometry, parts)
+            element_vector(np.ones_like(chosen), chosen, first, second, *geometry, parts)
             column = assembly.vector(parts)
             fitted += float(column @ solve(column))
     share = 1 - fitted / max(total, 1e-300)
