@@ -82,6 +82,8 @@ class Reference:
         Share of the variance of a block's score that the fit leaves in the residual (`unfitted_share`).
     values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
+    texture : ndarray, shape (2, P), float32
+        Gradient of the lights' common texture: the sum of theirs.
     prefilter : str
     """
 
@@ -98,6 +100,7 @@ class Reference:
     gradient_x: FloatImage
     gradient_y: FloatImage
     pixel_weights: FloatImage
+    texture: FloatImage
     prefilter: str
 
     @classmethod
@@ -145,6 +148,7 @@ class Reference:
             gradient_x=samples[1],
             gradient_y=samples[2],
             pixel_weights=weighted,
+            texture=samples[1:].sum(axis=1),
             prefilter=prefilter,
         )
 

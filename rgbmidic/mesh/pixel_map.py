@@ -146,7 +146,7 @@ class PixelMap:
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
         out = np.empty((len(grids), self.rows.size), dtype=np.float32)
-        from_grid(self.lines, np.ascontiguousarray(grids, dtype=np.float32), side, out)
+        from_grid(self.lines, self.line_offsets, np.ascontiguousarray(grids, dtype=np.float32), side, out)
         return out
 
     def window(self, values: FloatImage) -> FloatImage:
