@@ -139,11 +139,14 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
     the residual, which holds the noise of both images, differs by from pixel to pixel."""
     reference, pixels = residual.reference, residual.reference.pixels
     elements = nodes[reference.mesh.elements].any(axis=1)
-    around = np.repeat(elements, np.diff(pixels.offsets))
-    offsets = np.concatenate([[0], np.cumsum(np.diff(pixels.offsets)[elements])])
-    top, left, _, _ = pixels.bounds
-    row, column = pixels.rows[around] - top, pixels.columns[around] - left
-    place = pixels.local_x[around], pixels.local_y[around], offsets, pixels.barycentric[elements]
+    around, counts = np.repeat(elements, np.diff(pixels.offsets)), np.diff(pixels.offsets)[elements]
+    local, offsets = (
+        np.stack([pixels.local_x[around], pixels.local_y[around]]),
+        np.concatenate([[0], np.cumsum(counts)]),
+    )
+    place = *local, offsets, pixels.barycentric[elements]
+    corner = pixels.origin[elements] - pixels.bounds[1::-1]
+    column, row = local.astype(np.int64) + np.repeat(corner.T, counts, axis=1)
     own, total = np.zeros((int(elements.sum()), 3, 3, 3)), np.zeros((elements.size, 3, 3, 3))
     for weight, difference in zip(weights, residual.difference, strict=True):
         image = np.pad(pixels.window(difference[None] / np.float32(np.sqrt(2)))[0], ((0, 1), (0, 1)))

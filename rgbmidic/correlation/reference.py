@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.correlation import BLOCK, bring_back, element_hessian, element_right_side, element_sums
-from rgbmidic._kernels.interpolation import PAD
+from rgbmidic._kernels.interpolation import pixel_gradient
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
 from rgbmidic.correlation.recovery import linear_fit_offset
@@ -115,10 +115,8 @@ class Reference:
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
             usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
         pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
-        samples = np.stack([_values_and_gradient(image, pixels) for image in ready], axis=1)
         weighted = pixels.gather(usable)
-        samples[1:] = _common_gradient(samples[1:], weighted, pixels)
-        used = np.sqrt(weighted)
+        gradient_x, gradient_y = _common_gradient(_gradient(ready, pixels), weighted, pixels)
         return cls(
             mesh=mesh,
             pixels=pixels,
@@ -126,14 +124,12 @@ class Reference:
             colouring=NodeColouring.from_mesh(mesh),
             material=mesh,
             linear_offset=linear_fit_offset(mesh),
-            unfitted=unfitted_share(
-                pixels, assembly, samples[1] * used, samples[2] * used, block_side(pixels, mesh.size)
-            ),
+            unfitted=unfitted_share(pixels, assembly, gradient_x, gradient_y, weighted, block_side(pixels, mesh.size)),
             images=ready,
             weights=usable,
-            values=samples[0],
-            gradient_x=samples[1],
-            gradient_y=samples[2],
+            values=pixels.gather(ready),
+            gradient_x=gradient_x,
+            gradient_y=gradient_y,
             pixel_weights=weighted,
             prefilter=prefilter,
         )
@@ -231,14 +227,12 @@ def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
     return image.astype(bool)
 
 
-def _values_and_gradient(image: FloatImage, pixels: PixelMap) -> FloatImage:
-    """Value and spline gradient (3, P) of an image at the owned pixels."""
-    coefficients = spline_coefficients(image)
-    slope, mean = np.array([-0.5, 0, 0.5], dtype=np.float32), np.array([1, 4, 1], dtype=np.float32) / 6
-    gradient = [cv2.sepFilter2D(coefficients, -1, *taps)[PAD:-PAD, PAD:-PAD] for taps in ((slope, mean), (mean, slope))]
-    top, left, height, width = pixels.bounds
-    part = slice(top, top + height), slice(left, left + width)
-    return pixels.from_window(np.stack([image[part], *(component[part] for component in gradient)]))
+def _gradient(images: FloatImage, pixels: PixelMap) -> FloatImage:
+    """Spline gradient (2, k, P) of images (k, H, W) at the owned pixels."""
+    gradient = np.empty((2, len(images), pixels.local_x.size), dtype=np.float32)
+    for light, image in enumerate(images):
+        pixel_gradient(pixels.lines, spline_coefficients(image), *pixels.bounds[:2], *gradient[:, light])
+    return gradient
 
 
 def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap) -> FloatImage:
@@ -247,6 +241,8 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
     The mean over the lights of their `gradient`. A light's own gradient meets its own residual: what the lattice of
     one camera colour makes of a reflection's sparkle, the same in both, then pulls to whole pixels.
     """
+    if gradient.shape[1] == 1:
+        return gradient
     used = np.asarray(weights > 0, dtype=np.float32)
     mean = (gradient * used).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
     square = window_means(pixels, (mean**2).sum(axis=0)[None], used.max(axis=0)[None])
