@@ -162,12 +162,13 @@ def pull_back(deformed_weight, reference_weight, pixels, mesh, displacement):
     return out
 
 
-def element_vector(first, second, pixels):
-    """Sums (E, 3, 2) of two pixel fields times the shape functions."""
+def element_vector(weight, values, first, second, pixels):
+    """Sums (E, 3, 2) of two weighted products of pixel fields times the shape functions."""
     out = np.zeros((len(pixels.offsets) - 1, 3, 2))
     for e, i in owned(pixels):
         for a, phi in enumerate(shape_functions(pixels, e, i)):
-            out[e, a] += float(first[i]) * phi, float(second[i]) * phi
+            weighted = float(weight[i]) * float(values[i]) * phi
+            out[e, a] += weighted * float(first[i]), weighted * float(second[i])
     return out
 
 

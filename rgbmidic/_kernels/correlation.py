@@ -380,8 +380,9 @@ def element_sums(start, stop, values, factor, offsets, out):
 
 @over_ranges("out")
 @compiled(fastmath=_FAST)
-def element_vector(start, stop, first, second, local_x, local_y, offsets, barycentric, out):
-    """Projection of two pixel fields on the shape functions: ``out`` (E, 3, 2) receives their sums times phi."""
+def element_vector(start, stop, weight, values, first, second, local_x, local_y, offsets, barycentric, out):
+    """Projection of two fields on the shape functions: ``out`` (E, 3, 2) receives the sums of ``weight values first
+    phi`` and ``weight values second phi``, all (P,) float32."""
     for e in range(start, stop):
         b00 = np.float32(barycentric[e, 0, 0])
         b01 = np.float32(barycentric[e, 0, 1])
@@ -393,12 +394,14 @@ def element_vector(start, stop, first, second, local_x, local_y, offsets, baryce
         for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
             l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
-            p0 += first[i] * l0
-            p1 += first[i] * l1
-            p2 += first[i]
-            q0 += second[i] * l0
-            q1 += second[i] * l1
-            q2 += second[i]
+            weighted = weight[i] * values[i]
+            p, q = weighted * first[i], weighted * second[i]
+            p0 += p * l0
+            p1 += p * l1
+            p2 += p
+            q0 += q * l0
+            q1 += q * l1
+            q2 += q
         out[e, 0, 0], out[e, 0, 1] = p0, q0
         out[e, 1, 0], out[e, 1, 1] = p1, q1
         out[e, 2, 0], out[e, 2, 1] = p2 - p0 - p1, q2 - q0 - q1

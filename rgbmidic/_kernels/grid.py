@@ -13,7 +13,7 @@ from rgbmidic._kernels.interpolation import _FAST
 from rgbmidic._kernels.texture import expand_row
 from rgbmidic._kernels.threads import over_ranges
 
-__all__ = ["block_sums", "from_grid", "from_image", "product_sums", "score_sums", "to_image"]
+__all__ = ["block_sums", "from_grid", "from_image", "product_sums", "to_image"]
 
 
 _ZERO = np.float32(0.0)
@@ -32,10 +32,9 @@ def block_sums(start, stop, values, lines, line_offsets, side, out):
             columns[:] = 0
             first, last = line_offsets[block * side], line_offsets[min((block + 1) * side, line_offsets.size - 1)]
             for q in range(first, last):
-                slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
-                target, field = columns[lines[q, 3] :], values[n]
+                slot, number, column = np.uint64(lines[q, 0]), np.uint64(lines[q, 1]), np.uint64(lines[q, 3])
                 for i in range(number):
-                    target[i] += field[slot + i]
+                    columns[column + i] += values[n, slot + i]
             _gather(columns, side, out[n, block])
 
 
@@ -51,67 +50,46 @@ def product_sums(start, stop, values, weights, lines, line_offsets, side, out):
         sums[:] = 0
         for row in range(block * side, min((block + 1) * side, line_offsets.size - 1)):
             for light in range(lights):
-                _to_row(row, values[light], lines, line_offsets, field[light])
-                _to_row(row, weights[light], lines, line_offsets, root[light])
+                own, w = field[light], root[light]
+                _to_row(row, values[light], lines, line_offsets, own)
+                _to_row(row, weights[light], lines, line_offsets, w)
                 for i in range(np.uint64(width)):
-                    root[light, i] = np.sqrt(root[light, i])
+                    w[i] = np.sqrt(w[i])
+                for i in range(np.uint64(width)):
+                    own[i] *= w[i]
                 for other in range(light + 1):
-                    a, b, v, w = field[light], field[other], root[light], root[other]
+                    b, v = field[other], root[other]
                     product, share = sums[light, other, 0], sums[light, other, 1]
                     for i in range(np.uint64(width)):
-                        s = v[i] * w[i]
-                        product[i] += s * a[i] * b[i]
-                        share[i] += s
+                        product[i] += own[i] * b[i]
+                    for i in range(np.uint64(width)):
+                        share[i] += w[i] * v[i]
         for light in range(lights):
             for other in range(light + 1):
                 for n in range(2):
                     _gather(sums[light, other, n], side, out[light, other, n, block])
 
 
-@over_ranges("out", axis=2)
-@compiled(fastmath=_FAST)
-def score_sums(start, stop, residual, weight, gradient_x, gradient_y, lines, line_offsets, side, out):
-    """Per light, sums over blocks of ``w r gx``, ``w r gy``, ``w (gx gx + gy gy)`` and of the pixels with weight.
-
-    The fields are (k, P) float32; `out` (k, 4, h, w) float64.
-    """
-    columns = np.empty((4, out.shape[3] * side), dtype=np.float32)
-    for light in range(len(weight)):
-        r, w, gx, gy = residual[light], weight[light], gradient_x[light], gradient_y[light]
-        for block in range(start, stop):
-            columns[:] = 0
-            first, last = line_offsets[block * side], line_offsets[min((block + 1) * side, line_offsets.size - 1)]
-            for q in range(first, last):
-                slot, number, column = np.uint64(lines[q, 0]), np.uint64(lines[q, 1]), lines[q, 3]
-                x, y = columns[0, column:], columns[1, column:]
-                information, pixels = columns[2, column:], columns[3, column:]
-                for i in range(number):
-                    own, along, across = w[slot + i], gx[slot + i], gy[slot + i]
-                    pull = own * r[slot + i]
-                    x[i] += pull * along
-                    y[i] += pull * across
-                    information[i] += own * (along * along + across * across)
-                    pixels[i] += _ONE if own > _ZERO else _ZERO
-            for n in range(4):
-                _gather(columns[n], side, out[light, n, block])
-
-
-@helper(forceinline=True)
-def _filled(slot, number, size):
-    """So many pixels in whole vectors, where memory goes on so far."""
-    filled = (number + _LANES - 1) // _LANES * _LANES
-    return filled if slot + filled <= size else number
-
-
 @helper(fastmath=_FAST)
 def _to_row(row, values, lines, line_offsets, out):
-    """A row of the image of `values` (P,), 0 where no pixel is owned; `out` is longer by a vector."""
-    out[:] = 0
+    """A row of the image of `values` (P,), 0 where no pixel is owned; `out` is longer by a vector.
+
+    Whole vectors are copied, where memory goes on so far: the next line overwrites what is too much, or a gap does.
+    """
+    filled = np.int64(0)
     for q in range(line_offsets[row], line_offsets[row + 1]):
-        slot, number = np.int64(lines[q, 0]), np.int64(lines[q, 1])
-        source, target = values[slot:], out[lines[q, 3] :]
-        for i in range(np.uint32(_filled(slot, number, values.size))):  # what is too much, the next line overwrites
-            target[i] = source[i] if np.int32(i) < np.int32(number) else _ZERO
+        slot, number, column = np.int64(lines[q, 0]), np.int64(lines[q, 1]), np.int64(lines[q, 3])
+        for i in range(np.uint64(filled), np.uint64(column)):
+            out[i] = _ZERO
+        whole = (number + _LANES - 1) // _LANES * _LANES
+        if slot + whole > values.size:
+            whole = number
+        first, target = np.uint64(slot), np.uint64(column)
+        for i in range(np.uint32(whole)):
+            out[target + i] = values[first + i]
+        filled = column + number
+    for i in range(np.uint64(filled), np.uint64(out.size)):
+        out[i] = _ZERO
 
 
 @helper(fastmath=_FAST)
@@ -132,9 +110,9 @@ def to_image(start, stop, lines, values, top, left, out):
     for n in range(len(values)):
         for q in range(start, stop):
             slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
-            target = out[n, top + lines[q, 2], left + lines[q, 3] :]
+            row, column = np.uint64(top + lines[q, 2]), np.uint64(left + lines[q, 3])
             for i in range(number):
-                target[i] = values[n, slot + i]
+                out[n, row, column + i] = values[n, slot + i]
 
 
 @over_ranges("lines")
@@ -144,25 +122,22 @@ def from_image(start, stop, lines, image, top, left, out):
     for n in range(len(image)):
         for q in range(start, stop):
             slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
-            source = image[n, top + lines[q, 2], left + lines[q, 3] :]
+            row, column = np.uint64(top + lines[q, 2]), np.uint64(left + lines[q, 3])
             for i in range(number):
-                out[n, slot + i] = source[i]
+                out[n, slot + i] = image[n, row, column + i]
 
 
-@over_ranges("lines")
-@compiled()
-def from_grid(start, stop, lines, grid, side, out):
+@over_ranges("line_offsets")
+@compiled(fastmath=_FAST)
+def from_grid(start, stop, lines, line_offsets, grid, side, out):
     """Grids (n, h, w) float32 of blocks of `side` px interpolated linearly between their centres, constant beyond the
     outermost, at the owned pixels: ``out`` (n, P)."""
     row = np.empty(grid.shape[2] * side, dtype=np.float32)
     between = np.empty(grid.shape[2], dtype=np.float32)
-    for n in range(len(grid)):
-        on = -1
-        for q in range(start, stop):
-            if lines[q, 2] != on:
-                on = lines[q, 2]
-                expand_row(grid[n], on, side, between, row)
-            slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
-            source = row[lines[q, 3] :]
-            for i in range(number):
-                out[n, slot + i] = source[i]
+    for r in range(start, min(stop, line_offsets.size - 1)):
+        for n in range(len(grid)):
+            expand_row(grid[n], r, side, between, row)
+            for q in range(line_offsets[r], line_offsets[r + 1]):
+                slot, number, column = np.uint64(lines[q, 0]), np.uint64(lines[q, 1]), np.uint64(lines[q, 3])
+                for i in range(number):
+                    out[n, slot + i] = row[column + i]

@@ -1,4 +1,4 @@
-"""Compiled loops over the owned pixels that make weights from the lights' residuals."""
+"""Compiled loops over the owned pixels that make weights and scores from the lights' residuals."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from rgbmidic._kernels.compilation import compiled
 from rgbmidic._kernels.interpolation import _FAST
 from rgbmidic._kernels.threads import over_ranges
 
-__all__ = ["best_mean", "robust_weights"]
+__all__ = ["best_mean", "robust_weights", "scores"]
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -61,3 +61,26 @@ def robust_weights(start, stop, mean, variance, trusted, unit, freedom, share, b
             own = share[light, chunk]
             for i in range(np.uint64(own.size)):
                 own[i] *= factor[i]
+
+
+@over_ranges("out", axis=1, grain=_CHUNK)
+@compiled(fastmath=_FAST)
+def scores(start, stop, residual, weights, gradient_x, gradient_y, out):
+    """Sums over the lights of ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)``, and 1 where one of them has weight,
+    else 0: ``out`` (4, P) from fields (k, P)."""
+    for first in range(start, stop, _CHUNK):
+        chunk = slice(first, min(first + _CHUNK, stop))
+        x, y, information, used = out[0, chunk], out[1, chunk], out[2, chunk], out[3, chunk]
+        out[:, chunk] = 0
+        for light in range(len(weights)):
+            r, w = residual[light, chunk], weights[light, chunk]
+            gx, gy = gradient_x[light, chunk], gradient_y[light, chunk]
+            # loops that write to one place each: a loop over many arrays is not vectorised
+            for i in range(np.uint64(x.size)):
+                x[i] += w[i] * r[i] * gx[i]
+            for i in range(np.uint64(x.size)):
+                y[i] += w[i] * r[i] * gy[i]
+            for i in range(np.uint64(x.size)):
+                information[i] += w[i] * (gx[i] * gx[i] + gy[i] * gy[i])
+            for i in range(np.uint64(x.size)):
+                used[i] = max(used[i], _ONE if w[i] > _ZERO else _ZERO)

@@ -50,11 +50,10 @@ def expand_row(grid, row, block, line, out):
         out[j] = line[0]
     per_pixel = np.float32(1.0 / block)
     ahead = np.float32(0.5 - 0.5 * (block % 2))  # of the first pixel beyond a block's centre
-    for g in range(last):
-        start = half + g * block
-        level, slope = line[g], (line[g + 1] - line[g]) * per_pixel
-        for j in range(min(block, out.size - start)):
-            out[start + j] = level + slope * (np.float32(j) + ahead)
+    for j in range(block):
+        part, start = (np.float32(j) + ahead) * per_pixel, half + j
+        for g in range(np.uint64(max(min(last, (out.size - start + block - 1) // block), 0))):
+            out[np.uint64(start) + g * np.uint64(block)] = line[g] + part * (line[g + np.uint64(1)] - line[g])
     for j in range(half + last * block, out.size):
         out[j] = line[last]
 

@@ -56,9 +56,8 @@ def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: Floa
     system = assembly.matrix(reference.blocks(weight, g, np.ones_like(g)))
     smooth = _SMOOTHNESS * system.diagonal().mean() * assembly.smoothness
     parts = np.zeros((len(reference.mesh.elements), 3, 2))
-    wf = weight * f
     geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
-    element_vector(wf * g, wf, *geometry, parts)
+    element_vector(weight, f, g, np.ones_like(g), *geometry, parts)
     nodal = factorise((system + smooth).tocsc())(assembly.vector(parts)).reshape(-1, 2)
     fields = np.empty((2, f.size), dtype=np.float32)
     interpolate_nodal(nodal, reference.mesh.elements, *geometry, fields)

@@ -81,11 +81,19 @@ def compare(problem: Problem, values: FloatImage, estimate: Estimate) -> Residua
 
 @stage("iteration")
 def iterate(
-    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, tolerance: float
+    problem: Problem,
+    equations: Equations,
+    values: FloatImage,
+    residual: Residual,
+    estimate: Estimate,
+    tolerance: float,
 ) -> Estimate:
-    """Gauss-Newton iterations with one Hessian until no textured node moves by more than `tolerance` px."""
+    """Gauss-Newton iterations with one Hessian until no textured node moves by more than `tolerance` px, from an
+    estimate whose `residual` is known, for reference grey levels `values` (k, P)."""
+    known: FloatImage | None = residual.difference_from(values)
     for turn in range(min(_PASS_ITERATIONS, problem.options.max_iterations - len(estimate.increments))):
-        estimate = _stepped(problem, equations, values, estimate)
+        estimate = _stepped(problem, equations, values, estimate, known)
+        known = None
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
         # a few nodes that wander where nothing matches must not keep the others waiting
@@ -95,9 +103,11 @@ def iterate(
     return estimate
 
 
-def _stepped(problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate) -> Estimate:
-    """One Gauss-Newton iteration."""
-    right_side, rigid_side = _right_sides(problem, equations, values, estimate)
+def _stepped(
+    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
+) -> Estimate:
+    """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
+    right_side, rigid_side = _right_sides(problem, equations, values, estimate, known)
     motion, shifts = equations.increment(right_side, rigid_side)
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
@@ -116,15 +126,18 @@ def _stepped(problem: Problem, equations: Equations, values: FloatImage, estimat
 
 
 def _right_sides(
-    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate
+    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
 ) -> tuple[FloatArray, FloatArray]:
     """Right-hand sides of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
     bend = problem.reference.assembly.smoothness @ estimate.displacement.ravel()
     total = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
     rigid = []
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
-        given = values[light], equations.weights[light], displacement
-        vector = problem.reference.right_side(problem.deformed, light, *given)
+        weight = equations.weights[light]
+        if known is None:
+            vector = problem.reference.right_side(problem.deformed, light, values[light], weight, displacement)
+        else:
+            vector = problem.reference.projected(light, weight, known[light])
         total += vector
         if light:
             rigid.append(equations.functions.T @ vector)

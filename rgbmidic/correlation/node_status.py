@@ -138,18 +138,16 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
     """Entries xx, xy, yy (3, N) of the own blocks of the chosen `nodes` (N,) in the Hessian that noise alone has: what
     the residual, which holds the noise of both images, differs by from pixel to pixel."""
     reference, pixels = residual.reference, residual.reference.pixels
-    elements = nodes[reference.mesh.elements].any(axis=1)
-    around, counts = np.repeat(elements, np.diff(pixels.offsets)), np.diff(pixels.offsets)[elements]
-    local, offsets = (
-        np.stack([pixels.local_x[around], pixels.local_y[around]]),
-        np.concatenate([[0], np.cumsum(counts)]),
-    )
-    place = *local, offsets, pixels.barycentric[elements]
-    corner = pixels.origin[elements] - pixels.bounds[1::-1]
-    column, row = local.astype(np.int64) + np.repeat(corner.T, counts, axis=1)
+    mesh = reference.mesh
+    elements = np.asarray(nodes[mesh.elements].any(axis=1))
+    around, column, row = pixels.of_elements(elements)
+    beside, columns_beside, rows_beside = pixels.of_elements(np.asarray(mesh.beside(nodes)[mesh.elements].any(axis=1)))
+    offsets = np.concatenate([[0], np.cumsum(np.diff(pixels.offsets)[elements])])
+    place = pixels.local_x[around], pixels.local_y[around], offsets, pixels.barycentric[elements]
     own, total = np.zeros((int(elements.sum()), 3, 3, 3)), np.zeros((elements.size, 3, 3, 3))
+    image = np.zeros([side + 1 for side in pixels.shape], dtype=np.float32)
     for weight, difference in zip(weights, residual.difference, strict=True):
-        image = np.pad(pixels.window(difference[None] / np.float32(np.sqrt(2)))[0], ((0, 1), (0, 1)))
+        image[rows_beside, columns_beside] = difference[beside] / np.float32(np.sqrt(2))
         here = image[row, column]
         slopes = image[row, column + 1] - here, image[row + 1, column] - here
         element_hessian(*slopes, weight[around], *place, own)

@@ -70,7 +70,7 @@ def learn_precision(residual: Residual) -> Precision:
     best_mean(share, weights, residual.difference, mean, used)
     around = spread(pixels, window_means(pixels, (mean**2)[None], used[None]))[0]
     np.maximum(around, floor / len(share), out=around)
-    trusted = displacing_share(residual.reference, mean, share > 0, around)
+    trusted = displacing_share(residual.reference, mean, used / around)
     trusted *= around
     unit = np.median(_some(trusted, used)) if used.any() else np.float32(0)
     robust_weights(mean, around, trusted, np.float32(unit), np.float32(_FREEDOM), share, bend)

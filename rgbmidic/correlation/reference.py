@@ -8,7 +8,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.correlation import BLOCK, bring_back, element_hessian, element_right_side, element_sums
+from rgbmidic._kernels.correlation import (
+    BLOCK,
+    bring_back,
+    element_hessian,
+    element_right_side,
+    element_sums,
+    element_vector,
+)
 from rgbmidic._kernels.interpolation import pixel_gradient
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
@@ -72,6 +79,8 @@ class Reference:
         Share of the variance of a block's score that the fit leaves in the residual (`unfitted_share`).
     values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
+    texture : ndarray, shape (2, P), float32
+        Gradient of the lights' common texture: the sum of theirs.
     prefilter : str
     """
 
@@ -88,6 +97,7 @@ class Reference:
     gradient_x: FloatImage
     gradient_y: FloatImage
     pixel_weights: FloatImage
+    texture: FloatImage
     prefilter: str
 
     @classmethod
@@ -116,7 +126,7 @@ class Reference:
             usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
         pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
         weighted = pixels.gather(usable)
-        gradient_x, gradient_y = _common_gradient(_gradient(ready, pixels), weighted, pixels)
+        gradient = _common_gradient(_gradient(ready, pixels), weighted, pixels)
         return cls(
             mesh=mesh,
             pixels=pixels,
@@ -124,13 +134,14 @@ class Reference:
             colouring=NodeColouring.from_mesh(mesh),
             material=mesh,
             linear_offset=linear_fit_offset(mesh),
-            unfitted=unfitted_share(pixels, assembly, gradient_x, gradient_y, weighted, block_side(pixels, mesh.size)),
+            unfitted=unfitted_share(pixels, assembly, gradient, weighted, block_side(pixels, mesh.size)),
             images=ready,
             weights=usable,
             values=pixels.gather(ready),
-            gradient_x=gradient_x,
-            gradient_y=gradient_y,
+            gradient_x=gradient[0],
+            gradient_y=gradient[1],
             pixel_weights=weighted,
+            texture=gradient.sum(axis=1),
             prefilter=prefilter,
         )
 
@@ -178,6 +189,13 @@ class Reference:
         element_right_side(
             deformed.coefficients[light], values, *gradient, weight, *self._geometry(), displacement, parts
         )
+        return self.assembly.vector(parts)
+
+    def projected(self, light: int, weight: FloatImage, difference: FloatImage) -> FloatArray:
+        """The same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
+        parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
+        geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+        element_vector(weight, difference, self.gradient_x[light], self.gradient_y[light], *geometry, parts)
         return self.assembly.vector(parts)
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:

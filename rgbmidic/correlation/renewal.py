@@ -221,11 +221,10 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray) 
     residual, known = _residual(reference, deformed, displacement)
     pixels = reference.pixels
     total, parts = np.zeros((len(pixels.origin), 2)), np.zeros((len(pixels.origin), 3, 2))
-    gradients = zip(residual.weights * residual.difference, reference.gradient_x, reference.gradient_y, strict=True)
-    for weighted, gx, gy in gradients:
-        element_vector(
-            weighted * gx, weighted * gy, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, parts
-        )
+    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+    fields = residual.weights, residual.difference, reference.gradient_x, reference.gradient_y
+    for light in zip(*fields, strict=True):
+        element_vector(*light, *geometry, parts)
         total += parts.sum(axis=1)
     total[~known] = np.nan
     return total

@@ -55,6 +55,10 @@ class Residual:
         """Grey levels g(x + u), (k, P); those of f where it is not known."""
         return self.values - self.difference
 
+    def difference_from(self, values: FloatImage) -> FloatImage:
+        """The same difference for other reference grey levels (k, P)."""
+        return self.difference if values is self.values else self.difference + (values - self.values)
+
     def squares(self, weights: FloatImage) -> FloatArray:
         """Sums over each element of w r^2, of w and of the pixels with weight, for the solve's `weights` (k, P);
         shape (k, E, 3)."""

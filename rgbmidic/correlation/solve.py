@@ -107,11 +107,11 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
             break
         equations = _equations(problem, weighting, estimate)
         reached = max(tolerance, FIRST_PASS) if number == 0 else tolerance
-        estimate = iterate(problem, equations, weighting.values, estimate, reached)
+        estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, reached)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
     assert equations is not None
     if estimate.longest > tolerance:
-        estimate = iterate(problem, equations, weighting.values, estimate, tolerance)
+        estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, weighting.values, estimate))
     return estimate, equations, weighting
 

@@ -13,7 +13,7 @@ from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["PixelMap"]
 
@@ -105,17 +105,23 @@ class PixelMap:
         )
 
     @property
-    def rows(self) -> npt.NDArray[np.int32]:
+    def rows(self) -> npt.NDArray[np.int64]:
         """Row of every owned pixel in the image (P,)."""
-        return self._in_image(self.local_y, 1)
+        return self.of_elements(np.ones(len(self.origin), dtype=bool))[2]
 
     @property
-    def columns(self) -> npt.NDArray[np.int32]:
+    def columns(self) -> npt.NDArray[np.int64]:
         """Column of every owned pixel in the image (P,)."""
-        return self._in_image(self.local_x, 0)
+        return self.of_elements(np.ones(len(self.origin), dtype=bool))[1]
 
-    def _in_image(self, local: FloatImage, axis: int) -> npt.NDArray[np.int32]:
-        return local.astype(np.int32) + np.repeat(self.origin[:, axis].astype(np.int32), np.diff(self.offsets))
+    def of_elements(
+        self, chosen: BoolArray
+    ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Slots, columns and rows (n,) of the pixels of the chosen elements (E,)."""
+        counts = np.diff(self.offsets)
+        slots = np.flatnonzero(np.repeat(chosen, counts))
+        x, y = np.repeat(self.origin[chosen].T, counts[chosen], axis=1)
+        return slots, self.local_x[slots].astype(np.int64) + x, self.local_y[slots].astype(np.int64) + y
 
     def gather(self, image: FloatImage) -> FloatImage:
         """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
@@ -145,7 +151,7 @@ class PixelMap:
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
         out = np.empty((len(grids), self.local_x.size), dtype=np.float32)
-        from_grid(self.lines, np.ascontiguousarray(grids, dtype=np.float32), side, out)
+        from_grid(self.lines, self.line_offsets, np.ascontiguousarray(grids, dtype=np.float32), side, out)
         return out
 
     def in_blocks(self, grid: FloatImage, side: int) -> FloatImage:

@@ -38,8 +38,7 @@ def block_side(pixels: PixelMap, element: float) -> int:
 def unfitted_share(
     pixels: PixelMap,
     assembly: Assembly,
-    gradient_x: FloatImage,
-    gradient_y: FloatImage,
+    gradient: FloatImage,
     weights: FloatImage,
     side: int,
 ) -> float:
@@ -55,7 +54,7 @@ def unfitted_share(
     ----------
     pixels, assembly
         Of the mesh.
-    gradient_x, gradient_y, weights : ndarray, shape (k, P), float32
+    gradient, weights : ndarray, shape (2, k, P), (k, P), float32
         Of the reference images.
     side
         Of the blocks, px.
@@ -64,7 +63,7 @@ def unfitted_share(
     def summed(signs: FloatImage | np.float32) -> FloatArray:
         out = np.zeros((len(pixels.origin), 3, 3, 3))
         own, geometry = np.empty_like(out), (pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric)
-        for gx, gy, weight in zip(gradient_x, gradient_y, weights, strict=True):
+        for gx, gy, weight in zip(*gradient, weights, strict=True):
             element_hessian(gx, gy, weight * signs, *geometry, own)
             out += own
         return out

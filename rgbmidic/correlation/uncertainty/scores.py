@@ -9,11 +9,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.grid import score_sums
+from rgbmidic._kernels.robust import scores
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.blocks import BLOCK, block_side
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 __all__ = ["displacing_share", "score_covariance"]
 
@@ -31,27 +31,20 @@ _PRIOR = 0.1
 """Blocks for which the region's typical score counts in that window: beside a hole few blocks speak."""
 
 
-def displacing_share(reference: Reference, difference: FloatImage, used: BoolArray, variance: FloatImage) -> FloatImage:
-    """Variance of the scores of a residual `difference` (P,) over what white noise of that `variance` (P,) would give:
-    with the gradient of that of the lights, where `used` (k, P), that gives most; (P,)."""
-    inverse, ratios = 1 / variance, []
-    for light, own in enumerate(used):
-        x, y, part, count = _score_sums(reference, difference[None], (inverse * own)[None], BLOCK, light)[0]
-        xx, _, yy = _score_ratios(x, y, part, count, BLOCK)
-        ratios.append(xx + yy)
-    most = np.maximum(np.max(ratios, axis=0), _LEAST_RATIO)
-    return np.asarray(reference.pixels.from_blocks(most[None], BLOCK)[0])
+def displacing_share(reference: Reference, difference: FloatImage, weight: FloatImage) -> FloatImage:
+    """Variance of the scores of a residual `difference` (P,) over what white noise would give of which `weight` (P,) is
+    the inverse variance, with the gradient of the lights' common texture; (P,)."""
+    xx, _, yy = _score_ratios(reference, difference[None], weight[None], reference.texture[:, None], BLOCK)
+    share = np.maximum(xx + yy, _LEAST_RATIO)
+    return np.asarray(reference.pixels.from_blocks(share[None], BLOCK)[0])
 
 
 def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArray) -> FloatArray:
     """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P), and with
     its Hessian's element blocks `texture` (E, 3, 3, 3)."""
     reference = residual.reference
-    used = np.asarray(weights.max(axis=0) > 0, dtype=np.float32)
-    side = block_side(reference.pixels, reference.mesh.size)
-    x, y, information, _ = _score_sums(reference, residual.difference, weights, side).sum(axis=0)
-    count = reference.pixels.block_sums(used[None], side)[0]
-    ratios = _score_ratios(x, y, information, count.astype(np.float64), side)
+    side, gradient = block_side(reference.pixels, reference.mesh.size), (reference.gradient_x, reference.gradient_y)
+    ratios = _score_ratios(reference, residual.difference, weights, gradient, side)
     along_x, _, along_y = _per_element(reference, ratios, side) / reference.unfitted
     share = _share_along_x(reference, texture)
     along_x, along_y = along_x / share, along_y / (1 - share)
@@ -68,24 +61,23 @@ def _share_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
     return np.asarray(np.clip(share, _LEAST_SHARE, 1 - _LEAST_SHARE))
 
 
-def _score_sums(
-    reference: Reference, difference: FloatImage, weights: FloatImage, side: int, first: int = 0
+def _score_ratios(
+    reference: Reference,
+    difference: FloatImage,
+    weights: FloatImage,
+    gradient: FloatImage | tuple[FloatImage, FloatImage],
+    side: int,
 ) -> FloatArray:
-    """Sums (n, 4, rows, columns) over blocks of the scores in x and y of n lights from the `first`, their information,
-    and pixels."""
-    pixels, sums = reference.pixels, np.empty((len(weights), 4, *reference.pixels.grid(side)))
-    lights = slice(first, first + len(weights))
-    gradient = reference.gradient_x[lights], reference.gradient_y[lights]
-    score_sums(difference, weights, *gradient, pixels.lines, pixels.line_offsets, side, sums)
-    return sums
-
-
-def _score_ratios(x: FloatArray, y: FloatArray, information: FloatArray, count: FloatArray, side: int) -> FloatArray:
     """Covariance (xx, xy, yy) of the scores of blocks over their information; shape (3, rows, columns).
+
+    The scores are those of all lights together, for fields (k, P) and their `gradient` in x and y.
 
     A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
     smooth, and averaged, is its ratio to the information; xx + yy is 1 for white noise and ideal weights.
     """
+    fields = np.empty((4, difference.shape[1]), dtype=np.float32)
+    scores(difference, weights, *gradient, fields)
+    x, y, information, count = reference.pixels.block_sums(fields, side).astype(np.float64)
     level = _blur(information, _EVEN) / np.maximum(_blur(count, _EVEN), 1e-6)
     scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
     x, y = x * scale, y * scale

@@ -194,8 +194,8 @@ def test_sums_over_elements_equal_their_naive_twins():
 def test_projection_and_interpolation_of_pixel_fields_equal_their_naive_twins():
     case = scene(10, outlined=True)
     out = np.full((len(case.mesh.elements), 3, 2), 7.0)
-    kernels.element_vector(*case.gradient, *case.on_map, case.pixels.barycentric, out)
-    close(out, naive.element_vector(*case.gradient, case.pixels), scale=1e3)
+    kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, out)
+    close(out, naive.element_vector(case.weight, case.reference, *case.gradient, case.pixels), scale=1e3)
     fields = np.full((2, case.reference.size), 7, dtype=np.float32)
     kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     np.testing.assert_allclose(fields, naive.interpolate_nodal(case.displacement, case.pixels, case.mesh), atol=1e-5)
@@ -231,7 +231,7 @@ def all_outputs(number):
     difference, weights, moments = compared(case, case.image, case.weight)
     kernels.element_squares(case.gradient, case.gradient**2, case.pixels.offsets, squares)
     kernels.element_sums(case.gradient, case.weight, case.pixels.offsets, sums)
-    kernels.element_vector(*case.gradient, *case.on_map, case.pixels.barycentric, vector)
+    kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, vector)
     kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
     found = right, hessian, difference, weights, moments, squares, sums, vector, fields, curved

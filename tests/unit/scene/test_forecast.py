@@ -50,7 +50,7 @@ def test_the_node_constant_is_the_scatter_of_nodes_recovered_from_fits_to_noise(
     parts, loads = np.zeros((len(mesh.elements), 3, 2)), []
     for first, second in noise.reshape(-1, 2, pixels.rows.size):
         geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
-        element_vector(first, second, *geometry, parts)
+        element_vector(*np.ones_like([first, second]), first, second, *geometry, parts)
         loads += [np.bincount(mesh.elements.ravel(), weights=parts[..., c].ravel()) for c in (0, 1)]
     found = recovery.value @ np.linalg.solve(mass_matrix(mesh).toarray(), np.transpose(loads))
     inner = (abs(mesh.nodes - 75) < 40).all(axis=1)  # as many nodes with eight triangles as with four
