@@ -16,7 +16,7 @@ from rgbmidic._kernels.correlation import (
     element_sums,
     element_vector,
 )
-from rgbmidic._kernels.interpolation import PAD
+from rgbmidic._kernels.interpolation import pixel_gradient
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.images import spline_coefficients, spline_values, usable_pixels
 from rgbmidic.correlation.recovery import linear_fit_offset
@@ -128,10 +128,9 @@ class Reference:
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
             usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
         pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
-        samples = np.stack([_values_and_gradient(spline, pixels) for spline in coefficients], axis=1)
+        ready = spline_values(coefficients)
         weighted = pixels.gather(usable)
-        samples[1:] = _common_gradient(samples[1:], weighted, pixels)
-        used = np.sqrt(weighted)
+        gradient = _common_gradient(_gradient(coefficients, pixels), weighted, pixels)
         return cls(
             mesh=mesh,
             pixels=pixels,
@@ -139,16 +138,14 @@ class Reference:
             colouring=NodeColouring.from_mesh(mesh),
             material=mesh,
             linear_offset=linear_fit_offset(mesh),
-            unfitted=unfitted_share(
-                pixels, assembly, samples[1] * used, samples[2] * used, block_side(pixels, mesh.size)
-            ),
-            images=spline_values(coefficients),
+            unfitted=unfitted_share(pixels, assembly, gradient, weighted, block_side(pixels, mesh.size)),
+            images=ready,
             weights=usable,
-            values=samples[0],
-            gradient_x=samples[1],
-            gradient_y=samples[2],
+            values=pixels.gather(ready),
+            gradient_x=gradient[0],
+            gradient_y=gradient[1],
             pixel_weights=weighted,
-            texture=samples[1:].sum(axis=1),
+            texture=gradient.sum(axis=1),
             prefilter=prefilter,
         )
 
@@ -249,13 +246,12 @@ def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
     return image.astype(bool)
 
 
-def _values_and_gradient(coefficients: FloatImage, pixels: PixelMap) -> FloatImage:
-    """Value and gradient (3, P) of a spline at the owned pixels."""
-    slope, mean = np.array([-0.5, 0, 0.5], dtype=np.float32), np.array([1, 4, 1], dtype=np.float32) / 6
-    top, left, height, width = pixels.bounds
-    part = slice(top + PAD, top + PAD + height), slice(left + PAD, left + PAD + width)
-    taps = (mean, mean), (slope, mean), (mean, slope)
-    return pixels.from_window(np.stack([cv2.sepFilter2D(coefficients, -1, *pair)[part] for pair in taps]))
+def _gradient(coefficients: FloatImage, pixels: PixelMap) -> FloatImage:
+    """Gradient (2, k, P) of splines at the owned pixels."""
+    gradient = np.empty((2, len(coefficients), pixels.local_x.size), dtype=np.float32)
+    for light, spline in enumerate(coefficients):
+        pixel_gradient(pixels.lines, spline, *pixels.bounds[:2], *gradient[:, light])
+    return gradient
 
 
 def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap) -> FloatImage:
@@ -264,6 +260,8 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
     The mean over the lights of their `gradient`. A light's own gradient meets its own residual: what the lattice of
     one camera colour makes of a reflection's sparkle, the same in both, then pulls to whole pixels.
     """
+    if gradient.shape[1] == 1:
+        return gradient
     used = np.asarray(weights > 0, dtype=np.float32)
     mean = (gradient * used).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
     square = window_means(pixels, (mean**2).sum(axis=0)[None], used.max(axis=0)[None])
