@@ -65,7 +65,7 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     mesh = Tri3Mesh.from_region(region, 25)
     reference, deformed = Reference.prepare(image, region, mesh=mesh), Deformed.prepare(image)
     motion = (mesh.nodes - size / 2) @ np.array([[0.01, 0.035], [-0.035, 0.01]])
-    owned, count, elements = reference.pixels.rows.size, size * size, len(mesh.elements)
+    owned, count, elements = reference.pixels.local_x.size, size * size, len(mesh.elements)
     difference, weight = np.empty((2, owned), np.float32)
     values, weights = reference.values[0], reference.pixel_weights[0]
     coefficients = np.empty((size + 2 * PAD,) * 2, np.float32)

@@ -104,24 +104,25 @@ def _gather(columns, side, out):
 
 @over_ranges("lines")
 @compiled()
-def to_image(start, stop, lines, values, out):
-    """Fields (n, P) float32 of the owned pixels as images: ``out`` (n, h, w)."""
+def to_image(start, stop, lines, values, top, left, out):
+    """Fields (n, P) float32 of the owned pixels as images ``out`` (n, H, W), in which the rectangle begins at row `top`
+    and column `left`."""
     for n in range(len(values)):
         for q in range(start, stop):
             slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
-            row, column = np.uint64(lines[q, 2]), np.uint64(lines[q, 3])
+            row, column = np.uint64(top + lines[q, 2]), np.uint64(left + lines[q, 3])
             for i in range(number):
                 out[n, row, column + i] = values[n, slot + i]
 
 
 @over_ranges("lines")
 @compiled()
-def from_image(start, stop, lines, image, out):
-    """The way back: ``out`` (n, P) from images (n, h, w)."""
+def from_image(start, stop, lines, image, top, left, out):
+    """The way back: ``out`` (n, P) from such images (n, H, W)."""
     for n in range(len(image)):
         for q in range(start, stop):
             slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
-            row, column = np.uint64(lines[q, 2]), np.uint64(lines[q, 3])
+            row, column = np.uint64(top + lines[q, 2]), np.uint64(left + lines[q, 3])
             for i in range(number):
                 out[n, slot + i] = image[n, row, column + i]
 

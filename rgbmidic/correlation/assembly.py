@@ -22,10 +22,10 @@ class Assembly:
 
     Attributes
     ----------
-    entries, own : csr_matrix, shape (nonzeros, 27 E), (3 N, 27 E)
-        Sum element blocks into the data of the assembled matrix, and into entries xx, xy, yy of the nodes' own blocks.
-    corners : csr_matrix, shape (2 N, 6 E)
-        Sums element vectors into that of the unknowns.
+    entries : csc_matrix, shape (nonzeros, 27 E)
+        Sums element blocks into the data of the assembled matrix.
+    corners : csc_matrix, shape (N, 3 E)
+        Sums values at the corners of the elements at the nodes.
     smoothness : csc_matrix, shape (2 N, 2 N)
         Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal; in the structure of the
         assembled matrices.
@@ -35,9 +35,8 @@ class Assembly:
         A third of the area of the elements around each node, square px.
     """
 
-    entries: sp.csr_matrix
-    own: sp.csr_matrix
-    corners: sp.csr_matrix
+    entries: sp.csc_matrix
+    corners: sp.csc_matrix
     smoothness: sp.csc_matrix
     diagonal: FloatArray
     nodal_area: FloatArray
@@ -45,24 +44,27 @@ class Assembly:
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh) -> Assembly:
         """Structure of the equations of a mesh."""
-        unknowns = (2 * mesh.elements.astype(np.int64)[:, :, None] + np.arange(2)).reshape(-1, 6)
-        size = 2 * len(mesh.nodes)
-        rows = np.repeat(unknowns, 6, axis=1).ravel()
-        columns = np.tile(unknowns, 6).ravel()
-        keys, slots = np.unique(columns * size + rows, return_inverse=True)
-        part = np.arange(27 * len(mesh.elements)).reshape(-1, 3, 3, 3)
-        full = part[..., [0, 1, 1, 2]].reshape(-1, 3, 3, 2, 2).transpose(0, 1, 3, 2, 4)
-        own = 3 * mesh.elements[..., None] + np.arange(3)
-        indptr = np.searchsorted(keys, np.arange(size + 1) * size)
-        structure = (keys % size).astype(np.int32), indptr.astype(np.int32)
-        laplacian, data = sp.coo_matrix(_laplacian(mesh)), np.zeros(len(keys))
-        data[np.searchsorted(keys, laplacian.col.astype(np.int64) * size + laplacian.row)] = laplacian.data
+        count, corners = len(mesh.nodes), mesh.elements.astype(np.int64)
+        keys, pair = np.unique(corners[:, None, :] * count + corners[:, :, None], return_inverse=True)
+        row, column = keys % count, keys // count
+        degree = np.bincount(column)
+        ahead = np.cumsum(degree) - degree
+        component = np.arange(2)
+        indptr = np.append(4 * ahead[:, None] + 2 * degree[:, None] * component, 4 * len(keys)).astype(np.int32)
+        # the entry of each pair of nodes, its component in the row, its component in the column
+        slots = 2 * (np.arange(len(keys)) + ahead[column])[:, None, None] + component[:, None]
+        slots = slots + 2 * degree[column, None, None] * component
+        indices, smooth, diagonal = np.empty(slots.size, dtype=np.int32), np.zeros(slots.size), np.zeros(slots.size)
+        indices[slots] = (2 * row[:, None] + component)[:, :, None]
+        smooth[slots[:, component, component]] = (np.where(row == column, degree[row] - 1, -1) / (degree - 1).mean())[
+            :, None
+        ]
+        diagonal[slots[row == column][:, component, component]] = 1
         return cls(
-            entries=_sums(slots.ravel(), full.ravel(), (len(keys), part.size)),
-            own=_sums(own.ravel(), np.einsum("eaad->ead", part).ravel(), (3 * len(mesh.nodes), part.size)),
-            corners=_sums(unknowns.ravel(), np.arange(unknowns.size), (size, unknowns.size)),
-            smoothness=sp.csc_matrix((data, *structure), shape=(size, size)),
-            diagonal=(keys % size == keys // size).astype(np.float64),
+            entries=_sums(slots[pair], np.tile([1, 2, 1], 9 * len(corners)), slots.size),
+            corners=_sums(corners, np.ones(corners.size, dtype=int), count),
+            smoothness=sp.csc_matrix((smooth, indices, indptr), shape=(2 * count, 2 * count)),
+            diagonal=diagonal,
             nodal_area=mesh.to_nodes(mesh.areas / 3),
         )
 
@@ -80,29 +82,21 @@ class Assembly:
 
     def node_blocks(self, blocks: FloatArray) -> FloatArray:
         """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""
-        return np.ascontiguousarray((self.own @ blocks.ravel()).reshape(-1, 3).T)
+        own = np.einsum("eaad->ead", blocks).reshape(-1, 3)
+        return np.ascontiguousarray((self.corners @ own).T)
 
     def vector(self, parts: FloatArray) -> FloatArray:
         """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""
-        return np.asarray(self.corners @ parts.ravel())
+        return np.asarray(self.corners @ parts.reshape(-1, 2)).ravel()
 
 
-def _sums(rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64], shape: tuple[int, int]) -> sp.csr_matrix:
-    """The matrix that adds up entries: 1 at each pair of a row and a column."""
-    return sp.csr_matrix((np.ones(rows.size), (rows, columns)), shape=shape)
+def _sums(rows: npt.NDArray[np.int64], number: npt.NDArray[np.int64], count: int) -> sp.csc_matrix:
+    """The matrix that adds up entries: each of its columns counts in the next `number` of the `rows`."""
+    indptr = np.concatenate([[0], np.cumsum(number)])
+    return sp.csc_matrix((np.ones(rows.size), rows.ravel(), indptr), shape=(count, number.size))
 
 
 def factorise(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
     """Factorise a symmetric positive definite matrix; gives the function that solves for right-hand sides."""
     factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return factors.solve
-
-
-def _laplacian(mesh: Tri3Mesh) -> sp.csc_matrix:
-    count = len(mesh.nodes)
-    i, j = mesh.neighbours.T
-    adjacency = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
-    adjacency = adjacency + adjacency.T
-    degree = np.asarray(adjacency.sum(axis=1)).ravel()
-    laplacian = (sp.diags(degree) - adjacency) / degree.mean()
-    return sp.csc_matrix(sp.kron(laplacian, sp.eye(2)))

@@ -50,7 +50,8 @@ def brightness_change(
     slots = slots[:: max(1, slots.size // (_ENOUGH * int(chosen.sum())))]
     owner = np.searchsorted(pixels.offsets, slots, side="right") - 1
     step = np.round(np.nan_to_num(motion)).astype(np.int64)[owner]
-    rows, columns = pixels.rows[slots], pixels.columns[slots]
+    place = np.stack([pixels.local_x[slots], pixels.local_y[slots]]).astype(np.int64)
+    columns, rows = place + pixels.origin[owner].T
     there = rows + step[:, 1], columns + step[:, 0]
     height, width = first.shape[1:]
     inside = (there[0] >= 0) & (there[0] < height) & (there[1] >= 0) & (there[1] < width)

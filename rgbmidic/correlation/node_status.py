@@ -138,17 +138,16 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
     """Entries xx, xy, yy (3, N) of the own blocks of the chosen `nodes` (N,) in the Hessian that noise alone has: what
     the residual, which holds the noise of both images, differs by from pixel to pixel."""
     reference, pixels = residual.reference, residual.reference.pixels
-    mesh, counts = reference.mesh, np.diff(pixels.offsets)
-    elements = nodes[mesh.elements].any(axis=1)
-    around = np.flatnonzero(np.repeat(elements, counts))
-    beside = np.flatnonzero(np.repeat(mesh.beside(nodes)[mesh.elements].any(axis=1), counts))
-    row, column = pixels.rows[around], pixels.columns[around]
-    offsets = np.concatenate([[0], np.cumsum(counts[elements])])
+    mesh = reference.mesh
+    elements = np.asarray(nodes[mesh.elements].any(axis=1))
+    around, column, row = pixels.of_elements(elements)
+    beside, columns_beside, rows_beside = pixels.of_elements(np.asarray(mesh.beside(nodes)[mesh.elements].any(axis=1)))
+    offsets = np.concatenate([[0], np.cumsum(np.diff(pixels.offsets)[elements])])
     place = pixels.local_x[around], pixels.local_y[around], offsets, pixels.barycentric[elements]
     own, total = np.zeros((int(elements.sum()), 3, 3, 3)), np.zeros((elements.size, 3, 3, 3))
     image = np.zeros([side + 1 for side in pixels.shape], dtype=np.float32)
     for weight, difference in zip(weights, residual.difference, strict=True):
-        image[pixels.rows[beside], pixels.columns[beside]] = difference[beside] / np.float32(np.sqrt(2))
+        image[rows_beside, columns_beside] = difference[beside] / np.float32(np.sqrt(2))
         here = image[row, column]
         slopes = image[row, column + 1] - here, image[row + 1, column] - here
         element_hessian(*slopes, weight[around], *place, own)

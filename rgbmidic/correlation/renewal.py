@@ -201,7 +201,7 @@ def _region(first: Reference, mesh: Tri3Mesh, measured: BoolArray, shape: tuple[
     """
     whole, cracks = np.asarray(measured[mesh.elements].all(axis=1)), first.mesh.crack_edges
     mask = _covered(mesh, whole, shape) & ~drawn(mesh.nodes[cracks], shape)
-    if first.pixels.rows.size == first.pixels.bounds[2] * first.pixels.bounds[3] and not len(cracks):
+    if first.pixels.local_x.size == first.pixels.bounds[2] * first.pixels.bounds[3] and not len(cracks):
         side = 2 * usable_reach(first.prefilter) + 1
         grown = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), dtype=np.uint8)) > 0
         mask |= grown & ~_covered(mesh, ~whole, shape)
@@ -211,7 +211,7 @@ def _region(first: Reference, mesh: Tri3Mesh, measured: BoolArray, shape: tuple[
 def _covered(mesh: Tri3Mesh, chosen: BoolArray, shape: tuple[int, ...]) -> BoolArray:
     """Pixels (H, W) of the chosen elements (E,)."""
     owner = np.full(shape, -1, dtype=np.int32)
-    claim_pixels(mesh.nodes, mesh.elements[chosen], owner, np.zeros(int(chosen.sum()), dtype=np.int64))
+    claim_pixels(mesh.nodes, mesh.elements[chosen], owner)
     return owner >= 0
 
 

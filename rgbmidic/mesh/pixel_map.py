@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.grid import block_sums, from_grid, from_image, to_image
-from rgbmidic._kernels.mesh import claim_pixels, list_pixels
+from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["PixelMap"]
 
@@ -27,8 +27,6 @@ class PixelMap:
 
     Attributes
     ----------
-    rows, columns : ndarray, shape (P,), int32
-        Image position of each pixel.
     offsets : ndarray, shape (E + 1,), int64
         Element e owns the slots ``offsets[e]:offsets[e + 1]``.
     origin : ndarray, shape (E, 2), int64
@@ -51,33 +49,17 @@ class PixelMap:
         Row r of `bounds` has the lines ``line_offsets[r]:line_offsets[r + 1]``.
     """
 
-    rows: npt.NDArray[np.int32]
-    columns: npt.NDArray[np.int32]
     offsets: npt.NDArray[np.int64]
     origin: npt.NDArray[np.int64]
     local_x: FloatImage
     local_y: FloatImage
     barycentric: FloatArray
     shape: tuple[int, int]
-    runs: npt.NDArray[np.int32] = field(init=False)
-    run_offsets: npt.NDArray[np.int64] = field(init=False)
-    bounds: tuple[int, int, int, int] = field(init=False)
-    lines: npt.NDArray[np.int32] = field(init=False)
-    line_offsets: npt.NDArray[np.int64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        top, left = int(self.rows.min()), int(self.columns.min())
-        size = int(self.rows.max()) - top + 1, int(self.columns.max()) - left + 1
-        object.__setattr__(self, "bounds", (top, left, *size))
-        first = _run_starts(self.rows, self.columns, self.offsets)
-        length = np.diff(first, append=self.rows.size)
-        runs = np.stack([first, length, self.local_x[first], self.local_y[first]], axis=1).astype(np.int32)
-        object.__setattr__(self, "runs", runs)
-        object.__setattr__(self, "run_offsets", np.searchsorted(first, self.offsets).astype(np.int64))
-        lines = np.stack([first, length, self.rows[first] - top, self.columns[first] - left], axis=1)
-        lines = lines[np.lexsort((lines[:, 3], lines[:, 2]))].astype(np.int32)
-        object.__setattr__(self, "lines", lines)
-        object.__setattr__(self, "line_offsets", np.searchsorted(lines[:, 2], np.arange(size[0] + 1)))
+    runs: npt.NDArray[np.int32]
+    run_offsets: npt.NDArray[np.int64]
+    bounds: tuple[int, int, int, int]
+    lines: npt.NDArray[np.int32]
+    line_offsets: npt.NDArray[np.int64]
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
@@ -91,34 +73,62 @@ class PixelMap:
             No pixel of the region lies in the mesh.
         """
         owner = np.where(region.mask, np.int32(-1), np.int32(-2))
-        counts = np.zeros(len(mesh.elements), dtype=np.int64)
-        claim_pixels(mesh.nodes, mesh.elements, owner, counts)
+        claim_pixels(mesh.nodes, mesh.elements, owner)
         if (owner == -1).any():
-            counts = _claim_rim(owner, counts)
-        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        if offsets[-1] == 0:
+            _claim_rim(owner)
+        element, row, column, length = _owned_rows(owner)
+        if not element.size:
             raise RegionError("no pixel of the region of interest lies in the mesh")
-        rows = np.empty(offsets[-1], dtype=np.int32)
-        columns = np.empty_like(rows)
-        list_pixels(owner, offsets[:-1].copy(), rows, columns)
+        order = np.argsort(element, kind="stable")
+        first = np.empty_like(length)
+        first[order] = np.cumsum(length[order]) - length[order]
+        top, left = int(row.min()), int(column.min())
+        size = int(row.max()) - top + 1, int((column + length).max()) - left
+        lines = np.stack([first, length, row - top, column - left], axis=1)
         corners = mesh.nodes[mesh.elements]
         origin = np.round(corners.mean(axis=1)).astype(np.int64)
-        per_pixel = np.repeat(np.arange(len(counts)), counts)
+        from_origin = column - origin[element, 0], row - origin[element, 1]
+        runs = np.take(np.stack([first, length, *from_origin], axis=1).astype(np.int32), order, axis=0)
+        run_offsets = np.searchsorted(element[order], np.arange(len(origin) + 1))
         return cls(
-            rows=rows,
-            columns=columns,
-            offsets=offsets,
+            offsets=np.append(runs[:, 0], length.sum())[run_offsets],
             origin=origin,
-            local_x=(columns - origin[per_pixel, 0]).astype(np.float32),
-            local_y=(rows - origin[per_pixel, 1]).astype(np.float32),
+            local_x=_counted_up(runs),
+            local_y=np.repeat(runs[:, 3].astype(np.float32), runs[:, 1]),
             barycentric=_shape_functions(corners - origin[:, None]),
             shape=region.mask.shape,
+            runs=runs,
+            run_offsets=run_offsets,
+            bounds=(top, left, *size),
+            lines=lines,
+            line_offsets=np.searchsorted(lines[:, 2], np.arange(size[0] + 1)),
         )
+
+    @property
+    def rows(self) -> npt.NDArray[np.int64]:
+        """Row of every owned pixel in the image (P,)."""
+        return self.of_elements(np.ones(len(self.origin), dtype=bool))[2]
+
+    @property
+    def columns(self) -> npt.NDArray[np.int64]:
+        """Column of every owned pixel in the image (P,)."""
+        return self.of_elements(np.ones(len(self.origin), dtype=bool))[1]
+
+    def of_elements(
+        self, chosen: BoolArray
+    ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Slots, columns and rows (n,) of the pixels of the chosen elements (E,)."""
+        counts = np.diff(self.offsets)
+        slots = np.flatnonzero(np.repeat(chosen, counts))
+        x, y = np.repeat(self.origin[chosen].T, counts[chosen], axis=1)
+        return slots, self.local_x[slots].astype(np.int64) + x, self.local_y[slots].astype(np.int64) + y
 
     def gather(self, image: FloatImage) -> FloatImage:
         """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
-        place = self.rows.astype(np.int64) * self.shape[1] + self.columns
-        return np.take(image.reshape(*image.shape[:-2], -1), place, axis=-1)
+        out = np.empty((*image.shape[:-2], self.local_x.size), dtype=np.float32)
+        images = np.ascontiguousarray(image, dtype=np.float32).reshape(-1, *image.shape[-2:])
+        from_image(self.lines, images, *self.bounds[:2], out.reshape(len(images), -1))
+        return out
 
     def by_element(self, values: FloatImage) -> FloatArray:
         """Sum of values (P,) over the pixels of each element, shape (E,)."""
@@ -132,11 +142,6 @@ class PixelMap:
         _, _, height, width = self.bounds
         return -(-height // side), -(-width // side)
 
-    def blocks(self, side: int) -> npt.NDArray[np.int32]:
-        """Number of the block of `side` px in which each owned pixel lies (P,), row after row of that grid."""
-        top, left, _, _ = self.bounds
-        return (self.rows - top) // side * self.grid(side)[1] + (self.columns - left) // side
-
     def block_sums(self, values: FloatImage, side: int) -> FloatImage:
         """Sums of `values` (n, P) over such blocks, shape (n, rows, columns)."""
         out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
@@ -145,41 +150,49 @@ class PixelMap:
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
-        out = np.empty((len(grids), self.rows.size), dtype=np.float32)
+        out = np.empty((len(grids), self.local_x.size), dtype=np.float32)
         from_grid(self.lines, self.line_offsets, np.ascontiguousarray(grids, dtype=np.float32), side, out)
         return out
+
+    def in_blocks(self, grid: FloatImage, side: int) -> FloatImage:
+        """The value of its block in such a grid (rows, columns) at every owned pixel (P,)."""
+        image = np.repeat(np.repeat(grid, side, axis=1), side, axis=0)[None]
+        out = np.empty((1, self.local_x.size), dtype=np.float32)
+        from_image(self.lines, image, 0, 0, out)
+        return np.asarray(out[0])
 
     def window(self, values: FloatImage) -> FloatImage:
         """`values` (n, P) as images of the rectangle `bounds`; 0 where no pixel is owned."""
         images = np.zeros((len(values), *self.bounds[2:]), dtype=np.float32)
-        to_image(self.lines, values, images)
+        to_image(self.lines, values, 0, 0, images)
         return images
-
-    def from_window(self, images: FloatImage) -> FloatImage:
-        """Such images (n, h, w) at the owned pixels (n, P)."""
-        out = np.empty((len(images), self.rows.size), dtype=np.float32)
-        from_image(self.lines, images, out)
-        return out
 
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
         """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""
         image = np.full(self.shape, fill, dtype=np.float32)
-        image[self.rows, self.columns] = values
+        to_image(self.lines, np.asarray(values, dtype=np.float32)[None], *self.bounds[:2], image[None])
         return image
 
 
-def _run_starts(
-    rows: npt.NDArray[np.int32], columns: npt.NDArray[np.int32], offsets: npt.NDArray[np.int64]
-) -> npt.NDArray[np.intp]:
-    """Slots at which the pixel before is not the neighbour on the left, or belongs to another element."""
-    begins = np.ones(rows.size, dtype=bool)
-    begins[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1] + 1)
-    begins[offsets[:-1][np.diff(offsets) > 0]] = True
-    return np.flatnonzero(begins)
+def _owned_rows(owner: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], ...]:
+    """Owner, row, first column and length of every row of pixels that one element owns, in the order of the image."""
+    begins = np.ones(owner.shape, dtype=bool)
+    np.not_equal(owner[:, 1:], owner[:, :-1], out=begins[:, 1:])
+    start = np.flatnonzero(begins).astype(np.int32)
+    length, element = np.diff(start, append=np.int32(owner.size)), owner.ravel()[start]
+    owned = element >= 0
+    return element[owned], *np.divmod(start[owned], np.int32(owner.shape[1])), length[owned]
 
 
-def _claim_rim(owner: npt.NDArray[np.int32], counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Give free pixels of the region near an owned one to its element, in place; the new number of each element."""
+def _counted_up(runs: npt.NDArray[np.int32]) -> FloatImage:
+    """Position along x of every pixel (P,): that of its run's first, and one more from pixel to pixel."""
+    steps = np.ones(runs[:, 1].sum(), dtype=np.float32)
+    steps[runs[:, 0]] = np.diff(runs[:, 2], prepend=0) - np.concatenate([[0], runs[:-1, 1] - 1])
+    return np.cumsum(steps, out=steps)
+
+
+def _claim_rim(owner: npt.NDArray[np.int32]) -> None:
+    """Give free pixels of the region near an owned one to its element, in place."""
     free = (owner < 0).astype(np.uint8)
     distance, label = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     owned = owner >= 0
@@ -187,10 +200,10 @@ def _claim_rim(owner: npt.NDArray[np.int32], counts: npt.NDArray[np.int64]) -> n
     element_of_label[label[owned]] = owner[owned]
     rim = (owner == -1) & (np.asarray(distance) <= _RIM)
     owner[rim] = element_of_label[label[rim]]
-    return np.bincount(owner[owner >= 0], minlength=len(counts)).astype(np.int64)
 
 
 def _shape_functions(corners: FloatArray) -> FloatArray:
     """Coefficients of the linear shape functions of triangles (E, 3, 2): 1 at their own corner, 0 at the others."""
-    system = np.concatenate([np.ones((len(corners), 3, 1)), corners], axis=2)
-    return np.ascontiguousarray(np.linalg.inv(system).transpose(0, 2, 1))
+    (x1, y1), (x2, y2) = (np.moveaxis(np.roll(corners, turn, axis=1), 2, 0) for turn in (-1, 1))
+    areas = np.stack([x1 * y2 - x2 * y1, y1 - y2, x2 - x1], axis=2)
+    return np.asarray(areas / areas[..., 0].sum(axis=1)[:, None, None])

@@ -80,7 +80,7 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
     """
     value, x, y, xx, xy, yy = polynomials
     element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
-    out = np.zeros((value.shape[1], pixels.rows.size), dtype=np.float32)
+    out = np.zeros((value.shape[1], pixels.local_x.size), dtype=np.float32)
     for corner in range(3):
         node = mesh.elements[element, corner]
         constant, slope_x, slope_y = pixels.barycentric[element, corner].T

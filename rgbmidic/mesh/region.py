@@ -43,6 +43,9 @@ class Region:
     @property
     def width(self) -> int:
         """Diameter in px of the largest disc within the region."""
+        if self.rectangle is not None:
+            x0, y0, x1, y1 = self.rectangle
+            return int(min(np.floor(x1) - np.ceil(x0), np.floor(y1) - np.ceil(y0))) + 1
         distance = cv2.distanceTransform(np.pad(self.mask, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         return round(2 * float(np.max(distance))) - 1
 

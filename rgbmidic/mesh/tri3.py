@@ -86,11 +86,11 @@ class Tri3Mesh:
         """
         if not (np.isfinite(element_size) and element_size >= 4):
             raise InputError(f"element_size must be at least 4 px; given is {element_size!r}")
-        if region.width < NARROW:
-            logger.warning("the region is %d px across: two or three speckles, hardly enough to measure", region.width)
-        elif region.width < element_size:
+        if (width := region.width) < NARROW:
+            logger.warning("the region is %d px across: two or three speckles, hardly enough to measure", width)
+        elif width < element_size:
             logger.warning(
-                "the elements of %g px are larger than the region, which is %d px across", element_size, region.width
+                "the elements of %g px are larger than the region, which is %d px across", element_size, width
             )
         if region.rectangle is not None and not len(cracks):
             nodes, elements = _rectangle_mesh(region.rectangle, element_size)
@@ -189,8 +189,8 @@ class Tri3Mesh:
     @property
     def crack_edges(self) -> npt.NDArray[np.int32]:
         """Edges of both sides of the cracks, shape (C, 2): those at one place that belong to one element each."""
-        edges, place = self._boundary_edges(), np.arange(len(self.nodes))
-        np.minimum.at(place, self.copies[:, 1], self.copies[:, 0])
+        edges, place, copies = self._boundary_edges(), np.arange(len(self.nodes)), self.copies
+        np.minimum.at(place, copies[:, 1], copies[:, 0])
         _, index, count = np.unique(edge_keys(place[edges], len(place)), return_inverse=True, return_counts=True)
         return np.asarray(edges[count[index] > 1])
 

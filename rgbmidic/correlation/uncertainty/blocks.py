@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic._kernels.correlation import element_hessian, element_vector
-from rgbmidic.correlation.assembly import Assembly, factorise
+from rgbmidic._kernels.correlation import element_hessian
+from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.mesh import PixelMap
-from rgbmidic.typing import FloatImage
+from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["BLOCK", "block_side", "unfitted_share"]
 
@@ -19,10 +19,11 @@ _OF_ELEMENT = 0.75
 40 px elements on waves of 3 to 5 elements was 1.5 to 2.3 times the stated one, so 0.8 to 1.2 times (DIC Challenge)."""
 _ACROSS = 4
 """Blocks across a region from which they grow with the element: two of 19 px stated 1.8 times too much."""
-_APART = 4
-"""Blocks between two that are projected together, with random signs: their projections hardly meet."""
-_MANY = 500
-"""Blocks that tell enough: their shares scatter by a fifth."""
+_MANY = 700
+"""Blocks, every other one in both directions, whose projections are told from one another by their random signs to half
+a per cent of the share; where a region has fewer, those further apart are projected together, every fourth at most."""
+_SOLVED = 1e-4
+"""Share of what has been fitted below which an iteration of the conjugate gradients is the last."""
 _ANCHOR = 1e-6
 """Multiple of the identity, over the mean diagonal entry, that holds nodes without texture."""
 _LEAST = 0.05
@@ -35,51 +36,70 @@ def block_side(pixels: PixelMap, element: float) -> int:
 
 
 def unfitted_share(
-    pixels: PixelMap, assembly: Assembly, gradient_x: FloatImage, gradient_y: FloatImage, side: int
+    pixels: PixelMap,
+    assembly: Assembly,
+    gradient: FloatImage,
+    weights: FloatImage,
+    side: int,
 ) -> float:
     """Share of the variance of a block's score that is left after the displacement has been fitted to white noise.
 
     The residual is the noise less its projection P on the columns ``J = grad f phi`` of the least-squares problem. The
     score of block b is the product with ``c = grad f 1_b``, so ``1 - |P c|^2 / |c|^2`` of its variance is left, with
-    ``|P c|^2 = (J^T c)^T (J^T J)^-1 (J^T c)``; the mean over the blocks is returned. It falls from 0.85 for elements of
-    40 px to 0.1 for 4 px, and is not known (NaN) where nothing is left, in a region of about one block.
+    ``|P c|^2 = (J^T c)^T (J^T J)^-1 (J^T c)``; the mean over the blocks is returned. Blocks apart are projected
+    together, with random signs. It falls from 0.85 for elements of 40 px to 0.1 for 4 px, and is not known (NaN) where
+    nothing is left, in a region of about one block.
 
     Parameters
     ----------
     pixels, assembly
         Of the mesh.
-    gradient_x, gradient_y : ndarray, shape (k, P), float32
-        Of the reference images, 0 where a pixel is not used.
+    gradient, weights : ndarray, shape (2, k, P), (k, P), float32
+        Of the reference images.
     side
         Of the blocks, px.
     """
-    if not gradient_x.any() and not gradient_y.any():
+
+    def summed(signs: FloatImage | np.float32) -> FloatArray:
+        out = np.zeros((len(pixels.origin), 3, 3, 3))
+        own, geometry = np.empty_like(out), (pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric)
+        for gx, gy, weight in zip(*gradient, weights, strict=True):
+            element_hessian(gx, gy, weight * signs, *geometry, own)
+            out += own
+        return out
+
+    hessian = summed(np.float32(1))
+    total = float(hessian[..., (0, 2)].sum())
+    if not total:
         return 1.0
-    pairs = (gradient_x, gradient_x), (gradient_x, gradient_y), (gradient_y, gradient_y)
-    xx, xy, yy = (np.einsum("kp,kp->p", *pair) for pair in pairs)
-    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
-    hessian = np.zeros((len(pixels.origin), 3, 3, 3))
-    for gx, gy in zip(gradient_x, gradient_y, strict=True):
-        own = np.zeros_like(hessian)
-        element_hessian(
-            gx, gy, np.ones_like(gx), pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, own
-        )
-        hessian += own
-    matrix = assembly.matrix(hessian)
-    solve = factorise(sp.csc_matrix(matrix + _ANCHOR * matrix.diagonal().mean() * sp.eye(assembly.size)))
-    index, shape = pixels.blocks(side), pixels.grid(side)
-    rows, columns = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
-    group = rows % _APART * _APART + columns % _APART
-    sign = np.random.default_rng(0).choice([-1.0, 1.0], group.size)
-    total = fitted = 0.0
-    parts = np.zeros((len(pixels.origin), 3, 2))
-    for number in range(0, _APART**2, min(max(group.size // _MANY, 1), _APART**2)):
-        chosen = np.where(group == number, sign, 0.0).astype(np.float32)[index]
-        held = np.abs(chosen)
-        total += float((xx * held).sum(dtype=np.float64) + (yy * held).sum(dtype=np.float64))
-        for first, second in ((xx, xy), (xy, yy)):
-            element_vector(np.ones_like(chosen), chosen, first, second, *geometry, parts)
-            column = assembly.vector(parts)
-            fitted += float(column @ solve(column))
-    share = 1 - fitted / max(total, 1e-300)
+    rows, columns = pixels.grid(side)
+    apart = int(np.clip(np.ceil(2 * np.sqrt(_MANY / (rows * columns))), 2, 4))
+    sign = np.random.default_rng(0).choice(np.array([-1, 1], dtype=np.float32), (rows, columns))
+    projected = []
+    for place in np.ndindex(apart, apart):
+        chosen = np.zeros_like(sign)
+        chosen[place[0] :: apart, place[1] :: apart] = sign[place[0] :: apart, place[1] :: apart]
+        products = summed(pixels.in_blocks(chosen, side)).sum(axis=1)  # the shape functions of an element add up to 1
+        xx_to_yy = assembly.corners @ products.reshape(-1, 3)
+        projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
+    share = 1 - _fitted(assembly.matrix(hessian), np.stack(projected, axis=1)) / total
     return share if share > _LEAST else float("nan")
+
+
+def _fitted(matrix: sp.csc_matrix, columns: FloatArray) -> float:
+    """Sum of ``b^T M^-1 b`` over columns b (2 N, m), by conjugate gradients after division by the diagonal."""
+    diagonal = matrix.diagonal()
+    inverse = 1 / (diagonal + _ANCHOR * diagonal.mean())[:, None]
+    rest, total, gained = columns, 0.0, np.inf
+    way = near = inverse * rest
+    square = (rest * near).sum(axis=0)
+    while gained > _SOLVED * total:
+        ahead = matrix @ way
+        step = square / np.maximum((way * ahead).sum(axis=0), 1e-300)
+        gained = float(step @ square)
+        total += gained
+        rest = rest - step * ahead
+        near = inverse * rest
+        before, square = square, (rest * near).sum(axis=0)
+        way = near + square / np.maximum(before, 1e-300) * way
+    return total

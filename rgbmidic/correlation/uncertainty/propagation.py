@@ -14,14 +14,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from rgbmidic._kernels.mesh import colour_nodes
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["NodeColouring", "displacement_functionals", "functional_std"]
-
-
-_RINGS = 5
-"""Nodes of one colour are at least this many edges apart."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +29,7 @@ class NodeColouring:
     ----------
     colour : ndarray, shape (N,), int64
     nearest : ndarray, shape (C, N), int64
-        For every colour, the node of that colour nearest to each node.
+        For every colour, the node of that colour nearest to each node; N where there is none within four edges.
     """
 
     colour: npt.NDArray[np.int64]
@@ -40,33 +37,23 @@ class NodeColouring:
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh) -> NodeColouring:
-        """Greedy colouring of the graph of nodes closer than `_RINGS` edges."""
-        from scipy.spatial import cKDTree
-
+        """Greedy colouring: nodes of one colour are at least five edges apart."""
         count = len(mesh.nodes)
         # nodes at one place count as neighbours: the nearest of a colour is found by distance
-        i, j = np.concatenate([mesh.neighbours, mesh.copies]).T
-        edges = sp.coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
-        ring = sp.csr_matrix(edges + edges.T + sp.eye(count, dtype=np.int8))
-        reach = sp.csr_matrix(ring)
-        for _ in range(_RINGS - 2):
-            reach = sp.csr_matrix((reach @ ring) > 0)
-        colour = _greedy_colours(reach.indptr, reach.indices)
-        nearest = np.empty((colour.max() + 1, count), dtype=np.int64)
-        for c in range(len(nearest)):
-            centres = np.flatnonzero(colour == c)
-            nearest[c] = centres[cKDTree(mesh.nodes[centres]).query(mesh.nodes)[1]]
-        return cls(colour=colour, nearest=nearest)
-
-
-def _greedy_colours(indptr: npt.NDArray[np.int32], indices: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-    starts, neighbours, bits = indptr.tolist(), indices.tolist(), [0] * (len(indptr) - 1)
-    for node in range(len(bits)):
-        taken = 0
-        for other in neighbours[starts[node] : starts[node + 1]]:
-            taken |= bits[other]
-        bits[node] = ~taken & (taken + 1)  # the lowest bit that is free
-    return np.array([bit.bit_length() - 1 for bit in bits], dtype=np.int64)
+        i, j = np.concatenate([mesh.neighbours, mesh.copies, np.repeat(np.arange(count), 2).reshape(-1, 2)]).T
+        ends = np.concatenate([i, j]), np.concatenate([j, i])
+        ring = sp.csr_matrix((np.ones(2 * len(i), dtype=bool), ends), shape=(count, count))
+        near = ring @ ring  # two nodes with one near both are at most four edges apart
+        reach = near @ near
+        colour = np.empty(count, dtype=np.int64)
+        colour_nodes(near.indptr, near.indices, np.zeros((count, np.diff(reach.indptr).max()), dtype=bool), colour)
+        node, other = np.repeat(np.arange(count), np.diff(reach.indptr)), reach.indices
+        place, distance = colour[other] * count + node, sum((axis[node] - axis[other]) ** 2 for axis in mesh.nodes.T)
+        least = np.full((colour.max() + 1) * count, np.inf)
+        np.minimum.at(least, place, distance)
+        nearest, own = np.full(least.size, count), distance == least[place]
+        nearest[place[own]] = other[own]
+        return cls(colour=colour, nearest=nearest.reshape(-1, count))
 
 
 def functional_std(
@@ -100,7 +87,7 @@ def functional_std(
         sums = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
         columns = solve(sums.astype(np.float64, copy=False).reshape(2 * count, colours))
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
-        variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)
+        variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)[:count]
     return np.sqrt(np.maximum(variance, 0))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rgbmidic._kernels import correlation as kernels
-from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
+from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation.reference import _partial_blocks
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -95,6 +95,14 @@ def test_samples_and_gradients_equal_the_naive_twin(seed):
     out = np.empty((3, x.size), dtype=np.float32)
     sample_with_gradient(case.coefficients, x, y, *out)
     close(out, naive.sample_with_gradient(case.coefficients, x, y))
+
+
+@pytest.mark.parametrize("outlined", [False, True])
+def test_gradients_at_the_owned_pixels_equal_the_naive_twin(outlined):
+    case = scene(1, outlined=outlined)
+    out = np.empty((2, case.pixels.local_x.size), dtype=np.float32)
+    pixel_gradient(case.pixels.lines, case.coefficients, *case.pixels.bounds[:2], *out)
+    close(out, naive.sample_with_gradient(case.coefficients, case.pixels.columns, case.pixels.rows)[1:])
 
 
 @pytest.mark.parametrize("outlined", [False, True])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 from textures import Affine, Texture
 
 from rgbmidic import Region, Tri3Mesh, correlate
@@ -12,7 +14,7 @@ from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.blocks import BLOCK
-from rgbmidic.correlation.uncertainty.propagation import functional_std
+from rgbmidic.correlation.uncertainty.propagation import NodeColouring, functional_std
 
 NOISE = 3.0
 """Standard deviation of the noise, 6 % of the texture's contrast."""
@@ -36,7 +38,8 @@ def test_the_unfitted_share_is_that_of_the_projection(size):
         for node, (constant, in_x, in_y) in zip(corners, pixels.barycentric[element], strict=True):
             values = constant + in_x * pixels.local_x[own] + in_y * pixels.local_y[own]
             columns[own, node] = values[:, None] * np.stack([slope[own] for slope in slopes], axis=1)
-    index, grid = pixels.blocks(BLOCK), pixels.grid(BLOCK)
+    (top, left, _, _), grid = pixels.bounds, pixels.grid(BLOCK)
+    index = (pixels.rows - top) // BLOCK * grid[1] + (pixels.columns - left) // BLOCK
     used = reference.pixel_weights[0] > 0
     inside = (index[:, None] == np.arange(grid[0] * grid[1])) & used[:, None]
     scores = np.concatenate([slope[:, None] * inside for slope in slopes], axis=1).astype(float)
@@ -44,6 +47,31 @@ def test_the_unfitted_share_is_that_of_the_projection(size):
     fitted = system @ np.linalg.lstsq(system, scores, rcond=1e-6)[0]
     left = 1 - (fitted**2).sum() / (scores**2).sum()
     assert reference.unfitted == pytest.approx(left, rel=0.1)
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "disc with a hole"])
+def test_nodes_of_one_colour_are_five_edges_apart_and_each_knows_the_nearest(shape):
+    y, x = np.mgrid[:200, :260]
+    radius = np.hypot(x - 130, y - 100)
+    region = Region.from_mask((radius < 95) & (radius > 30))
+    if shape == "rectangle":
+        region = Region.from_rectangle((5, 5, 250, 190), x.shape)
+    mesh = Tri3Mesh.from_region(region, 13)
+    colouring, (i, j), count = NodeColouring.from_mesh(mesh), mesh.neighbours.T, len(mesh.nodes)
+    edges = dijkstra(coo_matrix((np.ones(i.size), (i, j)), shape=(count, count)), directed=False, unweighted=True)
+    same = colouring.colour[:, None] == colouring.colour
+    assert (edges[same] == np.where(np.eye(count)[same] > 0, 0, np.maximum(edges[same], 5))).all()
+    # greedy: each node sees all colours before its own
+    for node in range(count):
+        around = colouring.colour[(edges[node] < 5) & (np.arange(count) < node)]
+        assert colouring.colour[node] == np.flatnonzero(~np.isin(np.arange(count + 1), around))[0]
+    distance = np.hypot(*(mesh.nodes[:, None] - mesh.nodes).T)
+    for colour, nearest in enumerate(colouring.nearest):
+        within = np.where((edges < 5) & (colouring.colour == colour), distance, np.inf).min(axis=1)
+        assert ((nearest == count) == np.isinf(within)).all()
+        known = np.flatnonzero(nearest < count)
+        assert (colouring.colour[nearest[known]] == colour).all()
+        np.testing.assert_allclose(distance[known, nearest[known]], within[known], rtol=1e-12)
 
 
 @pytest.mark.parametrize("size", [5, 8, 12, 20, 32])
