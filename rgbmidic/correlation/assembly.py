@@ -10,6 +10,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from rgbmidic._kernels.triangular import solve_factors
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
@@ -99,4 +100,12 @@ def _sums(rows: npt.NDArray[np.int64], number: npt.NDArray[np.int64], count: int
 def factorise(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
     """Factorise a symmetric positive definite matrix; gives the function that solves for right-hand sides."""
     factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return factors.solve
+    parts = [part for factor in (factors.L, factors.U) for part in (factor.data, factor.indices, factor.indptr)]
+
+    def solve(right_sides: FloatArray) -> FloatArray:
+        solution = np.empty((len(right_sides), right_sides[0].size))
+        solution[factors.perm_r] = right_sides.reshape(solution.shape)
+        solve_factors(*parts, solution)
+        return solution[factors.perm_c].reshape(right_sides.shape)
+
+    return solve

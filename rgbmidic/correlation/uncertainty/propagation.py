@@ -15,6 +15,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic._kernels.mesh import colour_nodes
+from rgbmidic._kernels.triangular import node_energies
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -80,15 +81,21 @@ def functional_std(
         reaches far and would spoil those of its colour.
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
-    variance = np.empty((count, len(functionals)))
+    sums = np.empty((2 * count, len(functionals), colours))
     for i, functional in enumerate(functionals):
         row = np.repeat(np.arange(count), np.diff(functional.indptr))
         place = functional.indices.astype(np.int64) * colours + colouring.colour[row]
-        sums = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
-        columns = solve(sums.astype(np.float64, copy=False).reshape(2 * count, colours))
-        energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
-        variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)[:count]
-    return np.sqrt(np.maximum(variance, 0))
+        parts = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
+        sums[:, i] = parts.reshape(2 * count, colours)
+    columns = solve(sums.reshape(2 * count, -1))
+    energy = np.empty((count, *sums.shape[1:]))
+    covariance = right_side_covariance  # symmetric: its columns are its rows
+    node_energies(covariance.data, covariance.indices, covariance.indptr, columns, energy.reshape(count, -1))
+    nearest = colouring.nearest.T.ravel()
+    variance = [
+        np.bincount(nearest, weights=energy[:, i].ravel(), minlength=count)[:count] for i in range(len(functionals))
+    ]
+    return np.sqrt(np.maximum(np.stack(variance, axis=1), 0))
 
 
 def displacement_functionals(nodes: int) -> list[sp.csr_matrix]:
