@@ -18,7 +18,10 @@ from rgbmidic._kernels.mesh import colour_nodes
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NodeColouring", "displacement_functionals", "functional_std"]
+__all__ = ["Functional", "NodeColouring", "displacement_functionals", "functional_std"]
+
+Functional = tuple[sp.csr_matrix | None, sp.csr_matrix | None]
+"""A quantity linear in the displacements around each node: its matrices (N, N) for u and for v, None for 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +63,7 @@ def functional_std(
     solve: Callable[[FloatArray], FloatArray],
     right_side_covariance: sp.csc_matrix,
     colouring: NodeColouring,
-    functionals: Sequence[sp.csr_matrix],
+    functionals: Sequence[Functional],
     nodes: BoolArray,
 ) -> FloatArray:
     """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
@@ -74,7 +77,7 @@ def functional_std(
     colouring
         Of the mesh.
     functionals
-        F matrices (N, 2 N); row n of each gives the quantity at node n, and is zero but for n and its neighbours.
+        Of F quantities; row n of a matrix is zero but for n and its neighbours.
     nodes : ndarray, shape (N,), bool
         Nodes whose uncertainty is asked for. The quantity must not touch a node that is hardly seen: such a column
         reaches far and would spoil those of its colour.
@@ -82,16 +85,20 @@ def functional_std(
     count, colours = len(colouring.colour), len(colouring.nearest)
     variance = np.empty((count, len(functionals)))
     for i, functional in enumerate(functionals):
-        row = np.repeat(np.arange(count), np.diff(functional.indptr))
-        place = functional.indices.astype(np.int64) * colours + colouring.colour[row]
-        sums = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
-        columns = solve(sums.astype(np.float64, copy=False).reshape(2 * count, colours))
+        sums = np.zeros((count, 2, colours))
+        for axis, matrix in enumerate(functional):
+            if matrix is not None:
+                row = np.repeat(np.arange(count), np.diff(matrix.indptr))
+                place = matrix.indices * np.int64(colours) + colouring.colour[row]
+                own = np.bincount(place, weights=matrix.data * nodes[row], minlength=count * colours)
+                sums[:, axis] = own.reshape(count, colours)
+        columns = solve(sums.reshape(2 * count, colours))
         energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
         variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)[:count]
     return np.sqrt(np.maximum(variance, 0))
 
 
-def displacement_functionals(nodes: int) -> list[sp.csr_matrix]:
+def displacement_functionals(nodes: int) -> list[Functional]:
     """The displacements u and v themselves, as `functional_std` takes them."""
-    row = np.arange(nodes)
-    return [sp.csr_matrix((np.ones(nodes), (row, 2 * row + axis)), shape=(nodes, 2 * nodes)) for axis in (0, 1)]
+    itself = sp.eye(nodes, format="csr")
+    return [(itself, None), (None, itself)]
