@@ -15,100 +15,96 @@ PAD = 2
 
 _POLE = np.float32(np.sqrt(3.0) - 2.0)
 _GAIN = np.float32(6.0)  # (1 - z)(1 - 1/z) of the pole z
-_HORIZON = 14  # |z|**14 is below float32 resolution
 _FAST = {"reassoc", "contract", "arcp", "nsz"}  # keeps the meaning of NaN and inf
 
 
-_BLOCK = 64
-"""Columns filtered together: a cache line of each row."""
-_TOGETHER = 8
-"""Rows filtered together: each waits for its own last sample only."""
+_LINE = 16
+"""Columns of a cache line."""
+_STEPS, _REACH = 4, 15
+"""Steps 1, 2, 4 and 8 of the filter along a row, and their sum: |z|**16 is below float32 resolution."""
+_NO_FILTER = np.ones(1, dtype=np.float32)
 
 
-def bspline_coefficients(image: FloatImage, out: FloatImage) -> None:
-    """Cubic B-spline coefficients of `image` (H, W) float32 into `out` (H + 2 PAD, W + 2 PAD) float32, mirrored."""
-    height, width = image.shape
-    inner = out[PAD : PAD + height, PAD : PAD + width]
-    inner[:] = image
-    _filter_columns(inner)
-    _filter_rows(out[PAD : PAD + height])
+def bspline_coefficients(image: FloatImage, out: FloatImage, taps: FloatImage = _NO_FILTER) -> None:
+    """Cubic B-spline coefficients of `image` (H, W) float32 into `out` (H + 2 PAD, W + 2 PAD) float32, mirrored.
+
+    `taps` (r + 1,) float32 filter the image before, along both axes: the middle one of a symmetric filter and those to
+    one side of it.
+    """
+    height = image.shape[0]
+    _filter_columns(image, taps, out)
+    _filter_rows(image, taps, out)
     for p in range(1, PAD + 1):
         out[PAD - p] = out[PAD + min(p, height - 1)]
         out[PAD + height - 1 + p] = out[PAD + max(height - 1 - p, 0)]
 
 
-@over_ranges("values", axis=1, grain=_BLOCK)
+@over_ranges("image", axis=1, grain=_LINE)
 @compiled(fastmath=_FAST)
-def _filter_columns(start, stop, values):
-    """Turn the columns of `values` into B-spline coefficients in place (mirror boundary), side by side in memory."""
-    n = values.shape[0]
-    if n == 1:
-        return
-    z = _POLE
-    factor = z / (z * z - np.float32(1.0))
-    first = np.empty(_BLOCK, dtype=np.float32)
-    for left in range(start, stop, _BLOCK):
-        m = min(_BLOCK, stop - left)
-        for c in range(m):
-            first[c] = values[0, left + c]
-        power = z
-        for i in range(1, _HORIZON):
-            row = _mirrored(i, n)
-            for c in range(m):
-                first[c] += power * values[row, left + c]
-            power *= z
-        for c in range(m):
-            values[0, left + c] = first[c] * _GAIN
-        for i in range(1, n):
-            for c in range(left, left + m):
-                values[i, c] = values[i, c] * _GAIN + z * values[i - 1, c]
-        for c in range(left, left + m):
-            values[n - 1, c] = factor * (values[n - 1, c] + z * values[n - 2, c])
-        for i in range(n - 2, -1, -1):
-            for c in range(left, left + m):
-                values[i, c] = z * (values[i + 1, c] - values[i, c])
-
-
-@over_ranges("rows")
-@compiled()
-def _filter_rows(start, stop, rows):
-    """The same along each of `rows` (H, W + 2 PAD), whose ends then mirror what lies inside."""
-    n = rows.shape[1] - 2 * PAD
-    for top in range(start, stop, _TOGETHER):
-        end = min(top + _TOGETHER, stop)
-        if n > 1:
-            _filter_lines(rows[:, PAD:], top, end, n)
-        for r in range(top, end):
-            line = rows[r, PAD:]
-            for p in range(1, PAD + 1):
-                rows[r, PAD - p] = line[min(p, n - 1)]
-                line[n - 1 + p] = line[max(n - 1 - p, 0)]
-
-
-@helper()
-def _filter_lines(lines, top, end, n):
-    z = _POLE
-    for r in range(top, end):
-        first = lines[r, 0]
-        power = z
-        for i in range(1, _HORIZON):
-            first += power * lines[r, _mirrored(i, n)]
-            power *= z
-        lines[r, 0] = first * _GAIN
-    for i in range(np.uint64(1), np.uint64(n)):
-        for r in range(np.uint64(top), np.uint64(end)):
-            lines[r, i] = lines[r, i] * _GAIN + z * lines[r, i - np.uint64(1)]
-    for r in range(top, end):
-        lines[r, n - 1] = z / (z * z - np.float32(1.0)) * (lines[r, n - 1] + z * lines[r, n - 2])
+def _filter_columns(start, stop, image, taps, out):
+    """Filter down the columns, whole rows at a time: by `taps`, then by the recursions, causal and anticausal."""
+    n, z = image.shape[0], _POLE
+    line, before = np.empty(stop - start, dtype=np.float32), np.zeros(stop - start, dtype=np.float32)
+    for i in range(-_REACH, n):
+        middle = image[_mirrored(i, n), start:stop]
+        for j in range(line.size):
+            line[j] = taps[0] * middle[j]
+        for k in range(1, taps.size):
+            above, below = image[_mirrored(i - k, n), start:stop], image[_mirrored(i + k, n), start:stop]
+            for j in range(line.size):
+                line[j] += taps[k] * (above[j] + below[j])
+        row = out[PAD + max(i, 0), PAD + start :]
+        for j in range(line.size):
+            before[j] = row[j] = _GAIN * line[j] + z * before[j]
+    above, row = out[PAD + max(n - 2, 0), PAD + start :], out[PAD + n - 1, PAD + start :]
+    for j in range(line.size):
+        before[j] = row[j] = z / (z * z - np.float32(1.0)) * (row[j] + z * above[j])
     for i in range(n - 2, -1, -1):
-        for r in range(np.uint64(top), np.uint64(end)):
-            lines[r, np.uint64(i)] = z * (lines[r, np.uint64(i + 1)] - lines[r, np.uint64(i)])
+        row = out[PAD + i, PAD + start :]
+        for j in range(line.size):
+            before[j] = row[j] = z * (before[j] - row[j])
+
+
+@over_ranges("image")
+@compiled(fastmath=_FAST)
+def _filter_rows(start, stop, image, taps, out):
+    """Filter along each row, the recursions as products: ``1 / (1 - z B)`` is that of ``1 + z**s B**s`` over s = 1, 2,
+    4, ... with the delay B."""
+    n = image.shape[1]
+    edge = PAD + _REACH + taps.size - 1
+    line, other = np.empty(n + 2 * edge, dtype=np.float32), np.empty(n + 2 * edge, dtype=np.float32)
+    for r in range(PAD + start, PAD + stop):
+        row, middle = out[r, PAD:], line[edge:]
+        for j in range(n):
+            middle[j] = row[j]
+        for j in range(1, edge + 1):
+            line[edge - j], middle[n - 1 + j] = row[_mirrored(j, n)], row[_mirrored(n - 1 + j, n)]
+        for k in range(1, taps.size):
+            _symmetric(line if k == 1 else other, taps[0] if k == 1 else np.float32(1.0), line, taps[k], k, other)
+        if taps.size > 1:
+            line, other = other, line
+        factor = _POLE
+        for step in range(_STEPS):
+            _symmetric(line, np.float32(1.0) + factor * factor, line, factor, 1 << step, other)
+            line, other = other, line
+            factor *= factor
+        row, middle = out[r], line[edge - PAD :]
+        for j in range(row.size):
+            row[j] = -_GAIN * _POLE * middle[j]
+
+
+@helper(fastmath=_FAST)
+def _symmetric(centre, own, line, beside, step, out):
+    """``out = own * centre`` plus `beside` times what `line` has `step` before and behind, where there are both."""
+    left, middle, right, target = line, centre[step:], line[2 * step :], out[step:]
+    for j in range(right.size):
+        target[j] = own * middle[j] + beside * (left[j] + right[j])
 
 
 @helper()
 def _mirrored(i, n):
-    """Sample of n > 1 that stands for the i-th, mirrored about the last and the first."""
-    j = i % (2 * n - 2)
+    """Sample of n that stands for the i-th, mirrored about the last and the first."""
+    j = i % max(2 * n - 2, 1)
     return j if j < n else 2 * n - 2 - j
 
 

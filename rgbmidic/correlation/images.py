@@ -16,6 +16,7 @@ __all__ = [
     "as_light_stack",
     "fill_holes",
     "spline_coefficients",
+    "spline_values",
     "usable_pixels",
     "usable_reach",
 ]
@@ -70,12 +71,14 @@ def apply_prefilter(image: FloatImage, prefilter: str) -> FloatImage:
     InputError
         Unknown filter name.
     """
+    taps = _taps(prefilter)
+    return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
+
+
+def _taps(prefilter: str) -> FloatImage:
     if prefilter not in PREFILTERS:
         raise InputError(f"unknown prefilter {prefilter!r}; allowed are {', '.join(PREFILTERS)}")
-    if prefilter == "none":
-        return image
-    taps = PREFILTERS[prefilter].astype(np.float32)
-    return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
+    return PREFILTERS[prefilter].astype(np.float32)
 
 
 def usable_reach(prefilter: str) -> int:
@@ -87,11 +90,27 @@ def usable_pixels(valid: BoolArray, prefilter: str) -> BoolArray:
     """Pixels whose filtered value and spline neighbourhood use valid pixels inside the image only."""
     reach = usable_reach(prefilter)
     element = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
-    return cv2.erode(valid.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(bool)
+    eroded = cv2.erode(valid.view(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(eroded).view(bool)
 
 
-def spline_coefficients(image: FloatImage) -> FloatImage:
-    """Cubic B-spline coefficients of an image (H, W), padded by `PAD` on every side."""
-    out = np.empty((image.shape[0] + 2 * PAD, image.shape[1] + 2 * PAD), dtype=np.float32)
-    bspline_coefficients(np.ascontiguousarray(image), out)
+def spline_coefficients(images: FloatImage, prefilter: str = "none") -> FloatImage:
+    """Cubic B-spline coefficients of images (k, H, W), holes filled and prefiltered, padded by `PAD` on every side.
+
+    Raises
+    ------
+    InputError
+        Unknown filter name.
+    """
+    taps = _taps(prefilter)
+    out = np.empty((len(images), *(side + 2 * PAD for side in images.shape[1:])), dtype=np.float32)
+    for image, coefficients in zip(images, out, strict=True):
+        filled = fill_holes(image, np.isfinite(image))
+        bspline_coefficients(np.ascontiguousarray(filled), coefficients, taps[len(taps) // 2 :])
     return out
+
+
+def spline_values(coefficients: FloatImage) -> FloatImage:
+    """The images (k, H, W) at the pixels, from the coefficients of their splines."""
+    mean = np.array([1, 4, 1], dtype=np.float32) / 6
+    return np.stack([cv2.sepFilter2D(one, -1, mean, mean)[PAD:-PAD, PAD:-PAD] for one in coefficients])

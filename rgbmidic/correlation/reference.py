@@ -18,7 +18,7 @@ from rgbmidic._kernels.correlation import (
 )
 from rgbmidic._kernels.interpolation import pixel_gradient
 from rgbmidic.correlation.assembly import Assembly
-from rgbmidic.correlation.images import apply_prefilter, fill_holes, spline_coefficients, usable_pixels
+from rgbmidic.correlation.images import spline_coefficients, spline_values, usable_pixels
 from rgbmidic.correlation.recovery import linear_fit_offset
 from rgbmidic.correlation.uncertainty.blocks import block_side, unfitted_share
 from rgbmidic.correlation.uncertainty.propagation import NodeColouring
@@ -36,17 +36,14 @@ class Deformed:
 
     Attributes
     ----------
-    images : ndarray, shape (k, H, W), float32
-        Holes filled, prefiltered.
     coefficients : ndarray, shape (k, H + 2 PAD, W + 2 PAD), float32
-        Cubic B-spline coefficients of `images`.
+        Cubic B-spline coefficients of the images, holes filled and prefiltered.
     weights : ndarray, shape (k, H, W), float32
         0 where a pixel is excluded or must not be interpolated.
     partial : ndarray, shape (k, h + 1, w + 1), int32
         Number of blocks of `BLOCK` px, above and to the left, with a weight other than 1.
     """
 
-    images: FloatImage
     coefficients: FloatImage
     weights: FloatImage
     partial: npt.NDArray[np.int32] = field(init=False)
@@ -54,11 +51,17 @@ class Deformed:
     def __post_init__(self) -> None:
         object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
 
+    @property
+    def images(self) -> FloatImage:
+        """The images (k, H, W), holes filled and prefiltered."""
+        return spline_values(self.coefficients)
+
     @classmethod
     def prepare(cls, images: FloatImage, weights: FloatImage | None = None, *, prefilter: str = "none") -> Deformed:
         """Fill, filter and prefilter images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]."""
-        ready, usable = _prepare(images, weights, prefilter)
-        return cls(images=ready, coefficients=np.stack([spline_coefficients(i) for i in ready]), weights=usable)
+        return cls(
+            coefficients=spline_coefficients(images, prefilter), weights=_usable_weights(images, weights, prefilter)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,14 +122,15 @@ class Reference:
         """
         if region.mask.shape != images.shape[1:]:
             raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
-        ready, usable = _prepare(images, weights, prefilter)
+        coefficients, usable = spline_coefficients(images, prefilter), _usable_weights(images, weights, prefilter)
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
             usable = usable * usable_pixels(region.mask, prefilter)
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
             usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
         pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
+        ready = spline_values(coefficients)
         weighted = pixels.gather(usable)
-        gradient = _common_gradient(_gradient(ready, pixels), weighted, pixels)
+        gradient = _common_gradient(_gradient(coefficients, pixels), weighted, pixels)
         return cls(
             mesh=mesh,
             pixels=pixels,
@@ -215,26 +219,23 @@ class Reference:
         )
 
 
-def _prepare(images: FloatImage, weights: FloatImage | None, prefilter: str) -> tuple[FloatImage, FloatImage]:
-    """Filtered images without holes, and the weight of each pixel, 0 where it or its neighbourhood is invalid."""
-    ready, usable = np.empty_like(images), np.empty_like(images)
-    for light, image in enumerate(images):
+def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
+    """The weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
+    given = np.ones_like(images) if weights is None else weights
+    usable = np.zeros_like(images)
+    for image, weight, out in zip(images, given, usable, strict=True):
         known = np.isfinite(image)
-        ready[light] = apply_prefilter(fill_holes(image, known), prefilter)
-        if weights is not None:
-            known &= weights[light] > 0
-        usable[light] = usable_pixels(known, prefilter)
-    return ready, usable if weights is None else np.multiply(usable, weights, out=usable)
+        known &= weight > 0
+        cv2.copyTo(weight, usable_pixels(known, prefilter).view(np.uint8), out)
+    return usable
 
 
 def _partial_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
     """See `Deformed.partial`, for one weight (H, W)."""
-    partial = np.where(weight == 1, np.uint8(0), np.uint8(255))
     below, right = (-side % BLOCK for side in weight.shape)
-    whole = cv2.copyMakeBorder(partial, 0, below, 0, right, cv2.BORDER_REPLICATE)
-    size = whole.shape[1] // BLOCK, whole.shape[0] // BLOCK
-    blocks = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA)) > 0  # one of 64 pixels gives 4 of 255
-    return np.asarray(cv2.integral(blocks.astype(np.uint8)), dtype=np.int32)
+    partial = np.pad(weight != 1, ((0, below), (0, right))) if below or right else weight != 1
+    rows = partial.view(np.uint64).reshape(-1, BLOCK, partial.shape[1] // BLOCK)  # a number for each row of a block
+    return np.asarray(cv2.integral((np.bitwise_or.reduce(rows, axis=1) != 0).view(np.uint8)), dtype=np.int32)
 
 
 def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
@@ -245,11 +246,11 @@ def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
     return image.astype(bool)
 
 
-def _gradient(images: FloatImage, pixels: PixelMap) -> FloatImage:
-    """Spline gradient (2, k, P) of images (k, H, W) at the owned pixels."""
-    gradient = np.empty((2, len(images), pixels.local_x.size), dtype=np.float32)
-    for light, image in enumerate(images):
-        pixel_gradient(pixels.lines, spline_coefficients(image), *pixels.bounds[:2], *gradient[:, light])
+def _gradient(coefficients: FloatImage, pixels: PixelMap) -> FloatImage:
+    """Gradient (2, k, P) of splines at the owned pixels."""
+    gradient = np.empty((2, len(coefficients), pixels.local_x.size), dtype=np.float32)
+    for light, spline in enumerate(coefficients):
+        pixel_gradient(pixels.lines, spline, *pixels.bounds[:2], *gradient[:, light])
     return gradient
 
 

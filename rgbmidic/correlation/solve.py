@@ -76,10 +76,10 @@ def solve(
     InputError
         The two states have different numbers or sizes of images, or `initial` does not fit the mesh.
     """
-    if deformed.images.shape != reference.images.shape:
+    if deformed.weights.shape != reference.images.shape:
         raise InputError(
             f"reference and deformed images must have one shape; given are {reference.images.shape} and "
-            f"{deformed.images.shape}"
+            f"{deformed.weights.shape}"
         )
     if initial.shape != reference.mesh.nodes.shape or not np.isfinite(initial).all():
         raise InputError(f"the initial displacement must be finite with shape {reference.mesh.nodes.shape}")

@@ -96,10 +96,10 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
     known = nodes if last is None else np.concatenate([nodes, nodes + last])
     there = Box.around(known, max(side, _REACH), shape)
     most = int(min(_KEYPOINTS * there.area / here.area, _MOST))
-    best = 0.0
+    best, images = 0.0, deformed.images
     for reduction in _REDUCTIONS if side <= _SMALL else _REDUCTIONS[:-1]:
         f = Keypoints.find(reference.images, reference.weights, here, reduction, _KEYPOINTS)
-        g = Keypoints.find(deformed.images, deformed.weights, there, reduction, most)
+        g = Keypoints.find(images, deformed.weights, there, reduction, most)
         points, motion = pairs(f, g, 2.0 * reduction)
         if not len(points):
             continue
