@@ -22,6 +22,8 @@ __all__ = ["Functional", "NodeColouring", "displacement_functionals", "functiona
 
 Functional = tuple[sp.csr_matrix | None, sp.csr_matrix | None]
 """A quantity linear in the displacements around each node: its matrices (N, N) for u and for v, None for 0."""
+_TOGETHER = 2**22
+"""Entries of the right-hand sides that are solved together: 32 MB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,8 +65,7 @@ def functional_std(
     solve: Callable[[FloatArray], FloatArray],
     right_side_covariance: sp.csc_matrix,
     colouring: NodeColouring,
-    functionals: Sequence[Functional],
-    nodes: BoolArray,
+    asked: Sequence[tuple[Functional, BoolArray]],
 ) -> FloatArray:
     """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
 
@@ -76,26 +77,31 @@ def functional_std(
         S, shape (2 N, 2 N).
     colouring
         Of the mesh.
-    functionals
-        Of F quantities; row n of a matrix is zero but for n and its neighbours.
-    nodes : ndarray, shape (N,), bool
-        Nodes whose uncertainty is asked for. The quantity must not touch a node that is hardly seen: such a column
-        reaches far and would spoil those of its colour.
+    asked
+        F quantities, row n of whose matrices is zero but for n and its neighbours; and of each the nodes (N,) whose
+        uncertainty is asked for. It must not touch a node that is hardly seen: such a column reaches far and would
+        spoil those of its colour.
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
-    variance = np.empty((count, len(functionals)))
-    for i, functional in enumerate(functionals):
-        sums = np.zeros((count, 2, colours))
+    together = max(1, _TOGETHER // (2 * count * colours))
+    if len(asked) > together:
+        parts = (asked[i : i + together] for i in range(0, len(asked), together))
+        return np.concatenate([functional_std(solve, right_side_covariance, colouring, part) for part in parts], axis=1)
+    columns = np.zeros((count, 2, len(asked), colours))
+    for i, (functional, nodes) in enumerate(asked):
         for axis, matrix in enumerate(functional):
             if matrix is not None:
                 row = np.repeat(np.arange(count), np.diff(matrix.indptr))
                 place = matrix.indices * np.int64(colours) + colouring.colour[row]
-                own = np.bincount(place, weights=matrix.data * nodes[row], minlength=count * colours)
-                sums[:, axis] = own.reshape(count, colours)
-        columns = solve(sums.reshape(2 * count, colours))
-        energy = (columns * (right_side_covariance @ columns)).reshape(count, 2, colours).sum(axis=1)
-        variance[:, i] = np.bincount(colouring.nearest.ravel(), weights=energy.T.ravel(), minlength=count)[:count]
-    return np.sqrt(np.maximum(variance, 0))
+                sums = np.bincount(place, weights=matrix.data * nodes[row], minlength=count * colours)
+                columns[:, axis, i] = sums.reshape(count, colours)
+    solved = solve(columns.reshape(2 * count, -1))
+    energy = (solved * (right_side_covariance @ solved)).reshape(columns.shape).sum(axis=1)
+    variance = [
+        np.bincount(colouring.nearest.ravel(), weights=own.T.ravel(), minlength=count)[:count]
+        for own in energy.transpose(1, 0, 2)
+    ]
+    return np.sqrt(np.maximum(np.stack(variance, axis=1), 0))
 
 
 def displacement_functionals(nodes: int) -> list[Functional]:
