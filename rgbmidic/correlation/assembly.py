@@ -12,6 +12,7 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic._kernels.triangular import solve_factors
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh.sparse import with_data
 from rgbmidic.typing import FloatArray
 
 __all__ = ["Assembly", "factorise"]
@@ -25,8 +26,8 @@ class Assembly:
     ----------
     entries : csc_matrix, shape (nonzeros, 27 E)
         Sums element blocks into the data of the assembled matrix.
-    corners : csc_matrix, shape (N, 3 E)
-        Sums values at the corners of the elements at the nodes.
+    unknowns, own : ndarray, shape (6 E,), (9 E,)
+        Number of each entry of element vectors, and of three values at the corners, in those of the nodes.
     smoothness : csc_matrix, shape (2 N, 2 N)
         Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal; in the structure of the
         assembled matrices.
@@ -37,7 +38,8 @@ class Assembly:
     """
 
     entries: sp.csc_matrix
-    corners: sp.csc_matrix
+    unknowns: npt.NDArray[np.int64]
+    own: npt.NDArray[np.int64]
     smoothness: sp.csc_matrix
     diagonal: FloatArray
     nodal_area: FloatArray
@@ -63,7 +65,8 @@ class Assembly:
         diagonal[slots[row == column][:, component, component]] = 1
         return cls(
             entries=_sums(slots[pair], np.tile([1, 2, 1], 9 * len(corners)), slots.size),
-            corners=_sums(corners, np.ones(corners.size, dtype=int), count),
+            unknowns=(2 * corners[..., None] + component).ravel(),
+            own=(3 * corners[..., None] + np.arange(3)).ravel(),
             smoothness=sp.csc_matrix((smooth, indices, indptr), shape=(2 * count, 2 * count)),
             diagonal=diagonal,
             nodal_area=mesh.to_nodes(mesh.areas / 3),
@@ -77,18 +80,20 @@ class Assembly:
     def matrix(self, blocks: FloatArray, more: FloatArray | float = 0.0) -> sp.csc_matrix:
         """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N); `more` is
         added to its data."""
-        matrix = self.smoothness.copy()
-        matrix.data = self.entries @ blocks.ravel() + more
-        return matrix
+        return with_data(self.smoothness, self.entries @ blocks.ravel() + more)
 
     def node_blocks(self, blocks: FloatArray) -> FloatArray:
         """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""
-        own = np.einsum("eaad->ead", blocks).reshape(-1, 3)
-        return np.ascontiguousarray((self.corners @ own).T)
+        return np.ascontiguousarray(self.at_nodes(np.einsum("eaad->ead", blocks)).T)
+
+    def at_nodes(self, parts: FloatArray) -> FloatArray:
+        """Sums (N, 3) at the nodes of three values at the corners of the elements (E, 3, 3)."""
+        sums = np.bincount(self.own, weights=parts.ravel(), minlength=self.size // 2 * 3)
+        return np.asarray(sums, dtype=np.float64).reshape(-1, 3)
 
     def vector(self, parts: FloatArray) -> FloatArray:
         """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""
-        return np.asarray(self.corners @ parts.reshape(-1, 2)).ravel()
+        return np.asarray(np.bincount(self.unknowns, weights=parts.ravel(), minlength=self.size), dtype=np.float64)
 
 
 def _sums(rows: npt.NDArray[np.int64], number: npt.NDArray[np.int64], count: int) -> sp.csc_matrix:

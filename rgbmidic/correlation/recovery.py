@@ -15,8 +15,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import factorise
+from rgbmidic.correlation.uncertainty.propagation import Functional
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import quadratic_fit
+from rgbmidic.mesh.sparse import with_data
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["Recovery", "linear_fit_offset", "mass_matrix"]
@@ -45,16 +47,15 @@ class Recovery:
         return cls(value=value, slope_x=slope_x, slope_y=slope_y, curvature=tuple(curvature))
 
     @property
-    def displacement_functionals(self) -> list[sp.csr_matrix]:
+    def displacement_functionals(self) -> list[Functional]:
         """u and v at the nodes, as `functional_std` takes them."""
-        return [_of_component(self.value, axis) for axis in (0, 1)]
+        return [(self.value, None), (None, self.value)]
 
     @property
-    def strain_functionals(self) -> list[sp.csr_matrix]:
+    def strain_functionals(self) -> list[Functional]:
         """Strains exx, eyy, exy at the nodes, as `functional_std` takes them."""
-        x, y = self.slope_x, self.slope_y
-        shear = (_of_component(y, 0) + _of_component(x, 1)) / 2
-        return [_of_component(x, 0), _of_component(y, 1), sp.csr_matrix(shear)]
+        half_x, half_y = (with_data(slope, slope.data / 2) for slope in (self.slope_x, self.slope_y))
+        return [(self.slope_x, None), (None, self.slope_y), (half_y, half_x)]
 
     def displacement(self, fitted: FloatArray) -> FloatArray:
         """Displacement (N, 2) at the nodes for that of the linear fit (N, 2)."""
@@ -96,9 +97,3 @@ def mass_matrix(mesh: Tri3Mesh) -> sp.csc_matrix:
     mass = np.where(np.eye(3, dtype=bool), 2, 1) * mesh.areas[:, None, None] / 12
     rows, columns = np.repeat(mesh.elements, 3, axis=1).ravel(), np.tile(mesh.elements, 3).ravel()
     return sp.csc_matrix((mass.ravel(), (rows, columns)), shape=(len(mesh.nodes),) * 2)
-
-
-def _of_component(operator: sp.csr_matrix, component: int) -> sp.csr_matrix:
-    """An operator (N, N) on one component of the unknowns (u, v) of the nodes: (N, 2 N)."""
-    shape = operator.shape[0], 2 * operator.shape[1]
-    return sp.csr_matrix((operator.data, 2 * operator.indices + component, operator.indptr), shape=shape)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.mesh.pixel_map import PixelMap
+from rgbmidic.mesh.sparse import with_data
 from rgbmidic.mesh.tri3 import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -56,7 +57,7 @@ def quadratic_fit(
     offset : ndarray, shape (N, 3), optional
         What the given values have beyond a field whose second derivative xx, xy or yy is 1, square px; 0 without.
     """
-    other, known, weight = _window(mesh, used.tobytes())
+    other, known, weight, structure = _window(mesh, used.tobytes())
     basis = _basis(mesh, used.tobytes(), None if offset is None else offset.tobytes())
     if information is not None:
         own, theirs = np.broadcast_to(information[:, None], other.shape), information[other]
@@ -65,12 +66,9 @@ def quadratic_fit(
     normal = weighted @ basis.transpose(0, 2, 1)
     normal[:, range(1, 6), range(1, 6)] += _RIDGE
     fits = np.linalg.inv(normal) @ weighted
-    structure = other[known], np.concatenate([[0], np.cumsum(known.sum(axis=1))])
-    count = len(mesh.nodes)
-    return tuple(
-        sp.csr_matrix((fits[:, term][known] / mesh.size**power, *structure), shape=(count, count))
-        for term, power in enumerate((0, 1, 1, 2, 2, 2))
-    )
+    powers = mesh.size ** np.array([0, 1, 1, 2, 2, 2])
+    flat = np.take(fits.transpose(1, 0, 2).reshape(6, -1), known, axis=1) / powers[:, None]
+    return tuple(with_data(structure, entries) for entries in flat)
 
 
 def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray]) -> FloatImage:
@@ -93,9 +91,9 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
 
 
 @lru_cache(maxsize=1)
-def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, BoolArray, FloatArray]:
-    """The nodes around each, itself where a row has fewer, which are no such filling, and their weights; (N, W). Kept,
-    for most frames use all elements."""
+def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
+    """The nodes around each, itself where a row has fewer, (N, W); the places of those that are no such filling; their
+    weights (N, W); and the matrix of these nodes. Kept, for most frames use all elements."""
     elements = np.frombuffer(used, dtype=bool)
     share = _surrounded(mesh, elements)
     reach = _reached(mesh, elements, share)
@@ -105,7 +103,8 @@ def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, BoolArray, FloatArray]:
     other[known] = reach.indices
     square = ((mesh.nodes[other] - mesh.nodes[:, None]) ** 2).sum(axis=2) / mesh.size**2
     # at an edge the window holds as much of the mesh as inside
-    return other, known, np.where(known, np.exp(-square * share[:, None] / (2 * _WIDTH**2)), 0.0)
+    weight = np.where(known, np.exp(-square * share[:, None] / (2 * _WIDTH**2)), 0.0)
+    return other, np.flatnonzero(known), weight, reach
 
 
 def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:

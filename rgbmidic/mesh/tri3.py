@@ -36,11 +36,14 @@ class Tri3Mesh:
         Node indices, ordered so that ``(p1 - p0) x (p2 - p0) > 0`` in (x, y).
     areas : ndarray, shape (E,), float64
         Area of each element in square px.
+    size : float
+        Typical leg of an element in px: that of a right isosceles triangle of the median area.
     """
 
     nodes: FloatArray
     elements: npt.NDArray[np.int32]
     areas: FloatArray = field(init=False)
+    size: float = field(init=False)
 
     def __post_init__(self) -> None:
         nodes = np.ascontiguousarray(self.nodes, dtype=np.float64)
@@ -58,6 +61,7 @@ class Tri3Mesh:
         object.__setattr__(self, "nodes", nodes)
         object.__setattr__(self, "elements", elements)
         object.__setattr__(self, "areas", np.abs(area))
+        object.__setattr__(self, "size", float(np.sqrt(2 * np.median(self.areas))))
 
     @classmethod
     def from_region(cls, region: Region, element_size: float, cracks: Sequence[npt.ArrayLike] = ()) -> Tri3Mesh:
@@ -97,11 +101,6 @@ class Tri3Mesh:
             return cls(nodes=nodes, elements=elements)
         nodes, elements = outline_mesh(region.mask, element_size, cracks)
         return cls(nodes=nodes, elements=elements)
-
-    @property
-    def size(self) -> float:
-        """Typical leg of an element in px: that of a right isosceles triangle of the median area."""
-        return float(np.sqrt(2 * np.median(self.areas)))
 
     @property
     def copies(self) -> npt.NDArray[np.int32]:

@@ -80,7 +80,7 @@ def unfitted_share(
         chosen = np.zeros_like(sign)
         chosen[place[0] :: apart, place[1] :: apart] = sign[place[0] :: apart, place[1] :: apart]
         products = summed(pixels.in_blocks(chosen, side)).sum(axis=1)  # the shape functions of an element add up to 1
-        xx_to_yy = assembly.corners @ products.reshape(-1, 3)
+        xx_to_yy = assembly.at_nodes(products)
         projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
     share = 1 - _fitted(assembly.matrix(hessian), np.stack(projected, axis=1)) / total
     return share if share > _LEAST else float("nan")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.residual import Residual
@@ -24,10 +22,9 @@ def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | Non
     reference, textured = residual.reference, equations.textured
     covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
     if recovery is None:
-        asked = [(displacement_functionals(len(textured)), textured)]
+        asked = [(one, textured) for one in displacement_functionals(len(textured))]
     else:
         inner = textured & ~reference.mesh.beside(~textured)
-        asked = [(recovery.displacement_functionals, textured), (recovery.strain_functionals, inner)]
-    return np.concatenate(
-        [functional_std(equations.solve, covariance, reference.colouring, *one) for one in asked], axis=1
-    )
+        asked = [(one, textured) for one in recovery.displacement_functionals]
+        asked += [(one, inner) for one in recovery.strain_functionals]
+    return functional_std(equations.solve, covariance, reference.colouring, asked)

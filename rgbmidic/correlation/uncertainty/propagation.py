@@ -19,7 +19,12 @@ from rgbmidic._kernels.triangular import node_energies
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NodeColouring", "displacement_functionals", "functional_std"]
+__all__ = ["Functional", "NodeColouring", "displacement_functionals", "functional_std"]
+
+Functional = tuple[sp.csr_matrix | None, sp.csr_matrix | None]
+"""A quantity linear in the displacements around each node: its matrices (N, N) for u and for v, None for 0."""
+_TOGETHER = 2**22
+"""Entries of the right-hand sides that are solved together: 32 MB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,10 +64,9 @@ class NodeColouring:
 
 def functional_std(
     solve: Callable[[FloatArray], FloatArray],
-    right_side_covariance: sp.csc_matrix,
+    covariance: sp.csc_matrix,
     colouring: NodeColouring,
-    functionals: Sequence[sp.csr_matrix],
-    nodes: BoolArray,
+    asked: Sequence[tuple[Functional, BoolArray]],
 ) -> FloatArray:
     """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
 
@@ -70,35 +74,39 @@ def functional_std(
     ----------
     solve
         Solves ``M x = b`` for b of shape (2 N, R).
-    right_side_covariance
+    covariance
         S, shape (2 N, 2 N).
     colouring
         Of the mesh.
-    functionals
-        F matrices (N, 2 N); row n of each gives the quantity at node n, and is zero but for n and its neighbours.
-    nodes : ndarray, shape (N,), bool
-        Nodes whose uncertainty is asked for. The quantity must not touch a node that is hardly seen: such a column
-        reaches far and would spoil those of its colour.
+    asked
+        F quantities, row n of whose matrices is zero but for n and its neighbours; and of each the nodes (N,) whose
+        uncertainty is asked for. It must not touch a node that is hardly seen: such a column reaches far and would
+        spoil those of its colour.
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
-    sums = np.empty((2 * count, len(functionals), colours))
-    for i, functional in enumerate(functionals):
-        row = np.repeat(np.arange(count), np.diff(functional.indptr))
-        place = functional.indices.astype(np.int64) * colours + colouring.colour[row]
-        parts = np.bincount(place, weights=functional.data * nodes[row], minlength=2 * count * colours)
-        sums[:, i] = parts.reshape(2 * count, colours)
-    columns = solve(sums.reshape(2 * count, -1))
-    energy = np.empty((count, *sums.shape[1:]))
-    covariance = right_side_covariance  # symmetric: its columns are its rows
-    node_energies(covariance.data, covariance.indices, covariance.indptr, columns, energy.reshape(count, -1))
+    together = max(1, _TOGETHER // (2 * count * colours))
+    if len(asked) > together:
+        parts = (asked[i : i + together] for i in range(0, len(asked), together))
+        return np.concatenate([functional_std(solve, covariance, colouring, part) for part in parts], axis=1)
+    columns = np.zeros((count, 2, len(asked), colours))
+    for i, (functional, nodes) in enumerate(asked):
+        for axis, matrix in enumerate(functional):
+            if matrix is not None:
+                row = np.repeat(np.arange(count), np.diff(matrix.indptr))
+                place = matrix.indices * np.int64(colours) + colouring.colour[row]
+                sums = np.bincount(place, weights=matrix.data * nodes[row], minlength=count * colours)
+                columns[:, axis, i] = sums.reshape(count, colours)
+    solved = solve(columns.reshape(2 * count, -1))
+    energy = np.empty((count, len(asked), colours))
+    node_energies(  # of a symmetric matrix, whose columns are its rows
+        covariance.data, covariance.indices, covariance.indptr, solved, energy.reshape(count, -1)
+    )
     nearest = colouring.nearest.T.ravel()
-    variance = [
-        np.bincount(nearest, weights=energy[:, i].ravel(), minlength=count)[:count] for i in range(len(functionals))
-    ]
+    variance = [np.bincount(nearest, weights=own.ravel(), minlength=count)[:count] for own in energy.transpose(1, 0, 2)]
     return np.sqrt(np.maximum(np.stack(variance, axis=1), 0))
 
 
-def displacement_functionals(nodes: int) -> list[sp.csr_matrix]:
+def displacement_functionals(nodes: int) -> list[Functional]:
     """The displacements u and v themselves, as `functional_std` takes them."""
-    row = np.arange(nodes)
-    return [sp.csr_matrix((np.ones(nodes), (row, 2 * row + axis)), shape=(nodes, 2 * nodes)) for axis in (0, 1)]
+    itself = sp.eye(nodes, format="csr")
+    return [(itself, None), (None, itself)]

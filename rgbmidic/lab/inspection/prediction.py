@@ -148,8 +148,8 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
     solve = factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
     used = np.asarray(seen[mesh.elements].all(axis=1))
     recovery = Recovery.over(mesh, used, density, linear_fit_offset(mesh))
-    along_x, colouring = recovery.displacement_functionals[:1], NodeColouring.from_mesh(mesh)
-    std = np.stack([functional_std(solve, assembled(score), colouring, along_x, seen)[:, 0] for score in scores])
+    along_x, colouring = [(recovery.displacement_functionals[0], seen)], NodeColouring.from_mesh(mesh)
+    std = np.stack([functional_std(solve, assembled(score), colouring, along_x)[:, 0] for score in scores])
     return np.where(seen & (std < LOST), std, np.nan)
 
 

@@ -86,9 +86,9 @@ def test_elements_of_any_size_state_their_error(size):
 def test_the_smallest_element_beside_a_hole_is_told_by_the_common_way(monkeypatch):
     columns = []
 
-    def counted(solve, covariance, colouring, functionals, nodes):
-        columns.append(len(functionals) * len(colouring.nearest))
-        return functional_std(solve, covariance, colouring, functionals, nodes)
+    def counted(solve, covariance, colouring, asked):
+        columns.append(len(asked) * len(colouring.nearest))
+        return functional_std(solve, covariance, colouring, asked)
 
     monkeypatch.setattr("rgbmidic.correlation.uncertainty.nodal.functional_std", counted)
     image = Texture.random(4, speckle=3).image((96, 96))
@@ -97,7 +97,7 @@ def test_the_smallest_element_beside_a_hole_is_told_by_the_common_way(monkeypatc
     found = correlate(first, noisy(image, 1), element_size=4, initial=(0, 0))
     assert 0.6 < found.measured.mean() < 1
     # triangular solves do not grow with the rim of a hole: a fixed number of colours a pass
-    assert max(columns) <= 3 * 30
+    assert max(columns) <= 5 * 30
 
 
 def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
@@ -117,9 +117,12 @@ def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
     used = equations.textured[mesh.elements].all(axis=1)
     recovery = Recovery.over(mesh, used, equations.information(reference), reference.linear_offset)
     strain, hessian = recovery.strain_functionals, reference.assembly.matrix(equations.blocks)
-    probed = functional_std(equations.solve, hessian, reference.colouring, strain, inner)
+    probed = functional_std(equations.solve, hessian, reference.colouring, [(one, inner) for one in strain])
     for number, functional in enumerate(strain):
-        column = equations.solve(functional[inner].T.toarray())
+        whole = np.zeros((len(mesh.nodes), len(mesh.nodes), 2))
+        for axis, matrix in enumerate(functional):
+            whole[..., axis] += 0 if matrix is None else matrix.toarray()
+        column = equations.solve(whole.reshape(len(mesh.nodes), -1)[inner].T)
         exact = np.sqrt((column * (hessian @ column)).sum(axis=0))
         assert np.median(probed[inner, number] / exact) == pytest.approx(1, abs=0.05)
         assert (probed[inner, number] / exact).min() > 0.7
