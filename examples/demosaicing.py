@@ -30,7 +30,7 @@ for number, state in enumerate((None, moved)):
     pair.append(mosaic)
 
 lights = separate(pair[0], crosstalk)
-index = np.median(lights.reflection_index, axis=(1, 2))
+index = np.median(lights.reflection_index(), axis=(1, 2))
 print(f"speckle {lights.texture.diameter:.1f} px; reflection index of", end=" ")
 print(", ".join(f"{name} {value:.2f}" for name, value in zip(crosstalk.lights, index, strict=True)))
 

@@ -129,7 +129,7 @@ def run(
             progress=progress,
         )
     if chosen is None:
-        _conclude(result, started, draw=draw)
+        _conclude(result, started, draw=draw, processes=workers)
     else:
         print(f"frames {frames} are measured; when all frames are: rgbmidic finish {out}")
 
@@ -147,14 +147,16 @@ def finish(
     _conclude(Result.open(result), started, draw=draw)
 
 
-def _conclude(result: Result, started: float, *, draw: bool) -> None:
-    """Draw a finished result and tell what became of its frames; a failure where none of them is measured."""
+def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
+    """Draw a finished result, in as many processes as cores if none are asked for, and tell what became of its frames;
+    a failure where none of them is measured."""
+    from rgbmidic._kernels.threads import threads
     from rgbmidic.report import remove_figures, remove_report, write_figures
 
     remove_figures(result.path / "figures")
     remove_report(result.path)
     if draw:
-        write_figures(result, result.path / "figures")
+        write_figures(result, result.path / "figures", processes=processes or threads())
     _print_summary(result, time.perf_counter() - started)
     failed = [index for index in result.deformed if result.status[index] == _FAILED]
     if len(failed) == len(result.deformed):
@@ -191,11 +193,13 @@ def figures(
     partial: Partial = False,
 ) -> None:
     """Draw a result: maps, masks and reflections of some frames, and what happened over all of them."""
+    from rgbmidic._kernels.threads import threads
     from rgbmidic.report import write_figures
     from rgbmidic.results import Result
 
     chosen = _whole_numbers(frames, "--frames") if frames else None
-    for file in write_figures(Result.open(result, partial=partial), out or result / "figures", chosen):
+    opened, folder = Result.open(result, partial=partial), out or result / "figures"
+    for file in write_figures(opened, folder, chosen, processes=threads()):
         print(file)
 
 
@@ -346,6 +350,7 @@ def demo(
         f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}", soft_wrap=True
     )
     _tell_first_run()
+    from rgbmidic._kernels.threads import threads
     from rgbmidic.lab.demo import run_demo
     from rgbmidic.report import write_figures
     from rgbmidic.results import Result
@@ -354,7 +359,7 @@ def demo(
     with _progress("demo") as progress:
         rows = run_demo(out, lambda line: _messages.print(line, soft_wrap=True), _calibrate_demo, progress)
     _messages.print(f"5 of 5: pictures of the result in {out / 'figures'}", soft_wrap=True)
-    write_figures(Result.open(out / "result"), out / "figures", (1, len(rows)))
+    write_figures(Result.open(out / "result"), out / "figures", (1, len(rows)), processes=threads())
     table = Table(title="Displacement error against the exact truth, px (a sphere turning under moving reflections)")
     for heading in ("angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"):
         table.add_column(heading, justify="right")

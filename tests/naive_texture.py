@@ -15,14 +15,13 @@ def between(grid, row, column, block):
     return upper * (1 - part[0]) + lower * part[0]
 
 
-def block_sums(values, cfa, block):
-    channels = site_channels(values.shape, cfa)
-    shape = (3, *(-(-n // block) for n in values.shape))
+def block_sums(values, block):
+    shape = (4, *(-(-n // block) for n in values.shape))
     sums, counts = np.zeros(shape), np.zeros(shape)
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
-            sums[channels[i, j], i // block, j // block] += value
-            counts[channels[i, j], i // block, j // block] += 1
+            sums[2 * (i % 2) + j % 2, i // block, j // block] += value
+            counts[2 * (i % 2) + j % 2, i // block, j // block] += 1
     return sums, counts
 
 

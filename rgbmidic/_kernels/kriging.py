@@ -3,13 +3,17 @@
 import numpy as np
 
 from rgbmidic._kernels.compilation import compiled, helper
-from rgbmidic._kernels.texture import expand_row
+from rgbmidic._kernels.texture import between
 from rgbmidic._kernels.threads import over_ranges
 
 __all__ = ["TILE", "fill_unknown", "predict"]
 
 TILE = 16
 """Side in px of the squares within which the filters are the same."""
+_SIZE = 5
+"""Usual side of the square of samples, whose taps are added in one go."""
+_STRIP = 256
+"""Columns at a time: what a core's caches hold of their filters."""
 
 
 @helper()
@@ -51,46 +55,39 @@ def fill_unknown(start, stop, padded, share, red_row, red_column, pad, out, unkn
 
 
 # contraction to fused multiply-add alone: NaN and infinity keep their meaning
-@helper(fastmath={"contract"})
-def _add_five(line, c0, c1, c2, c3, c4, total):
-    for j in range(total.size):
-        total[j] += (
-            c0[j] * line[j] + c1[j] * line[j + 1] + c2[j] * line[j + 2] + c3[j] * line[j + 3] + c4[j] * line[j + 4]
-        )
+@helper(fastmath={"contract"}, forceinline=True)
+def _filtered(r0, r1, r2, r3, r4, lines, out):
+    """Sum of the products of five rows of samples with the taps `lines` (25, _STRIP)."""
+    for j in range(out.size):
+        total = np.float32(0.0)
+        for b in range(_SIZE):
+            upper = lines[b, j] * r0[j + b] + lines[_SIZE + b, j] * r1[j + b]
+            lower = lines[3 * _SIZE + b, j] * r3[j + b] + lines[4 * _SIZE + b, j] * r4[j + b]
+            total += upper + lines[2 * _SIZE + b, j] * r2[j + b] + lower
+        out[j] = total
 
 
-@helper(fastmath={"contract"})
-def _add_one(line, c, total):
-    for j in range(total.size):
-        total[j] += c[j] * line[j]
-
-
-@helper()
-def _add_taps(line, lines, k, size, total):
-    """Add the products of a row of samples with the `size` filters `lines` from the k-th, five at a time."""
-    b = 0
-    while b + 5 <= size:
-        _add_five(line[b:], lines[k + b], lines[k + b + 1], lines[k + b + 2], lines[k + b + 3], lines[k + b + 4], total)
-        b += 5
-    while b < size:
-        _add_one(line[b:], lines[k + b], total)
-        b += 1
+@helper(fastmath={"contract"}, forceinline=True)
+def _add_tap(row, line, out):
+    for j in range(out.size):
+        out[j] += line[j] * row[j]
 
 
 @helper()
-def _spread(taps, index, row, parity, output, lines):
-    """Filters of a row of tiles, tap by tap, written out along the pixels: `lines` (size², 16 w)."""
-    for tile in range(index.shape[1]):
-        chosen = index[row, tile]
+def _spread(taps, parity, channel, index, first, lines):
+    """Filters of tiles, tap by tap, written out along the pixels from the tile `first` on."""
+    for tile in range(first, min(first + _STRIP // TILE, index.size)):
+        chosen = taps[index[tile], parity, channel]
         for k in range(lines.shape[0]):
+            source, line = chosen[k], lines[k, (tile - first) * TILE :]
             for j in range(TILE):
-                lines[k, tile * TILE + j] = taps[chosen, parity, output, k, j]
+                line[j] = source[j]
 
 
 @over_ranges("index")
 @compiled(fastmath={"contract"})
-def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, mean_block, out):
-    """Channels from the scaled contrast: ``out = mean + scale * sum of taps x samples around``.
+def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, mean_block, mixing, out):
+    """Mixtures of the channels ``mean + scale * sum of taps x samples around`` from the scaled contrast.
 
     Parameters
     ----------
@@ -98,29 +95,49 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
         Scaled contrast, finite, with pad = size // 2.
     index : (h, w) int32
         Which filters each tile of 16 x 16 px uses.
-    taps : (T, 2, n, size², 16) float32
-        By row parity, output and tap; the last axis runs over the columns of the tile, which alternate between two
+    taps : (T, 2, 3, size², 16) float32
+        By row parity, channel and tap; the last axis runs over the columns of the tile, which alternate between two
         phases.
-    scale, mean : (n, gh, gw) float32
-        Grids of `scale_block` and `mean_block` px.
+    scale, mean : (3, h, W) float32
+        Rows of grids of `scale_block` and `mean_block` px, widened to the pixels.
+    mixing : (n, 3) float32
     out : (n, H, W) float32
     """
-    outputs, rows, columns = out.shape
-    width = index.shape[1] * TILE
+    rows, columns = out.shape[1:]
+    lines, channels = np.empty((size * size, _STRIP), np.float32), np.empty((3, TILE, _STRIP), np.float32)
     for ti in range(start, stop):
-        lines = np.empty((size * size, width), dtype=np.float32)
-        total, level, gain = np.empty(width, np.float32), np.empty(columns, np.float32), np.empty(columns, np.float32)
-        scratch_scale, scratch_mean = np.empty(scale.shape[2], np.float32), np.empty(mean.shape[2], np.float32)
-        for n in range(outputs):
-            for parity in range(2):
-                _spread(taps, index, ti, parity, n, lines)
-                for i in range(ti * TILE + parity, min((ti + 1) * TILE, rows), 2):
-                    for j in range(width):
-                        total[j] = 0.0
-                    for a in range(size):
-                        _add_taps(padded[i + a], lines, a * size, size, total)
-                    expand_row(scale[n], i, scale_block, scratch_scale, gain)
-                    expand_row(mean[n], i, mean_block, scratch_mean, level)
-                    target = out[n, i]
-                    for j in range(columns):
-                        target[j] = level[j] + gain[j] * total[j]
+        top, bottom = ti * TILE, min((ti + 1) * TILE, rows)
+        for left in range(0, columns, _STRIP):
+            number = min(_STRIP, columns - left)
+            for c in range(3):
+                for parity in range(2):
+                    _spread(taps, parity, c, index[ti], left // TILE, lines)
+                    for i in range(top + parity, bottom, 2):
+                        made = channels[c, i - top, :number]
+                        if size == _SIZE:
+                            _filtered(
+                                padded[i, left:],
+                                padded[i + 1, left:],
+                                padded[i + 2, left:],
+                                padded[i + 3, left:],
+                                padded[i + 4, left:],
+                                lines,
+                                made,
+                            )
+                        else:
+                            made[:] = 0
+                            for k in range(size * size):
+                                _add_tap(padded[i + k // size, left + k % size :], lines[k], made)
+                        low, high, part = between(i, mean_block, mean.shape[1])
+                        above, below = mean[c, low, left:], mean[c, high, left:]
+                        low, high, ahead = between(i, scale_block, scale.shape[1])
+                        gain, other = scale[c, low, left:], scale[c, high, left:]
+                        for j in range(number):
+                            level = above[j] + part * (below[j] - above[j])
+                            made[j] = level + (gain[j] + ahead * (other[j] - gain[j])) * made[j]
+            for n in range(len(out)):
+                red, green, blue = mixing[n]
+                for i in range(top, bottom):
+                    r, g, b, target = channels[0, i - top], channels[1, i - top], channels[2, i - top], out[n, i, left:]
+                    for j in range(number):
+                        target[j] = red * r[j] + green * g[j] + blue * b[j]

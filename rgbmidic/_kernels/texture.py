@@ -10,38 +10,65 @@ import numpy as np
 from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.threads import over_ranges
 
-__all__ = ["block_sums", "cell_moments", "expand_row", "lag_products", "scaled_contrast", "subtract_mean"]
+__all__ = [
+    "PLANE_PAIRS",
+    "between",
+    "block_sums",
+    "cell_moments",
+    "expand_row",
+    "lag_products",
+    "scaled_contrast",
+    "subtract_mean",
+]
 
 REACH = 3
 """Rows and columns beyond a cell that its binomial sums reach."""
+PLANE_PAIRS = tuple((p, q) for p in range(4) for q in range(p, 4))
+"""Pairs of the planes of a mosaic; plane 2 a + b has the samples of row a and column b of the 2x2 cells."""
+_CELLS = 128
+"""Cells of a row at a time."""
 
 
 @over_ranges("sums", axis=1)
 @compiled()
-def block_sums(start, stop, values, red_row, red_column, block, sums, counts):
-    """Sum and number of finite samples of each channel in each block: `sums`, `counts` (3, h, w) float64."""
-    rows, columns = values.shape
+def block_sums(start, stop, values, block, sums, counts):
+    """Sum and number of finite samples of each plane in each block: `sums`, `counts` (4, h, w) float32."""
+    total, number = np.zeros((2, sums.shape[2] * block), np.float32), np.zeros((2, sums.shape[2] * block), np.float32)
     for bi in range(start, stop):
-        for bj in range(sums.shape[2]):
-            for channel in range(3):
-                sums[channel, bi, bj] = 0.0
-                counts[channel, bi, bj] = 0.0
-            for i in range(bi * block, min((bi + 1) * block, rows)):
-                own = 0 if i % 2 == red_row else 2
-                for j in range(bj * block, min((bj + 1) * block, columns)):
-                    channel = own if (j % 2 == red_column) == (own == 0) else 1
-                    if np.isfinite(values[i, j]):
-                        sums[channel, bi, bj] += values[i, j]
-                        counts[channel, bi, bj] += 1.0
+        for i in range(bi * block, min((bi + 1) * block, len(values))):
+            line, value, known = values[i], total[i % 2], number[i % 2]
+            for j in range(line.size):
+                finite = np.isfinite(line[j])
+                value[j] += line[j] if finite else np.float32(0.0)
+                known[j] += np.float32(1.0) if finite else np.float32(0.0)
+        for plane in range(4):
+            _gather(total[plane // 2, plane % 2 :], 2, block // 2, sums[plane, bi])
+            _gather(number[plane // 2, plane % 2 :], 2, block // 2, counts[plane, bi])
+        total[:] = number[:] = 0
+
+
+@helper()
+def _gather(line, step, block, out):
+    """Sums of `block` entries of a line after the other, `step` apart."""
+    for b in range(out.size):
+        total = np.float32(0.0)
+        for j in range(block):
+            total += line[np.uint64((b * block + j) * step)]
+        out[b] = total
+
+
+@helper()
+def between(row, block, rows):
+    """The two rows of a grid that a row of pixels lies between, and how far it is from the first to the second."""
+    position = min(max((row + 0.5) / block - 0.5, 0.0), rows - 1.0)
+    low = int(position)
+    return low, min(low + 1, rows - 1), np.float32(position - low)
 
 
 @helper()
 def expand_row(grid, row, block, line, out):
     """Row of pixels `out` (W,) interpolated from a grid (h, w); `line` (w,) is scratch."""
-    position = min(max((row + 0.5) / block - 0.5, 0.0), grid.shape[0] - 1.0)
-    low = int(position)
-    high = min(low + 1, grid.shape[0] - 1)
-    part = np.float32(position - low)
+    low, high, part = between(row, block, grid.shape[0])
     for g in range(line.size):
         line[g] = grid[low, g] + part * (grid[high, g] - grid[low, g])
     half, last = block // 2, line.size - 1
@@ -58,111 +85,103 @@ def expand_row(grid, row, block, line, out):
         out[j] = line[last]
 
 
-@helper()
-def _expand_own(grid, i, block, red_row, red_column, line, other, out):
-    """Row i of a grid (3, h, w) of blocks, at each pixel that of the pixel's own channel, into `out` (W,)."""
-    own = 0 if i % 2 == red_row else 2
-    expand_row(grid[own], i, block, line, other)
-    expand_row(grid[1], i, block, line, out)
-    start = red_column if own == 0 else 1 - red_column
-    for j in range(start, out.size, 2):
-        out[j] = other[j]
-
-
 @over_ranges("out")
 @compiled()
-def subtract_mean(start, stop, values, mean, red_row, red_column, block, out):
-    """``out = values - local mean of the pixel's channel``; `mean` (3, h, w) float32."""
-    columns = values.shape[1]
+def subtract_mean(start, stop, values, mean, block, out):
+    """``out = values - local mean``; `mean` (2, h, W) float32: the rows of a grid, for the even and for the odd rows of
+    pixels, widened to their columns."""
     for i in range(start, stop):
-        line = np.empty(mean.shape[2], dtype=np.float32)
-        other, green = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
-        _expand_own(mean, i, block, red_row, red_column, line, other, green)
-        for j in range(columns):
-            out[i, j] = values[i, j] - green[j]
+        low, high, part = between(i, block, mean.shape[1])
+        above, below, line, target = mean[i % 2, low], mean[i % 2, high], values[i], out[i]
+        for j in range(line.size):
+            target[j] = line[j] - (above[j] + part * (below[j] - above[j]))
 
 
 @over_ranges("out")
 @compiled()
-def scaled_contrast(start, stop, contrast, scale, red_row, red_column, block, pad, out):
-    """``out = contrast * scale of the pixel's channel``, mirrored by `pad` pixels on every side.
+def scaled_contrast(start, stop, contrast, scale, block, pad, out):
+    """``out = contrast * scale``, mirrored by `pad` pixels on every side.
 
-    `scale` (3, h, w) float32; `out` has `pad` more rows above and below and columns on the left, and at least as many
-    on the right, where what lies beyond is 0. H, W > pad.
+    `scale` (2, h, W) float32 as the mean of `subtract_mean`; `out` has `pad` more rows above and below and columns on
+    the left, and at least as many on the right, where what lies beyond is 0. H, W > pad.
     """
     rows, columns = contrast.shape
     for p in range(start, stop):
         i = abs(p - pad)
         i = min(i, 2 * (rows - 1) - i)
-        line = np.empty(scale.shape[2], dtype=np.float32)
-        other, green = np.empty(columns, dtype=np.float32), np.empty(columns, dtype=np.float32)
-        _expand_own(scale, i, block, red_row, red_column, line, other, green)
-        target = out[p]
+        low, high, part = between(i, block, scale.shape[1])
+        above, below, line, target = scale[i % 2, low], scale[i % 2, high], contrast[i], out[p, pad:]
         for j in range(columns):
-            target[j + pad] = contrast[i, j] * green[j]
+            target[j] = line[j] * (above[j] + part * (below[j] - above[j]))
         for side in range(1, pad + 1):
-            target[pad - side] = target[pad + side]
-            target[pad + columns - 1 + side] = target[pad + columns - 1 - side]
-        for j in range(columns + 2 * pad, target.size):
+            out[p, pad - side] = target[side]
+            target[columns - 1 + side] = target[columns - 1 - side]
+        for j in range(columns + pad, target.size):
             target[j] = 0.0
 
 
-@helper()
-def _along(line, j, odd):
-    """Binomial sum about the middle of the cell at column j, of its even or its odd columns."""
-    if odd:
-        return 5 * line[j - 1] + 10 * line[j + 1] + line[j + 3]
-    return line[j - 2] + 10 * line[j] + 5 * line[j + 2]
+@helper(fastmath={"contract"})
+def _down(above, here, below, first, last, planes, number):
+    """Binomial sums of three rows of a mosaic, of their even and of their odd columns."""
+    ten = np.float32(10)
+    for c in range(np.uint64(number)):
+        j = np.uint64(2) * c
+        planes[0, c] = first * above[j] + ten * here[j] + last * below[j]
+        j += np.uint64(1)
+        planes[1, c] = first * above[j] + ten * here[j] + last * below[j]
 
 
 @over_ranges("counts")
-@compiled()
-def cell_moments(start, stop, contrast, red_row, red_column, block, sums, counts):
+@compiled(fastmath={"contract"})
+def cell_moments(start, stop, contrast, block, sums, counts):
     """Second moments of the four planes' low-passed contrast, summed over the cells of each block.
 
-    At the middle of each 2x2 cell the binomial [1 5 10 10 5 1] along both axes takes from each of the planes red, green
-    in red rows, green in blue rows and blue its own share, with the same weight and the same centroid. `sums`
-    (7, h, w) float64 receives red², green², blue², red green, red blue, green blue, the greens averaged after
-    multiplying, and the product of the two greens; `counts` (h, w) the cells; a cell with a sample that is not finite
-    in reach is left out.
+    At the middle of each 2x2 cell the binomial [1 5 10 10 5 1] along both axes takes from each plane its own share,
+    with the same weight and the same centroid. `sums` (10, h, w) float32 receives the products of the planes in the
+    order of `PLANE_PAIRS`, `counts` (h, w) the cells; a cell with a sample that is not finite in reach is left out.
     """
     rows, columns = contrast.shape
     half = block // 2
+    one, five, ten = np.float32(1), np.float32(5), np.float32(10)
+    planes, total = np.empty((4, _CELLS + 2), np.float32), np.empty((11, _CELLS), np.float32)
     for bi in range(start, stop):
-        for bj in range(sums.shape[2]):
-            counts[bi, bj] = 0.0
-            for moment in range(7):
-                sums[moment, bi, bj] = 0.0
-        even = np.empty(columns, dtype=np.float32)
-        odd = np.empty(columns, dtype=np.float32)
-        for ci in range(bi * half, (bi + 1) * half):
-            i = 2 * ci
-            if i < 2 or i + REACH >= rows:
-                continue
-            for j in range(columns):
-                even[j] = contrast[i - 2, j] + 10 * contrast[i, j] + 5 * contrast[i + 2, j]
-                odd[j] = 5 * contrast[i - 1, j] + 10 * contrast[i + 1, j] + contrast[i + 3, j]
-            red = even if red_row == 0 else odd
-            blue = odd if red_row == 0 else even
-            for bj in range(sums.shape[2]):
-                for cj in range(bj * half, (bj + 1) * half):
-                    j = 2 * cj
-                    if j < 2 or j + REACH >= columns:
-                        continue
-                    r, g1 = _along(red, j, red_column), _along(red, j, 1 - red_column)
-                    g2, b = _along(blue, j, red_column), _along(blue, j, 1 - red_column)
-                    total = r + g1 + g2 + b
-                    if not np.isfinite(total):
-                        continue
-                    g = 0.5 * (g1 + g2)
-                    sums[0, bi, bj] += r * r
-                    sums[1, bi, bj] += 0.5 * (g1 * g1 + g2 * g2)
-                    sums[2, bi, bj] += b * b
-                    sums[3, bi, bj] += r * g
-                    sums[4, bi, bj] += r * b
-                    sums[5, bi, bj] += g * b
-                    sums[6, bi, bj] += g1 * g2
-                    counts[bi, bj] += 1.0
+        for left in range(0, half * sums.shape[2], _CELLS):
+            total[:] = 0
+            first = max(left, 1)
+            number = min(left + _CELLS, columns // 2 - 1) - first
+            for i in range(max(bi * block, 2), min((bi + 1) * block, rows - REACH), 2):
+                j = 2 * first - 2
+                _down(contrast[i - 2, j:], contrast[i, j:], contrast[i + 2, j:], one, five, planes[:2], number + 2)
+                _down(contrast[i - 1, j:], contrast[i + 1, j:], contrast[i + 3, j:], five, one, planes[2:], number + 2)
+                for c in range(np.uint64(max(number, 0))):
+                    d, e = c + np.uint64(1), c + np.uint64(2)
+                    p0 = planes[0, c] + ten * planes[0, d] + five * planes[0, e]
+                    p1 = five * planes[1, c] + ten * planes[1, d] + planes[1, e]
+                    p2 = planes[2, c] + ten * planes[2, d] + five * planes[2, e]
+                    p3 = five * planes[3, c] + ten * planes[3, d] + planes[3, e]
+                    known = np.isfinite(p0 + p1 + p2 + p3)
+                    q0, q1 = p0 if known else np.float32(0), p1 if known else np.float32(0)
+                    q2, q3 = p2 if known else np.float32(0), p3 if known else np.float32(0)
+                    total[0, c] += q0 * q0
+                    total[1, c] += q0 * q1
+                    total[2, c] += q0 * q2
+                    total[3, c] += q0 * q3
+                    total[4, c] += q1 * q1
+                    total[5, c] += q1 * q2
+                    total[6, c] += q1 * q3
+                    total[7, c] += q2 * q2
+                    total[8, c] += q2 * q3
+                    total[9, c] += q3 * q3
+                    total[10, c] += one if known else np.float32(0)
+            for b in range(left // half, min((left + _CELLS) // half, sums.shape[2])):
+                for moment in range(11):
+                    value = np.float32(0)
+                    for c in range(b * half - first, (b + 1) * half - first):
+                        value += total[moment, c] if 0 <= c < _CELLS else np.float32(0)
+                    if moment < 10:
+                        sums[moment, bi, b] = value
+                    else:
+                        counts[bi, b] = value
 
 
 @compiled()

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import splu
 
-from rgbmidic._kernels.factors import solve_factors
+from rgbmidic._kernels.triangular import solve_factors
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.sparse import with_data
 from rgbmidic.typing import FloatArray
 
 __all__ = ["Assembly", "factorise"]
-
-_MANY = 8
-"""Right-hand sides from which they are solved side by side: SuperLU takes three to five times as long for a hundred."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,17 +104,13 @@ def _sums(rows: npt.NDArray[np.int64], number: npt.NDArray[np.int64], count: int
 
 def factorise(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
     """Factorise a symmetric positive definite matrix; gives the function that solves for right-hand sides."""
-    return partial(
-        _solved, splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    )
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    parts = [part for factor in (factors.L, factors.U) for part in (factor.data, factor.indices, factor.indptr)]
 
+    def solve(right_sides: FloatArray) -> FloatArray:
+        solution = np.empty((len(right_sides), right_sides[0].size))
+        solution[factors.perm_r] = right_sides.reshape(solution.shape)
+        solve_factors(*parts, solution)
+        return solution[factors.perm_c].reshape(right_sides.shape)
 
-def _solved(factors: SuperLU, right_sides: FloatArray) -> FloatArray:
-    if right_sides.ndim == 1 or right_sides.shape[1] < _MANY:
-        return np.asarray(factors.solve(right_sides))
-    columns = np.empty(right_sides.shape)
-    columns[factors.perm_r] = right_sides
-    lower, upper = factors.L, factors.U
-    triangles = (part for matrix in (lower, upper) for part in (matrix.indptr, matrix.indices, matrix.data))
-    solve_factors(*triangles, upper.diagonal(), columns)
-    return columns[factors.perm_c]
+    return solve

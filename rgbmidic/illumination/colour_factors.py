@@ -30,7 +30,9 @@ __all__ = [
     "gather_moments",
     "learn_texture",
     "local_means",
+    "of_mosaic",
     "scaled",
+    "widened",
 ]
 
 
@@ -122,12 +124,13 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     """
     mean = local_means(values, red)
     contrast = np.empty_like(values)
-    kernels.subtract_mean(values, mean, *red, MEAN_BLOCK, contrast)
+    kernels.subtract_mean(values, of_mosaic(mean, MEAN_BLOCK, values.shape[1], red), MEAN_BLOCK, contrast)
     height, width = (-(-side // BLOCK) for side in values.shape)
-    sums, counts = np.empty((7, height, width)), np.empty((height, width))
-    kernels.cell_moments(contrast, *red, BLOCK, sums, counts)
+    sums = np.empty((len(kernels.PLANE_PAIRS), height, width), dtype=np.float32)
+    counts = np.empty((1, height, width), dtype=np.float32)
+    kernels.cell_moments(contrast, BLOCK, sums, counts[0])
     # the binomial weights of a plane sum to 256 in the kernel
-    moments = _smooth(sums / 256**2, counts, MOMENT_WIDTH / BLOCK)
+    moments = _smooth(colour_moments(sums, red), counts, MOMENT_WIDTH / BLOCK).astype(np.float64) / 256**2
     level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in mean]).astype(np.float64)
     variance = np.zeros_like(level) if noise is None else np.asarray(noise.variance(level), dtype=np.float64)
     # where nothing is seen but noise, a third of it stands for the contrast that there may be
@@ -137,34 +140,82 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     return Moments(mean=mean, contrast=contrast, own=own, shared=shared, greens=greens, noise=variance, red=red)
 
 
-def enlarged(grid: npt.NDArray[np.floating], block: int, shape: tuple[int, ...]) -> FloatImage:
-    """A grid (n, h, w) of blocks interpolated to the pixels (n, H, W) of a frame of `shape` (H, W)."""
-    size = (grid.shape[2] * block, grid.shape[1] * block)
-    whole = [cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) for layer in grid]
-    return np.stack([layer[: shape[0], : shape[1]] for layer in whole])
+def enlarged(grid: npt.NDArray[np.floating], block: int, shape: tuple[int, ...], step: int = 1) -> FloatImage:
+    """A grid (n, h, w) of blocks interpolated to every `step`-th pixel of a frame of `shape` (H, W)."""
+    wide = widened(grid, block, shape[1])[:, :, ::step]
+    place = np.clip((np.arange(0, shape[0], step) + 0.5) / block - 0.5, 0, grid.shape[1] - 1)
+    low = place.astype(np.intp)
+    part = (place - low).astype(np.float32)[:, None]
+    above, below = wide[:, low], wide[:, np.minimum(low + 1, grid.shape[1] - 1)]
+    below -= above
+    below *= part
+    return np.asarray(np.add(above, below, out=below))
+
+
+def widened(grid: npt.NDArray[np.floating], block: int, columns: int) -> FloatImage:
+    """The rows of a grid (n, h, w) of blocks interpolated to the columns of a frame, (n, h, W)."""
+    out = np.empty((*grid.shape[:2], columns), dtype=np.float32)
+    for layer, wide in zip(grid, out, strict=True):
+        size = grid.shape[2] * block, grid.shape[1]
+        wide[:] = cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:, :columns]
+    return out
+
+
+def of_mosaic(grid: npt.NDArray[np.floating], block: int, columns: int, red: tuple[int, int]) -> FloatImage:
+    """Of a grid (3, h, w) for each channel, the rows for even and for odd rows of a mosaic, (2, h, W): at each column
+    that of the channel sampled there."""
+    wide = widened(grid, block, columns)
+    out = np.empty((2, *wide.shape[1:]), dtype=np.float32)
+    for row, column in np.ndindex(2, 2):
+        channel = 1 if (row == red[0]) != (column == red[1]) else 0 if row == red[0] else 2
+        out[row, :, column::2] = wide[channel, :, column::2]
+    return out
 
 
 def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
     """Local mean (3, h, w) of each channel of a mosaic, NaN where not known, on a grid of `MEAN_BLOCK` px."""
-    shape = (3, *(-(-side // MEAN_BLOCK) for side in values.shape))
-    sums, counts = np.empty(shape), np.empty(shape)
-    kernels.block_sums(values, *red, MEAN_BLOCK, sums, counts)
-    return _smooth(sums, counts, MEAN_WIDTH / MEAN_BLOCK).astype(np.float32)
+    shape = (4, *(-(-side // MEAN_BLOCK) for side in values.shape))
+    sums, counts = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+    kernels.block_sums(values, MEAN_BLOCK, sums, counts)
+    r, g, h, b = _planes(red)
+    total, number = (np.stack([of[r], of[g] + of[h], of[b]]) for of in (sums, counts))
+    return _smooth(total, number, MEAN_WIDTH / MEAN_BLOCK)
 
 
-def _smooth(sums: FloatArray, counts: FloatArray, sigma: float) -> FloatArray:
-    """Mean (n, h, w) in a Gaussian window (blocks) of sums over `counts` entries; the overall mean where none are."""
+def _planes(red: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Of red, of green in red rows, of green in blue rows and of blue the plane (`PLANE_PAIRS`)."""
+    row, column = red
+    return 2 * row + column, 2 * row + 1 - column, 2 - 2 * row + column, 3 - 2 * row - column
 
-    def blurred(grid: FloatArray) -> FloatArray:
+
+def colour_moments(sums: FloatImage, red: tuple[int, int]) -> FloatImage:
+    """Moments of the colours (7, h, w) from those of the planes (10, h, w).
+
+    red², green², blue², red green, red blue, green blue, the greens averaged after multiplying, and the product of the
+    two greens.
+    """
+    of = {frozenset(pair): moment for pair, moment in zip(kernels.PLANE_PAIRS, sums, strict=True)}
+    r, g, h, b = _planes(red)
+    both = [(of[frozenset((n, g))] + of[frozenset((n, h))]) / 2 for n in (r, b)]
+    own = [of[frozenset((r,))], (of[frozenset((g,))] + of[frozenset((h,))]) / 2, of[frozenset((b,))]]
+    return np.stack([*own, both[0], of[frozenset((r, b))], both[1], of[frozenset((g, h))]])
+
+
+def _smooth(sums: FloatImage, counts: FloatImage, sigma: float) -> FloatImage:
+    """Mean (n, h, w) in a Gaussian window (blocks) of sums over `counts` entries, (n, h, w) or (1, h, w); the overall
+    mean where none are."""
+
+    def blurred(grid: FloatImage) -> FloatImage:
+        if (grid == grid[0, 0]).all():
+            return grid
         return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
 
-    counts = np.broadcast_to(counts, sums.shape)
     out = np.empty_like(sums)
-    for total, number, target in zip(sums, counts, out, strict=True):
-        weight = blurred(np.ascontiguousarray(number))
-        overall = total.sum() / max(number.sum(), 1.0)
+    weights = np.broadcast_to([blurred(number) for number in counts], sums.shape)
+    for total, number, weight, target in zip(sums, np.broadcast_to(counts, sums.shape), weights, out, strict=True):
+        overall = total.sum(dtype=np.float64) / max(number.sum(dtype=np.float64), 1.0)
         enough = weight > 1e-3 * max(float(number.max()), 1.0)
-        np.divide(blurred(np.ascontiguousarray(total)), weight, out=target, where=enough)
+        np.divide(blurred(total), weight, out=target, where=enough)
         target[~enough] = overall
     return out
 
@@ -189,7 +240,7 @@ def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None =
     """Contrast times `scale` (3, h, w), mirrored by `pad` px; `width` asks for more columns, which are 0."""
     rows, columns = moments.contrast.shape
     out = np.empty((rows + 2 * pad, max(columns, width or 0) + 2 * pad), dtype=np.float32)
-    kernels.scaled_contrast(moments.contrast, np.ascontiguousarray(scale), *moments.red, BLOCK, pad, out)
+    kernels.scaled_contrast(moments.contrast, of_mosaic(scale, BLOCK, columns, moments.red), BLOCK, pad, out)
     return out
 
 
@@ -213,9 +264,12 @@ def colour_factors(
     own = moments.own / band.own
     sparkle = np.zeros_like(own)
     allowed = ALIASING * (1 - coloured)
+    least_shared = 1e-4 * own.min(axis=0)
+    to_lights, to_pairs = np.linalg.pinv(crosstalk**2), np.stack([crosstalk[a] * crosstalk[b] for a, b in _PAIRS])
     for _ in range(2):  # the correction is small and settles at once
-        leaked = np.stack([_crossed(crosstalk, sparkle, a, b) for a, b in _PAIRS])
-        red_green, red_blue, green_blue = np.maximum((moments.shared - leaked) / energy, 1e-4 * own.min(axis=0))
+        # moments of two channels that come from the sparkle of lights, given each channel's own
+        leaked = np.tensordot(to_pairs, np.maximum(np.tensordot(to_lights, sparkle, axes=1), 0), axes=1)
+        red_green, red_blue, green_blue = np.maximum((moments.shared - leaked) / energy, least_shared)
         square = np.stack(
             [red_green * red_blue / green_blue, red_green * green_blue / red_blue, red_blue * green_blue / red_green]
         )
@@ -228,9 +282,3 @@ def colour_factors(
     # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side
     variance = np.maximum(private * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
     return ColourFactors(slope=np.sqrt(square), private=variance, noise=moments.noise / square)
-
-
-def _crossed(crosstalk: FloatArray, sparkle: FloatArray, a: int, b: int) -> FloatArray:
-    """Moment of channels a and b that comes from the sparkle of lights, given each channel's own."""
-    lights = np.maximum(np.tensordot(np.linalg.pinv(crosstalk**2), sparkle, axes=1), 0)
-    return np.asarray(np.tensordot(crosstalk[a] * crosstalk[b], lights, axes=1))

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.illumination.colour_factors import BLOCK, enlarged
 from rgbmidic.illumination.linearise import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.typing import BoolArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["REFLECTING", "IlluminationImages"]
 
@@ -33,9 +34,8 @@ class IlluminationImages:
         The lights' names.
     full_scale : float
         Grey level of a just saturated camera sample (DN above black).
-    reflection_index : ndarray, shape (k, H, W), float32, or None
-        Share of a light that is not diffuse, from a single frame: 0 where its contrast is that of the light with the
-        most contrast there, towards 1 in its reflection; None where the separation does not tell.
+    reflection : ndarray, shape (k, h, w), or None
+        What `reflection_index` tells, on a grid of blocks of 8 px.
     texture : TextureModel or None
         The speckle's autocorrelation as the separation took it: hand it on to the other frames of a test; None where
         the separation does not use it.
@@ -45,7 +45,7 @@ class IlluminationImages:
     valid: BoolArray
     names: tuple[str, ...]
     full_scale: float
-    reflection_index: FloatImage | None = None
+    reflection: FloatArray | None = None
     texture: TextureModel | None = None
 
     def __post_init__(self) -> None:
@@ -75,6 +75,14 @@ class IlluminationImages:
             names=("light",) if len(frames) == 1 else tuple(f"light {i + 1}" for i in range(len(frames))),
             full_scale=frames[0].full_scale,
         )
+
+    def reflection_index(self, step: int = 1) -> FloatImage | None:
+        """Share of a light that is not diffuse, from a single frame, (k, H, W) at every `step`-th pixel.
+
+        0 where its contrast is that of the light with the most contrast there, towards 1 in its reflection; None where
+        the separation does not tell.
+        """
+        return None if self.reflection is None else enlarged(self.reflection, BLOCK, self.shape, step)
 
     @property
     def shape(self) -> tuple[int, int]:

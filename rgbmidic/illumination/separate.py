@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, enlarged
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic import (
     Demosaicer,
@@ -22,7 +21,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import unmix
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.typing import FloatArray
 
 __all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "reconstructed_lights", "separate"]
 
@@ -61,17 +60,26 @@ def separate(
     """
     method = _chosen(method, mosaic)
     _check_channels(crosstalk)
-    if method == DEFAULT_METHOD:
-        demosaicer = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)
+    if method != DEFAULT_METHOD:
+        return unmix(_BY_CHANNEL[method](mosaic), crosstalk)
+    demosaicer = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)
+    if crosstalk.field is not None:
         return reconstructed_lights(demosaicer.reconstruct(mosaic), crosstalk)
-    return unmix(_BY_CHANNEL[method](mosaic), crosstalk)
+    model = demosaicer.reconstruct(mosaic, crosstalk.unmixing)
+    return IlluminationImages(
+        values=model.channels.values,
+        valid=model.channels.valid,
+        names=crosstalk.lights,
+        full_scale=mosaic.full_scale,
+        reflection=_reflection(model, crosstalk),
+        texture=model.texture,
+    )
 
 
 def reconstructed_lights(reconstruction: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:
     """The lights of a frame, and their reflection index, from what the reflection-aware method made of its channels."""
     images = unmix(reconstruction.channels, crosstalk)
-    index = _reflection_index(reconstruction.factors, reconstruction.mean, crosstalk)
-    return replace(images, reflection_index=enlarged(index, BLOCK, images.shape), texture=reconstruction.texture)
+    return replace(images, reflection=_reflection(reconstruction, crosstalk), texture=reconstruction.texture)
 
 
 def _chosen(method: str, mosaic: LinearMosaic) -> str:
@@ -90,12 +98,12 @@ def _check_channels(crosstalk: Crosstalk) -> None:
         )
 
 
-def _reflection_index(factors: ColourFactors, mean: FloatImage, crosstalk: Crosstalk) -> FloatArray:
+def _reflection(model: Reconstruction, crosstalk: Crosstalk) -> FloatArray:
     """Index (k, h, w) on the blocks' grid: how much less contrast a light has than the best one."""
-    height, width = factors.slope.shape[1:]
-    level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in mean])
-    slope = np.tensordot(crosstalk.unmixing, factors.slope, axes=1)
-    light = np.tensordot(crosstalk.unmixing, level, axes=1)
+    height, width = model.factors.slope.shape[1:]
+    level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in model.mean])
+    unmixing = crosstalk.unmixing
+    slope, light = (np.tensordot(unmixing, channels, axes=1) for channels in (model.factors.slope, level))
     contrast = np.divide(slope, light, out=np.zeros_like(slope), where=light > 1e-3 * light.max())
     best = contrast.max(axis=0)
     relative = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)

@@ -10,9 +10,9 @@ from rgbmidic.errors import InputError
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearChannels
-from rgbmidic.typing import FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["NEGLIGIBLE", "unmix"]
+__all__ = ["NEGLIGIBLE", "needed", "unmix"]
 
 NEGLIGIBLE = 0.25
 """A clipped channel makes a light invalid only if its coefficient is above this fraction of the light's largest: the
@@ -53,14 +53,14 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
             f"{channels.values.shape}, their validity {channels.valid.shape}"
         )
     matrix = crosstalk.unmixing
-    needed = np.abs(matrix) > negligible * np.abs(matrix).max(axis=1, keepdims=True)
+    matters = needed(matrix, negligible)
     lights, shape = len(matrix), channels.values.shape[1:]
     values = np.empty((lights, shape[0] * shape[1]), dtype=np.float32)
     valid = np.empty(values.shape, dtype=bool)
     flat = np.ascontiguousarray(channels.values, dtype=np.float32).reshape(colours, -1)
     flat_valid = np.ascontiguousarray(channels.valid, dtype=bool).reshape(colours, -1)
     if crosstalk.field is None:
-        unmix_kernel(flat, flat_valid, matrix.astype(np.float32), needed, values, valid)
+        unmix_kernel(flat, flat_valid, matrix.astype(np.float32), matters, values, valid)
     else:
         step = max(min(GRID, min(shape) // 16), 2)
         grid = _unmixing_grid(crosstalk, shape, step)
@@ -70,7 +70,7 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
             flat_valid.reshape(image),
             grid,
             step,
-            needed,
+            matters,
             values.reshape(image),
             valid.reshape(image),
         )
@@ -80,6 +80,11 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
         names=crosstalk.lights,
         full_scale=channels.full_scale,
     )
+
+
+def needed(matrix: FloatArray, negligible: float = NEGLIGIBLE) -> BoolArray:
+    """Which channels (k, C) must be valid for a light that ``matrix @ channels`` gives to be."""
+    return np.asarray(np.abs(matrix) > negligible * np.abs(matrix).max(axis=1, keepdims=True))
 
 
 def _unmixing_grid(crosstalk: Crosstalk, shape: tuple[int, ...], step: int) -> FloatImage:

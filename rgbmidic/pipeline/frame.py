@@ -102,6 +102,8 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
     brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
     _tell_dark(name, images.names, brightness)
     match, best, renewals = _compared(plan, index, start, renewal, deformed, solution)
+    step = -(-max(images.shape) // _THUMBNAIL)
+    reflection = images.reflection_index(step)
     return {
         "solution": kept,
         "number": plan.series.numbers[index],
@@ -110,8 +112,8 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
         "match": match,
         "best_match": best,
         "renewals": renewals,
-        "weights_thumbnail": _thumbnail(weights),
-        "reflection_thumbnail": None if images.reflection_index is None else _thumbnail(images.reflection_index),
+        "weights_thumbnail": _in_bytes(weights[:, ::step, ::step]),
+        "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": plan.series.inputs(index),
     }
 
@@ -157,6 +159,5 @@ def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> No
             logger.warning("%s: %s gives %.0f %% of its light in the reference", name, light, 100 * gain)
 
 
-def _thumbnail(weights: FloatImage) -> npt.NDArray[np.uint8]:
-    step = -(-max(weights.shape[1:]) // _THUMBNAIL)
-    return np.round(weights[:, ::step, ::step] * 255).astype(np.uint8)
+def _in_bytes(shares: FloatImage) -> npt.NDArray[np.uint8]:
+    return np.round(shares * 255).astype(np.uint8)

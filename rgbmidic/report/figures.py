@@ -198,11 +198,12 @@ def _maps(
 ) -> Figure:
     """One map per nodal field, over the reference where there is one."""
     x, y = _view(result, result.nodes)
+    reference = None if result.reference is None else result.reference.mean(axis=0, dtype=np.float32)
 
     def draw(axes: list[Axes]) -> None:
         for axis, (label, (values, norm)) in zip(axes, maps.items(), strict=True):
-            if result.reference is not None:
-                show_image(axis, result.reference.mean(axis=0))
+            if reference is not None:
+                show_image(axis, reference)
             if norm is not None and np.isfinite(values).any():
                 _show_field(axis, result, values, norm, colour_map)
             else:

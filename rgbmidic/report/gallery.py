@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,11 +35,28 @@ REPORT = "report.html"
 """Name of the report that lies in a result's folder."""
 
 _FRAMES = 3
-_OF_FRAMES = (*MAPS, "shares", "masks", "reflections")
-_NAMES = re.compile(rf"(convergence|residual|brightness|({'|'.join(_OF_FRAMES)})_[0-9]{{6,}})\.png")
+_OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
+    "convergence": convergence_figure,
+    "residual": residual_figure,
+    "brightness": brightness_figure,
+}
+_OF_FRAME: Mapping[str, Callable[[Result, int], Figure | None]] = {
+    **{kind: partial(map_figure, kind=kind) for kind in MAPS},
+    "shares": lambda result, frame: share_figure(result, frame) if len(result.lights) > 1 else None,
+    "masks": mask_figure,
+    "reflections": reflection_figure,
+}
+_NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)})_[0-9]{{6,}})\.png")
+_FEW = 8
+"""Pictures for which another process does not pay: it starts in one to two seconds, a picture takes half of one."""
+
+_Picture = tuple[str, int | None]
+"""Kind, and frame if it is of one."""
 
 
-def write_figures(result: Result, folder: Path | str, frames: Sequence[int] | None = None) -> tuple[Path, ...]:
+def write_figures(
+    result: Result, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1
+) -> tuple[Path, ...]:
     """Write convergence, residual and brightness of a test, and of some frames maps, masks and reflections.
 
     Parameters
@@ -47,6 +67,9 @@ def write_figures(result: Result, folder: Path | str, frames: Sequence[int] | No
         Where the pictures go; made where it does not exist. Pictures of the same names are replaced.
     frames
         Indices of the frames that get pictures; None: three deformed ones, evenly spaced, the last one included.
+    processes
+        How many draw, this one among them. With more than one, a script that calls this must be importable
+        (``if __name__ == "__main__":``), as always with processes.
 
     Returns
     -------
@@ -66,11 +89,33 @@ def write_figures(result: Result, folder: Path | str, frames: Sequence[int] | No
     frames = spread(shown_frames(result), _FRAMES) if frames is None else frames
     for frame in frames:
         result.frame(frame)  # what is wrong with one is told before the first picture
+    pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]
+    pictures += [(kind, frame) for frame in frames for kind in _OF_FRAME]
+    parts = max(1, min(processes, len(pictures) // _FEW))
+    with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn")) as pool:
+        others = [pool.submit(_draw_of, result.path, folder, pictures[part::parts]) for part in range(1, parts)]
+        drawn = {*_draw(result, folder, pictures[::parts])}.union(*(other.result() for other in others))
+    return tuple(file for picture in pictures if (file := _file(folder, *picture)) in drawn)
+
+
+def _draw_of(path: Path, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
+    """What another process does."""
+    return _draw(Result.open(path, partial=True), folder, pictures)
+
+
+def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
+    """Write pictures, one after the other, so that only one is in memory; the files of those that there are."""
     files = []
-    for name, figure in _figures(result, frames):
-        files.append(folder / f"{name}.png")
-        save_figure(figure, files[-1])
-    return tuple(files)
+    for kind, frame in pictures:
+        figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](result, frame)
+        if figure is not None:
+            files.append(_file(folder, kind, frame))
+            save_figure(figure, files[-1])
+    return files
+
+
+def _file(folder: Path, kind: str, frame: int | None) -> Path:
+    return folder / (f"{kind}.png" if frame is None else f"{kind}_{frame:06d}.png")
 
 
 def remove_figures(folder: Path | str) -> None:
@@ -97,15 +142,3 @@ def remove_report(folder: Path | str) -> None:
     """
     with writing(Path(folder) / REPORT):
         (Path(folder) / REPORT).unlink(missing_ok=True)
-
-
-def _figures(result: Result, frames: Sequence[int]) -> Iterator[tuple[str, Figure]]:
-    """Name and content of each picture, one after the other: only one is in memory."""
-    yield "convergence", convergence_figure(result)
-    yield "residual", residual_figure(result)
-    yield "brightness", brightness_figure(result)
-    for frame in frames:
-        made: dict[str, Figure | None] = {kind: map_figure(result, frame, kind) for kind in MAPS}
-        made["shares"] = share_figure(result, frame) if len(result.lights) > 1 else None
-        made |= {"masks": mask_figure(result, frame), "reflections": reflection_figure(result, frame)}
-        yield from ((f"{kind}_{frame:06d}", figure) for kind, figure in made.items() if figure is not None)

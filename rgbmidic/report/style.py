@@ -63,6 +63,8 @@ _BELOW, _ABOVE = 0.52, 0.3
 """Inches: room for the numbers below a panel, and for its title."""
 _CLIPPED, _WILD = 0.5, 0.1
 """Colours span all values but this percentage at each end, and what lies within this share of that span beyond."""
+_SHOWN = 800
+"""Most pixels along a side of an image in a figure."""
 _SPAN = 4.0
 """Colours of a positive quantity end at its median over this and times this: else outliers turn the bulk black."""
 
@@ -145,10 +147,14 @@ def colour_scale(known: FloatArray, *, positive: bool = False) -> Normalize:
 
 
 def show_image(axis: Axes, image: AnyArray) -> None:
-    """An image in grey, with the extreme percent at either end clipped."""
-    finite = image[np.isfinite(image)]
+    """An image in grey, reduced to what a page shows, with the extreme percent at either end clipped."""
+    step = -(-max(image.shape) // _SHOWN)
+    rows, columns = (size // step for size in image.shape)
+    reduced = image[: rows * step, : columns * step].reshape(rows, step, columns, step).mean(axis=(1, 3))
+    finite = reduced[np.isfinite(reduced)]
     low, high = np.percentile(finite, [1, 99]) if finite.size else (0, 1)
-    axis.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), interpolation="antialiased")
+    extent = (-0.5, columns * step - 0.5, rows * step - 0.5, -0.5)
+    axis.imshow(reduced, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), extent=extent, interpolation="antialiased")
 
 
 def add_colour_bar(axis: Axes, shown: ScalarMappable, **options: Any) -> Colorbar:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic._kernels.mesh import colour_nodes
+from rgbmidic._kernels.triangular import node_energies
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -22,8 +23,6 @@ __all__ = ["Functional", "NodeColouring", "displacement_functionals", "functiona
 
 Functional = tuple[sp.csr_matrix | None, sp.csr_matrix | None]
 """A quantity linear in the displacements around each node: its matrices (N, N) for u and for v, None for 0."""
-_TOGETHER = 2**22
-"""Entries of the right-hand sides that are solved together: 32 MB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,10 +82,6 @@ def functional_std(
         spoil those of its colour.
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
-    together = max(1, _TOGETHER // (2 * count * colours))
-    if len(asked) > together:
-        parts = (asked[i : i + together] for i in range(0, len(asked), together))
-        return np.concatenate([functional_std(solve, right_side_covariance, colouring, part) for part in parts], axis=1)
     columns = np.zeros((count, 2, len(asked), colours))
     for i, (functional, nodes) in enumerate(asked):
         for axis, matrix in enumerate(functional):
@@ -96,11 +91,11 @@ def functional_std(
                 sums = np.bincount(place, weights=matrix.data * nodes[row], minlength=count * colours)
                 columns[:, axis, i] = sums.reshape(count, colours)
     solved = solve(columns.reshape(2 * count, -1))
-    energy = (solved * (right_side_covariance @ solved)).reshape(columns.shape).sum(axis=1)
-    variance = [
-        np.bincount(colouring.nearest.ravel(), weights=own.T.ravel(), minlength=count)[:count]
-        for own in energy.transpose(1, 0, 2)
-    ]
+    energy = np.empty((count, len(asked), colours))
+    covariance = right_side_covariance  # symmetric: its columns are its rows
+    node_energies(covariance.data, covariance.indices, covariance.indptr, solved, energy.reshape(count, -1))
+    nearest = colouring.nearest.T.ravel()
+    variance = [np.bincount(nearest, weights=energy[:, i].ravel(), minlength=count)[:count] for i in range(len(asked))]
     return np.sqrt(np.maximum(np.stack(variance, axis=1), 0))
 
 

@@ -27,12 +27,14 @@ from rgbmidic.illumination.colour_factors import (
     gather_moments,
     learn_texture,
     scaled,
+    widened,
 )
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic.base import check_mosaic, red_position
 from rgbmidic.illumination.demosaic.prediction import SIZE, WIDE, FilterTable, prediction_filters
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.illumination.unmix import needed
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["SMALLEST_FRAME", "Reconstruction", "ReflectionAwareDemosaicer"]
@@ -49,7 +51,7 @@ class Reconstruction:
     Attributes
     ----------
     channels : LinearChannels
-        (3, H, W).
+        (3, H, W), or the mixtures of them that were asked for.
     texture : TextureModel
         The one used: given, or learnt from the frame.
     factors : ColourFactors
@@ -83,8 +85,16 @@ class ReflectionAwareDemosaicer:
         """Demosaic; see `Demosaicer`."""
         return self.reconstruct(mosaic).channels
 
-    def reconstruct(self, mosaic: LinearMosaic) -> Reconstruction:
+    def reconstruct(self, mosaic: LinearMosaic, mixing: FloatArray | None = None) -> Reconstruction:
         """Demosaic and tell what was found out.
+
+        Parameters
+        ----------
+        mosaic
+            The linearised frame.
+        mixing : (n, 3), or None
+            Mixtures of the channels to give instead of them; not valid where a channel that matters in one
+            (`rgbmidic.illumination.unmix.needed`) is not.
 
         Raises
         ------
@@ -107,8 +117,12 @@ class ReflectionAwareDemosaicer:
         matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
         factors = colour_factors(moments, texture.band, matrix, coloured=texture.private)
         table = _filters(factors, texture, mosaic.cfa)
-        out, unknown = _predict(moments, factors, table, damaged=damaged)
-        valid = _validity(saturated, unknown, mosaic.cfa) if damaged else np.ones(out.shape, dtype=bool)
+        mixing = np.eye(3) if mixing is None else mixing
+        out, unknown = _predict(moments, factors, table, mixing, damaged=damaged)
+        valid = np.ones(out.shape, dtype=bool)
+        if damaged:
+            known = _validity(saturated, unknown, mosaic.cfa)
+            valid = np.stack([known[matters].all(axis=0) for matters in needed(mixing)])
         channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
         return Reconstruction(channels=channels, texture=texture, factors=factors, mean=moments.mean)
 
@@ -124,14 +138,15 @@ def _per_tile(grid: FloatArray) -> FloatArray:
     """Mean of a grid of blocks over the tiles; the last one may be narrower."""
     ratio = TILE // BLOCK
     missing = [(0, 0), *((0, -side % ratio) for side in grid.shape[1:])]
-    padded = np.pad(grid, missing, mode="edge")
-    return np.asarray(padded.reshape(len(grid), padded.shape[1] // ratio, ratio, -1, ratio).mean(axis=(2, 4)))
+    padded = np.pad(grid, missing, mode="edge") if np.any(missing) else grid
+    parts = [padded[:, row::ratio, column::ratio] for row, column in np.ndindex(ratio, ratio)]
+    return np.asarray(sum(parts) / ratio**2)
 
 
 def _predict(
-    moments: Moments, factors: ColourFactors, table: FilterTable, *, damaged: bool
+    moments: Moments, factors: ColourFactors, table: FilterTable, mixing: FloatArray, *, damaged: bool
 ) -> tuple[FloatImage, BoolArray]:
-    """Channels (3, H, W) and where samples stayed unknown (H, W)."""
+    """Mixtures (n, H, W) of the channels and where samples stayed unknown (H, W)."""
     spread, pad = factors.spread.astype(np.float32), table.size // 2
     padded = scaled(moments, np.float32(1) / spread, pad=pad, width=table.index.shape[1] * TILE)
     rows, columns = moments.contrast.shape
@@ -139,8 +154,10 @@ def _predict(
     if damaged:
         source = padded.copy()
         fill_unknown(source, _per_tile(factors.share), *moments.red, pad, padded, unknown)
-    out = np.empty((3, rows, columns), dtype=np.float32)
-    predict(padded, table.index, table.taps, table.size, spread, BLOCK, moments.mean, MEAN_BLOCK, out)
+    out = np.empty((len(mixing), rows, columns), dtype=np.float32)
+    scale, mean = widened(spread, BLOCK, columns), widened(moments.mean, MEAN_BLOCK, columns)
+    mixing = mixing.astype(np.float32)
+    predict(padded, table.index, table.taps, table.size, scale, BLOCK, mean, MEAN_BLOCK, mixing, out)
     return out, unknown[pad : pad + rows, pad : pad + columns]
 
 

@@ -240,7 +240,7 @@ def _separated(
         images = reconstructed_lights(model, crosstalk)
         if method not in ("auto", DEFAULT_METHOD):
             other = separate(first, crosstalk, method)
-            images = replace(other, reflection_index=images.reflection_index, texture=images.texture)
+            images = replace(other, reflection=images.reflection, texture=images.texture)
         disturbances = Disturbances.of_mosaic(first, model, crosstalk, method, noise, random)
         return _Separated(images=images, disturbances=disturbances)
     full = [frame for frame in linear if isinstance(frame, LinearChannels)]
@@ -253,8 +253,9 @@ def _separated(
 
 def _reflection_index(images: IlluminationImages, contrast: FloatImage) -> FloatImage | None:
     """What the separation tells of reflections, else the contrast that a light lacks to the best one's."""
-    if images.reflection_index is not None or len(contrast) == 1:
-        return images.reflection_index
+    index = images.reflection_index()
+    if index is not None or len(contrast) == 1:
+        return index
     return np.asarray(1 - contrast / np.maximum(contrast.max(axis=0), 1e-6), dtype=np.float32)
 
 

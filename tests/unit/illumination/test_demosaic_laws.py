@@ -123,7 +123,7 @@ def test_difficult_frames_give_numbers_or_unknown_without_a_warning(name, noisy)
         warnings.simplefilter("error")
         images = separate(mosaic, scenes.CROSSTALK)
     assert np.isfinite(images.values[images.valid]).all()
-    assert np.isfinite(images.reflection_index).all()
+    assert np.isfinite(images.reflection_index()).all()
     sound = images.valid & (lights.sum(axis=0) < 3500)
     if sound.any():
         # Malvar rings at edges too; nothing may run away

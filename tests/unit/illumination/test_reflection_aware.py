@@ -166,8 +166,8 @@ def test_a_reflection_does_not_leak_into_the_other_lights(mat, glaring):
 
 def test_reflection_index_tells_the_light_and_its_share(mat, glaring):
     clean = separate(scenes.mosaic_of(mat), scenes.CROSSTALK)
-    assert np.median(clean.reflection_index, axis=(1, 2)).max() < 0.05
-    index = separate(scenes.mosaic_of(glaring), scenes.CROSSTALK).reflection_index
+    assert np.median(clean.reflection_index(), axis=(1, 2)).max() < 0.05
+    index = separate(scenes.mosaic_of(glaring), scenes.CROSSTALK).reflection_index()
     reflected = (glaring - mat).mean(axis=(1, 2)) / glaring.mean(axis=(1, 2))
     np.testing.assert_allclose(np.median(index, axis=(1, 2)), reflected, atol=0.05)
     assert index.shape == (3, *SHAPE)

@@ -6,9 +6,10 @@ import pytest
 
 from rgbmidic._kernels import kriging, texture
 from rgbmidic.frames.data import BAYER_PATTERNS
+from rgbmidic.illumination.colour_factors import colour_moments, of_mosaic, widened
 from rgbmidic.illumination.demosaic.base import red_position
 
-SHAPES = [(16, 24), (19, 21), (33, 18)]
+SHAPES = [(16, 24), (19, 21), (33, 18), (9, 531)]
 
 
 def make_contrast(shape, unknown=0.02, seed=0):
@@ -27,16 +28,16 @@ def grid_for(shape, block, seed=1):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_sums_means_and_scaling(cfa, shape):
     values, red = make_contrast(shape), red_position(cfa)
-    sums, counts = np.empty((2, 3, *(-(-n // 4) for n in shape)))
-    texture.block_sums(values, *red, 4, sums, counts)
-    expected = naive_texture.block_sums(values, cfa, 4)
+    sums, counts = np.empty((2, 4, *(-(-n // 4) for n in shape)), dtype=np.float32)
+    texture.block_sums(values, 4, sums, counts)
+    expected = naive_texture.block_sums(values, 4)
     np.testing.assert_allclose(sums, expected[0], rtol=1e-5, atol=1e-3)
     np.testing.assert_array_equal(counts, expected[1])
     mean, out = grid_for(shape, 4), np.empty_like(values)
-    texture.subtract_mean(values, mean, *red, 4, out)
+    texture.subtract_mean(values, of_mosaic(mean, 4, shape[1], red), 4, out)
     np.testing.assert_allclose(out, naive_texture.subtract_mean(values, mean, cfa, 4), rtol=1e-5, atol=1e-4)
     scale, padded = grid_for(shape, 8), np.empty((shape[0] + 4, shape[1] + 4 + 7), dtype=np.float32)
-    texture.scaled_contrast(values, scale, *red, 8, 2, padded)
+    texture.scaled_contrast(values, of_mosaic(scale, 8, shape[1], red), 8, 2, padded)
     expected = naive_texture.scaled_contrast(values, scale, cfa, 8, 2, padded.shape[1])
     np.testing.assert_allclose(padded, expected, rtol=1e-5, atol=1e-3)
 
@@ -45,12 +46,12 @@ def test_sums_means_and_scaling(cfa, shape):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_moments_of_the_planes(cfa, shape):
     values = make_contrast(shape, unknown=0.005)
-    sums = np.empty((7, *(-(-n // 8) for n in shape)))
-    counts = np.empty(sums.shape[1:])
-    texture.cell_moments(values, *red_position(cfa), 8, sums, counts)
+    sums = np.empty((10, *(-(-n // 8) for n in shape)), dtype=np.float32)
+    counts = np.empty(sums.shape[1:], dtype=np.float32)
+    texture.cell_moments(values, 8, sums, counts)
     expected = naive_texture.cell_moments(values, cfa, 8)
     np.testing.assert_array_equal(counts, expected[1])
-    np.testing.assert_allclose(sums, expected[0], rtol=1e-4, atol=1e5)
+    np.testing.assert_allclose(colour_moments(sums, red_position(cfa)), expected[0], rtol=1e-4, atol=1e5)
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "GBRG"])
@@ -72,10 +73,12 @@ def test_prediction_with_different_filters_per_tile(size):
     taps = np.tile(pair, kriging.TILE // 2).astype(np.float32)
     pad = size // 2
     padded = rng.normal(size=(shape[0] + 2 * pad, tiles[1] * kriging.TILE + 2 * pad)).astype(np.float32)
-    scale, mean, out = grid_for(shape, 8), grid_for(shape, 4), np.empty((3, *shape), dtype=np.float32)
-    kriging.predict(padded, index, taps, size, scale, 8, mean, 4, out)
-    expected = naive_texture.predict(padded, index, taps, size, scale, 8, mean, 4, shape, kriging.TILE)
-    np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-4)
+    scale, mean, out = grid_for(shape, 8), grid_for(shape, 4), np.empty((2, *shape), dtype=np.float32)
+    mixing = rng.normal(size=(2, 3)).astype(np.float32)
+    wide = widened(scale, 8, shape[1]), 8, widened(mean, 4, shape[1]), 4
+    kriging.predict(padded, index, taps, size, *wide, mixing, out)
+    channels = naive_texture.predict(padded, index, taps, size, scale, 8, mean, 4, shape, kriging.TILE)
+    np.testing.assert_allclose(out, np.tensordot(mixing, channels, axes=1), rtol=1e-4, atol=3e-4)
 
 
 def test_unknown_samples_get_what_the_others_tell():
