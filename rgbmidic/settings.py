@@ -12,6 +12,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -40,6 +41,13 @@ __all__ = [
 ]
 
 _Section = TypeVar("_Section")
+
+
+@cache
+def _hints(settings: Any) -> dict[str, Any]:
+    return get_type_hints(settings)
+
+
 FrameKind = Literal["bayer", "rgb", "monochrome"]
 
 ELEMENT_SIZE = 25.0
@@ -650,7 +658,7 @@ def _plain(value: Any) -> Any:
 
 
 def _check_bounds(settings: Any, section: str) -> None:
-    hints = get_type_hints(type(settings))
+    hints = _hints(settings.__class__)
     for entry in fields(settings):
         value = getattr(settings, entry.name)
         where = entry.metadata.get("key", f"{section}.{entry.name}")

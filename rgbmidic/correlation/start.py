@@ -69,7 +69,8 @@ def confidence(reference: Reference, deformed: Deformed, displacement: FloatArra
     """
     residual = Residual.at(reference, deformed, reference.values, [displacement] * len(reference.images))
     around = correlation_around(residual)
-    seen = reference.mesh.to_nodes(reference.pixels.by_element(reference.pixel_weights.sum(axis=0))) > 0
+    weight = reference.sums(reference.pixel_weights, reference.pixel_weights[0])[..., 0].sum(axis=0)
+    seen = reference.mesh.to_nodes(weight) > 0
     with np.errstate(invalid="ignore"):
         agrees = around >= least
     return float(agrees.sum() / max(int(np.isfinite(around).sum()), 0.1 * seen.sum(), 1))

@@ -130,13 +130,6 @@ class PixelMap:
         from_image(self.lines, images, *self.bounds[:2], out.reshape(len(images), -1))
         return out
 
-    def by_element(self, values: FloatImage) -> FloatArray:
-        """Sum of values (P,) over the pixels of each element, shape (E,)."""
-        sums = np.zeros(len(self.origin))
-        filled = self.offsets[:-1] < self.offsets[1:]
-        sums[filled] = np.add.reduceat(values, self.offsets[:-1][filled], dtype=np.float64)
-        return sums
-
     def grid(self, side: int) -> tuple[int, int]:
         """Rows and columns of the blocks of `side` px that cover `bounds`."""
         _, _, height, width = self.bounds

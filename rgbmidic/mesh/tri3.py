@@ -150,7 +150,11 @@ class Tri3Mesh:
 
     def element_gradient(self, values: FloatArray) -> FloatArray:
         """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2)."""
-        return np.asarray(np.einsum("eac,ead->ecd", values[self.elements], self.shape_gradients()))
+        (first_x, first_y), (second_x, second_y) = _legs(self.nodes, self.elements)
+        first, second = (leg / (2 * self.areas) for leg in _legs(values, self.elements))
+        return np.stack([first * second_y - second * first_y, second * first_x - first * second_x], axis=-1).swapaxes(
+            0, 1
+        )
 
     def shape_gradients(self) -> FloatArray:
         """Gradient of the three shape functions of every element, shape (E, 3, 2), per px."""
@@ -200,9 +204,14 @@ class Tri3Mesh:
 
 
 def _signed_area(nodes: FloatArray, elements: npt.NDArray[np.int32]) -> FloatArray:
-    p = nodes[elements]
-    a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    return np.asarray((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2)
+    a, b = _legs(nodes, elements)
+    return np.asarray((a[0] * b[1] - a[1] * b[0]) / 2)
+
+
+def _legs(values: FloatArray, elements: npt.NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
+    """What nodal values (N, C) differ by from the first to the second and third corner of each element, (C, E)."""
+    own = values.T[:, elements]
+    return own[..., 1] - own[..., 0], own[..., 2] - own[..., 0]
 
 
 def _rectangle_mesh(

@@ -11,8 +11,8 @@ import pytest
 from rgbmidic._kernels import correlation as kernels
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import set_threads, threads
-from rgbmidic.correlation.assembly import Assembly, factorise
 from rgbmidic.correlation.reference import _partial_blocks
+from rgbmidic.correlation.residual import curved_deviation
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 SHAPE = (31, 38)
@@ -96,26 +96,6 @@ def test_samples_and_gradients_equal_the_naive_twin(seed):
     out = np.empty((3, x.size), dtype=np.float32)
     sample_with_gradient(case.coefficients, x, y, *out)
     close(out, naive.sample_with_gradient(case.coefficients, x, y))
-
-
-@pytest.mark.parametrize("columns", [3, 40])
-def test_right_sides_are_solved_side_by_side_as_by_dense_algebra_on_any_number_of_threads(columns):
-    random = np.random.default_rng(0)
-    mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 90, 70), (71, 91)), 13)
-    slopes = random.normal(size=(len(mesh.elements), 3, 4, 2))  # of a symmetric positive definite matrix
-    blocks = np.einsum("eanc,ebnd->eabcd", slopes, slopes)
-    blocks = (blocks + blocks.transpose(0, 2, 1, 3, 4))[..., [0, 0, 1], [0, 1, 1]]
-    assembly = Assembly.from_mesh(mesh)
-    matrix = assembly.matrix(blocks, 100 * assembly.diagonal)
-    right, found, before = random.normal(size=(assembly.size, columns)), [], threads()
-    try:
-        for number in (1, 3):
-            set_threads(number)
-            found.append(factorise(matrix)(right))
-    finally:
-        set_threads(before)
-    np.testing.assert_array_equal(*found)
-    np.testing.assert_allclose(found[0], np.linalg.solve(matrix.toarray(), right), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("outlined", [False, True])
@@ -232,11 +212,11 @@ def test_the_residual_less_a_curved_field_equals_the_naive_twin(outlined):
 
 
 def less_curved(case, carried, bend):
-    """What `subtract_curvature` makes of one light."""
+    """What `subtract_quadratic` makes of one light."""
     out = np.full((1, case.reference.size), 7, dtype=np.float32)
     images = case.reference[None], case.gradient[:1], case.gradient[1:]
-    field = case.mesh.nodes, case.mesh.elements, carried, bend
-    kernels.subtract_curvature(*images, *field, *case.on_map, case.pixels.barycentric, out)
+    deviation = curved_deviation(case.mesh, case.pixels.barycentric, carried, bend)
+    kernels.subtract_quadratic(*images, deviation, *case.on_map, out)
     return out
 
 
