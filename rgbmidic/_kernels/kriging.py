@@ -125,7 +125,8 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
                                 made,
                             )
                         else:
-                            made[:] = 0
+                            for j in range(number):
+                                made[j] = 0
                             for k in range(size * size):
                                 _add_tap(padded[i + k // size, left + k % size :], lines[k], made)
                         low, high, part = between(i, mean_block, mean.shape[1])

@@ -31,30 +31,26 @@ _CELLS = 128
 
 @over_ranges("sums", axis=1)
 @compiled()
-def block_sums(start, stop, values, block, sums, counts):
-    """Sum and number of finite samples of each plane in each block: `sums`, `counts` (4, h, w) float32."""
-    total, number = np.zeros((2, sums.shape[2] * block), np.float32), np.zeros((2, sums.shape[2] * block), np.float32)
+def block_sums(start, stop, values, block, sums):
+    """Sums of the finite samples of the four planes in each block, then their numbers: `sums` (8, h, w) float32."""
+    total = np.empty((4, sums.shape[2] * block), np.float32)
     for bi in range(start, stop):
+        for n in range(4):
+            for j in range(total.shape[1]):
+                total[n, j] = 0
         for i in range(bi * block, min((bi + 1) * block, len(values))):
-            line, value, known = values[i], total[i % 2], number[i % 2]
+            line, value, known = values[i], total[i % 2], total[2 + i % 2]
             for j in range(line.size):
                 finite = np.isfinite(line[j])
                 value[j] += line[j] if finite else np.float32(0.0)
                 known[j] += np.float32(1.0) if finite else np.float32(0.0)
-        for plane in range(4):
-            _gather(total[plane // 2, plane % 2 :], 2, block // 2, sums[plane, bi])
-            _gather(number[plane // 2, plane % 2 :], 2, block // 2, counts[plane, bi])
-        total[:] = number[:] = 0
-
-
-@helper()
-def _gather(line, step, block, out):
-    """Sums of `block` entries of a line after the other, `step` apart."""
-    for b in range(out.size):
-        total = np.float32(0.0)
-        for j in range(block):
-            total += line[np.uint64((b * block + j) * step)]
-        out[b] = total
+        for plane in range(8):
+            line, out = total[plane // 2], sums[plane, bi]
+            for b in range(out.size):
+                value = np.float32(0)
+                for j in range(np.uint64(b * block + plane % 2), np.uint64((b + 1) * block), np.uint64(2)):
+                    value += line[j]
+                out[b] = value
 
 
 @helper()
@@ -131,14 +127,14 @@ def _down(above, here, below, first, last, planes, number):
         planes[1, c] = first * above[j] + ten * here[j] + last * below[j]
 
 
-@over_ranges("counts")
+@over_ranges("sums", axis=1)
 @compiled(fastmath={"contract"})
-def cell_moments(start, stop, contrast, block, sums, counts):
+def cell_moments(start, stop, contrast, block, sums):
     """Second moments of the four planes' low-passed contrast, summed over the cells of each block.
 
     At the middle of each 2x2 cell the binomial [1 5 10 10 5 1] along both axes takes from each plane its own share,
-    with the same weight and the same centroid. `sums` (10, h, w) float32 receives the products of the planes in the
-    order of `PLANE_PAIRS`, `counts` (h, w) the cells; a cell with a sample that is not finite in reach is left out.
+    with the same weight and the same centroid. `sums` (11, h, w) float32 receives the products of the planes in the
+    order of `PLANE_PAIRS`, then the number of cells; a cell with a sample that is not finite in reach is left out.
     """
     rows, columns = contrast.shape
     half = block // 2
@@ -146,7 +142,9 @@ def cell_moments(start, stop, contrast, block, sums, counts):
     planes, total = np.empty((4, _CELLS + 2), np.float32), np.empty((11, _CELLS), np.float32)
     for bi in range(start, stop):
         for left in range(0, half * sums.shape[2], _CELLS):
-            total[:] = 0
+            for moment in range(11):
+                for c in range(_CELLS):
+                    total[moment, c] = 0
             first = max(left, 1)
             number = min(left + _CELLS, columns // 2 - 1) - first
             for i in range(max(bi * block, 2), min((bi + 1) * block, rows - REACH), 2):
@@ -173,15 +171,12 @@ def cell_moments(start, stop, contrast, block, sums, counts):
                     total[8, c] += q2 * q3
                     total[9, c] += q3 * q3
                     total[10, c] += one if known else np.float32(0)
-            for b in range(left // half, min((left + _CELLS) // half, sums.shape[2])):
-                for moment in range(11):
+            for moment in range(11):
+                for b in range(left // half, min((left + _CELLS) // half, sums.shape[2])):
                     value = np.float32(0)
-                    for c in range(b * half - first, (b + 1) * half - first):
-                        value += total[moment, c] if 0 <= c < _CELLS else np.float32(0)
-                    if moment < 10:
-                        sums[moment, bi, b] = value
-                    else:
-                        counts[bi, b] = value
+                    for c in range(np.uint64(max(b * half - first, 0)), np.uint64((b + 1) * half - first)):
+                        value += total[moment, c]
+                    sums[moment, bi, b] = value
 
 
 @compiled()

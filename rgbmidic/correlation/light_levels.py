@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -42,42 +41,38 @@ def brightness_change(
         Gain and offset (grey levels); NaN where no element is seen in both states.
     """
     mesh, pixels = reference.mesh, reference.pixels
-    count = len(mesh.elements)
-    motion = displacement[mesh.elements].mean(axis=1)
-    chosen = np.zeros(count, dtype=bool)
-    chosen[:: max(1, count // _MANY)] = True
-    slots = np.flatnonzero(np.repeat(chosen, np.diff(pixels.offsets)))
-    slots = slots[:: max(1, slots.size // (_ENOUGH * int(chosen.sum())))]
-    owner = np.searchsorted(pixels.offsets, slots, side="right") - 1
-    step = np.round(np.nan_to_num(motion)).astype(np.int64)[owner]
-    place = np.stack([pixels.local_x[slots], pixels.local_y[slots]]).astype(np.int64)
-    columns, rows = place + pixels.origin[owner].T
-    there = rows + step[:, 1], columns + step[:, 0]
+    chosen = np.arange(0, len(mesh.elements), max(1, len(mesh.elements) // _MANY))
+    motion, size = displacement[mesh.elements[chosen]].mean(axis=1), np.diff(pixels.offsets)[chosen]
+    seen = np.isfinite(motion).all(axis=1) & (size >= _LEAST)
+    chosen, step, size = chosen[seen], np.round(motion[seen]).astype(np.int64), size[seen]
+    slots = pixels.offsets[chosen, None] + np.arange(_ENOUGH) * size[:, None] // _ENOUGH
+    columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[chosen, :1]
+    rows = pixels.local_y[slots].astype(np.int64) + pixels.origin[chosen, 1:]
     height, width = first.shape[1:]
-    inside = (there[0] >= 0) & (there[0] < height) & (there[1] >= 0) & (there[1] < width)
-    inside &= np.isfinite(motion).all(axis=1)[owner]
-    moved = np.clip(there[0], 0, height - 1), np.clip(there[1], 0, width - 1)
-    return np.array(
-        [_gain_and_offset(f[rows, columns], g[moved], inside, owner, count) for f, g in zip(first, second, strict=True)]
+    across, down = columns + step[:, :1], rows + step[:, 1:]
+    inside = (down >= 0) & (down < height) & (across >= 0) & (across < width)
+    there = np.clip(down, 0, height - 1) * width + np.clip(across, 0, width - 1)
+    f, g = (
+        np.take(images.reshape(len(images), -1), at, axis=1)
+        for images, at in ((first, rows * width + columns), (second, there))
     )
+    return np.array([_gain_and_offset(*pair, inside) for pair in zip(f, g, strict=True)])
 
 
-def _gain_and_offset(
-    f: FloatImage, g: FloatImage, inside: BoolArray, owner: npt.NDArray[np.int64], elements: int
-) -> tuple[float, float]:
+def _gain_and_offset(f: FloatImage, g: FloatImage, inside: BoolArray) -> tuple[float, float]:
+    """From the samples (E, n) of elements."""
     known = inside & np.isfinite(f) & np.isfinite(g)
-    owner = owner[known]
-    number = np.bincount(owner, minlength=elements)
-    many = number >= _LEAST
+    known &= known.sum(axis=1, keepdims=True) >= _LEAST
+    seen = np.asarray(known.any(axis=1))
+    known, number = known[seen], known[seen].sum(axis=1)
 
     def moments(values: FloatImage) -> tuple[FloatArray, FloatArray]:
-        exact = values[known].astype(np.float64)
-        mean = np.bincount(owner, weights=exact, minlength=elements)[many] / number[many]
-        square = np.bincount(owner, weights=exact**2, minlength=elements)[many] / number[many]
-        return mean, np.maximum(square - mean**2, 0)
+        exact = np.where(known, values[seen], 0).astype(np.float64)
+        mean = exact.sum(axis=1) / number
+        return mean, np.maximum((exact**2).sum(axis=1) / number - mean**2, 0)
 
     (mean_f, contrast_f), (mean_g, contrast_g) = moments(f), moments(g)
-    textured = contrast_f > 0.05 * np.median(contrast_f) if many.any() else np.zeros(0, dtype=bool)
+    textured = contrast_f > 0.05 * np.median(contrast_f) if seen.any() else seen[:0]
     if not textured.any():
         return float("nan"), float("nan")
     gain = float(np.median(np.sqrt(contrast_g[textured] / contrast_f[textured])))

@@ -18,7 +18,7 @@ from rgbmidic._kernels.correlation import (
 )
 from rgbmidic._kernels.interpolation import pixel_gradient
 from rgbmidic.correlation.assembly import Assembly
-from rgbmidic.correlation.images import spline_coefficients, spline_values, usable_pixels
+from rgbmidic.correlation.images import spline_coefficients, spline_values, usable_pixels, usable_reach
 from rgbmidic.correlation.recovery import linear_fit_offset
 from rgbmidic.correlation.uncertainty.blocks import block_side, unfitted_share
 from rgbmidic.correlation.uncertainty.propagation import NodeColouring
@@ -222,11 +222,14 @@ class Reference:
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
     """The weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
     given = np.ones_like(images) if weights is None else weights
-    usable = np.zeros_like(images)
+    usable, reach = np.zeros_like(images), usable_reach(prefilter)
     for image, weight, out in zip(images, given, usable, strict=True):
         known = np.isfinite(image)
         known &= weight > 0
-        cv2.copyTo(weight, usable_pixels(known, prefilter).view(np.uint8), out)
+        if known.all():
+            out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
+        else:
+            cv2.copyTo(weight, usable_pixels(known, prefilter).view(np.uint8), out)
     return usable
 
 

@@ -126,11 +126,10 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     contrast = np.empty_like(values)
     kernels.subtract_mean(values, of_mosaic(mean, MEAN_BLOCK, values.shape[1], red), MEAN_BLOCK, contrast)
     height, width = (-(-side // BLOCK) for side in values.shape)
-    sums = np.empty((len(kernels.PLANE_PAIRS), height, width), dtype=np.float32)
-    counts = np.empty((1, height, width), dtype=np.float32)
-    kernels.cell_moments(contrast, BLOCK, sums, counts[0])
+    sums = np.empty((len(kernels.PLANE_PAIRS) + 1, height, width), dtype=np.float32)
+    kernels.cell_moments(contrast, BLOCK, sums)
     # the binomial weights of a plane sum to 256 in the kernel
-    moments = _smooth(colour_moments(sums, red), counts, MOMENT_WIDTH / BLOCK).astype(np.float64) / 256**2
+    moments = _smooth(colour_moments(sums[:-1], red), sums[-1:], MOMENT_WIDTH / BLOCK).astype(np.float64) / 256**2
     level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in mean]).astype(np.float64)
     variance = np.zeros_like(level) if noise is None else np.asarray(noise.variance(level), dtype=np.float64)
     # where nothing is seen but noise, a third of it stands for the contrast that there may be
@@ -174,11 +173,10 @@ def of_mosaic(grid: npt.NDArray[np.floating], block: int, columns: int, red: tup
 
 def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
     """Local mean (3, h, w) of each channel of a mosaic, NaN where not known, on a grid of `MEAN_BLOCK` px."""
-    shape = (4, *(-(-side // MEAN_BLOCK) for side in values.shape))
-    sums, counts = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    kernels.block_sums(values, MEAN_BLOCK, sums, counts)
+    sums = np.empty((8, *(-(-side // MEAN_BLOCK) for side in values.shape)), dtype=np.float32)
+    kernels.block_sums(values, MEAN_BLOCK, sums)
     r, g, h, b = _planes(red)
-    total, number = (np.stack([of[r], of[g] + of[h], of[b]]) for of in (sums, counts))
+    total, number = (np.stack([of[r], of[g] + of[h], of[b]]) for of in (sums[:4], sums[4:]))
     return _smooth(total, number, MEAN_WIDTH / MEAN_BLOCK)
 
 
