@@ -23,7 +23,7 @@ __all__ = [
     "element_sums",
     "element_vector",
     "interpolate_nodal",
-    "subtract_curvature",
+    "subtract_quadratic",
 ]
 
 _SIXTH = np.float32(1.0 / 6.0)
@@ -423,45 +423,24 @@ def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, 
                 out[c, i] = constant + slope_x * local_x[i] + slope_y * local_y[i]
 
 
-@over_ranges("elements")
+@over_ranges("polynomials")
 @compiled(fastmath=_FAST)
-def subtract_curvature(
-    start, stop, difference, gradient_x, gradient_y, nodes, elements, carried, curvature, local_x, local_y, offsets,
-    barycentric, out,
+def subtract_quadratic(
+    start, stop, difference, gradient_x, gradient_y, polynomials, local_x, local_y, offsets, out,
 ):  # fmt: skip
-    """Residual less what the curved field has over its own linear fit: ``out`` (k, P) receives ``difference - grad f .
-    d``, all (k, P) float32.
+    """Residual less a displacement d quadratic in every element: ``out`` (k, P) receives ``difference - grad f . d``,
+    all (k, P) float32.
 
-    `curvature` (N, 2, 3) float64 holds the second derivatives (xx, xy, yy) of both components at the nodes; along an
-    edge that is the mean of its ends. Over its linear interpolant the field has the continuous
-    ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H_ab (x_a - x_b)``; its linear fit has `carried` (N, 2) at the nodes.
+    `polynomials` (E, 2, 6) float32 holds the coefficients of 1, x, y, x^2, x y, y^2 of the local position, in px.
     """
-    for e in range(start, stop):
-        sag, nodal = np.empty((2, 3), dtype=np.float32), np.empty((2, 3), dtype=np.float32)
-        for c in range(2):
-            for a in range(3):
-                sag[c, a] = _half_sag(nodes, elements[e, a], elements[e, (a + 1) % 3], curvature, c)
-                nodal[c, a] = carried[elements[e, a], c]
-        b = barycentric[e]
-        b00, b01, b02 = np.float32(b[0, 0]), np.float32(b[0, 1]), np.float32(b[0, 2])
-        b10, b11, b12 = np.float32(b[1, 0]), np.float32(b[1, 1]), np.float32(b[1, 2])
-        for light in range(len(difference)):
-            given, gx, gy, less = difference[light], gradient_x[light], gradient_y[light], out[light]
+    for light in range(len(difference)):
+        given, gx, gy, less = difference[light], gradient_x[light], gradient_y[light], out[light]
+        for e in range(start, stop):
+            u, v = polynomials[e, 0], polynomials[e, 1]
+            u0, u1, u2, u3, u4, u5 = u[0], u[1], u[2], u[3], u[4], u[5]
+            v0, v1, v2, v3, v4, v5 = v[0], v[1], v[2], v[3], v[4], v[5]
             for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
-                l0 = b00 + b01 * local_x[i] + b02 * local_y[i]
-                l1 = b10 + b11 * local_x[i] + b12 * local_y[i]
-                l2 = _ONE - l0 - l1
-                dx = sag[0, 0] * l0 * l1 + sag[0, 1] * l1 * l2 + sag[0, 2] * l2 * l0
-                dy = sag[1, 0] * l0 * l1 + sag[1, 1] * l1 * l2 + sag[1, 2] * l2 * l0
-                dx -= nodal[0, 0] * l0 + nodal[0, 1] * l1 + nodal[0, 2] * l2
-                dy -= nodal[1, 0] * l0 + nodal[1, 1] * l1 + nodal[1, 2] * l2
+                x, y = local_x[i], local_y[i]
+                dx = u0 + x * (u1 + u3 * x + u4 * y) + y * (u2 + u5 * y)
+                dy = v0 + x * (v1 + v3 * x + v4 * y) + y * (v2 + v5 * y)
                 less[i] = given[i] - gx[i] * dx - gy[i] * dy
-
-
-@helper()
-def _half_sag(nodes, a, b, curvature, c):
-    """Half the second difference of component c along the edge from node a to node b."""
-    dx = nodes[a, 0] - nodes[b, 0]
-    dy = nodes[a, 1] - nodes[b, 1]
-    h = curvature[a, c] + curvature[b, c]
-    return -0.25 * (h[0] * dx * dx + 2.0 * h[1] * dx * dy + h[2] * dy * dy)

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rgbmidic._kernels.correlation import element_squares, subtract_curvature
+from rgbmidic._kernels.correlation import element_squares, subtract_quadratic
 from rgbmidic.correlation.reference import Deformed, Reference
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["Residual"]
+__all__ = ["Residual", "curved_deviation"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,6 +85,24 @@ class Residual:
         """
         known, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
         images = self.difference, known.gradient_x, known.gradient_y
-        field = known.material.nodes, known.material.elements, carried, curvature
-        subtract_curvature(*images, *field, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, out)
+        deviation = curved_deviation(known.material, pixels.barycentric, carried, curvature)
+        subtract_quadratic(*images, deviation, pixels.local_x, pixels.local_y, pixels.offsets, out)
         return replace(self, difference=out)
+
+
+def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArray, curvature: FloatArray) -> FloatImage:
+    """What a curved field has over its own linear fit: (E, 2, 6), coefficients of 1, x, y, x^2, x y, y^2 of the local
+    position in every element, whose shape functions are `barycentric` (E, 3, 3).
+
+    Along an edge the second derivative is the mean of its ends. Over its linear interpolant the field has the
+    continuous ``-1/2 sum_{a<b} phi_a phi_b (x_a - x_b)^T H_ab (x_a - x_b)``; its linear fit has `carried` (N, 2) more
+    than the field at the nodes.
+    """
+    first, second = mesh.elements, np.roll(mesh.elements, -1, axis=1)
+    (x, y), bend = np.moveaxis(mesh.nodes[first] - mesh.nodes[second], -1, 0), curvature[first] + curvature[second]
+    sag = -0.25 * (bend @ np.stack([x * x, 2 * x * y, y * y], axis=-1)[..., None])[..., 0]
+    (a0, a1, a2), (b0, b1, b2) = (np.moveaxis(phi, -1, 0) for phi in (barycentric, np.roll(barycentric, -1, axis=1)))
+    products = np.stack([a0 * b0, a0 * b1 + a1 * b0, a0 * b2 + a2 * b0, a1 * b1, a1 * b2 + a2 * b1, a2 * b2], axis=-1)
+    deviation = sag.transpose(0, 2, 1) @ products
+    deviation[..., :3] -= carried[first].transpose(0, 2, 1) @ barycentric
+    return np.asarray(deviation, dtype=np.float32)

@@ -23,8 +23,6 @@ __all__ = ["Functional", "NodeColouring", "displacement_functionals", "functiona
 
 Functional = tuple[sp.csr_matrix | None, sp.csr_matrix | None]
 """A quantity linear in the displacements around each node: its matrices (N, N) for u and for v, None for 0."""
-_TOGETHER = 2**22
-"""Entries of the right-hand sides that are solved together: 32 MB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +62,7 @@ class NodeColouring:
 
 def functional_std(
     solve: Callable[[FloatArray], FloatArray],
-    covariance: sp.csc_matrix,
+    right_side_covariance: sp.csc_matrix,
     colouring: NodeColouring,
     asked: Sequence[tuple[Functional, BoolArray]],
 ) -> FloatArray:
@@ -74,7 +72,7 @@ def functional_std(
     ----------
     solve
         Solves ``M x = b`` for b of shape (2 N, R).
-    covariance
+    right_side_covariance
         S, shape (2 N, 2 N).
     colouring
         Of the mesh.
@@ -84,10 +82,6 @@ def functional_std(
         spoil those of its colour.
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
-    together = max(1, _TOGETHER // (2 * count * colours))
-    if len(asked) > together:
-        parts = (asked[i : i + together] for i in range(0, len(asked), together))
-        return np.concatenate([functional_std(solve, covariance, colouring, part) for part in parts], axis=1)
     columns = np.zeros((count, 2, len(asked), colours))
     for i, (functional, nodes) in enumerate(asked):
         for axis, matrix in enumerate(functional):
@@ -98,11 +92,10 @@ def functional_std(
                 columns[:, axis, i] = sums.reshape(count, colours)
     solved = solve(columns.reshape(2 * count, -1))
     energy = np.empty((count, len(asked), colours))
-    node_energies(  # of a symmetric matrix, whose columns are its rows
-        covariance.data, covariance.indices, covariance.indptr, solved, energy.reshape(count, -1)
-    )
+    covariance = right_side_covariance  # symmetric: its columns are its rows
+    node_energies(covariance.data, covariance.indices, covariance.indptr, solved, energy.reshape(count, -1))
     nearest = colouring.nearest.T.ravel()
-    variance = [np.bincount(nearest, weights=own.ravel(), minlength=count)[:count] for own in energy.transpose(1, 0, 2)]
+    variance = [np.bincount(nearest, weights=energy[:, i].ravel(), minlength=count)[:count] for i in range(len(asked))]
     return np.sqrt(np.maximum(np.stack(variance, axis=1), 0))
 
 

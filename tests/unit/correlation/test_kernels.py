@@ -12,6 +12,7 @@ from rgbmidic._kernels import correlation as kernels
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation.reference import _partial_blocks
+from rgbmidic.correlation.residual import curved_deviation
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 SHAPE = (31, 38)
@@ -211,11 +212,11 @@ def test_the_residual_less_a_curved_field_equals_the_naive_twin(outlined):
 
 
 def less_curved(case, carried, bend):
-    """What `subtract_curvature` makes of one light."""
+    """What `subtract_quadratic` makes of one light."""
     out = np.full((1, case.reference.size), 7, dtype=np.float32)
     images = case.reference[None], case.gradient[:1], case.gradient[1:]
-    field = case.mesh.nodes, case.mesh.elements, carried, bend
-    kernels.subtract_curvature(*images, *field, *case.on_map, case.pixels.barycentric, out)
+    deviation = curved_deviation(case.mesh, case.pixels.barycentric, carried, bend)
+    kernels.subtract_quadratic(*images, deviation, *case.on_map, out)
     return out
 
 
