@@ -14,6 +14,9 @@ from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["Residual", "curved_deviation"]
 
+_ROUNDING = 2e-7
+"""Share of the sum of squares below which their sum beyond the mean is that of rounding, in single precision."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Residual:
@@ -71,7 +74,11 @@ class Residual:
         """Sums f g, f f and g g over each element, of what f and g are beyond their means in it, (k, E)."""
         total, f, g, ff, fg, gg = np.moveaxis(self.moments, -1, 0)
         total = np.maximum(total, 1e-30)
-        return fg - f * g / total, ff - f * f / total, gg - g * g / total
+        beyond_f, beyond_g = (
+            np.where(beyond > _ROUNDING * square, beyond, 0.0)
+            for beyond, square in ((ff - f * f / total, ff), (gg - g * g / total, gg))
+        )
+        return fg - f * g / total, beyond_f, beyond_g
 
     def without(self, carried: FloatArray, curvature: FloatArray) -> Residual:
         """The same, less what a curved field has over its own linear fit.

@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -91,7 +92,11 @@ class Origin:
 
 
 def _package_versions() -> dict[str, str]:
-    return {one.name: one.version for one in importlib.metadata.distributions() if one.name in _PACKAGES}
+    versions = {}
+    for name in _PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions
 
 
 def digest(content: Mapping[str, AnyArray] | list[str]) -> str:
