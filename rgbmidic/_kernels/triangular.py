@@ -32,22 +32,21 @@ def factorise(data, given_starts, given_nodes, given, before_starts, before, sta
         work[k] = 0.0
         for q in range(before_starts[k], before_starts[k + 1]):
             i = before[q]
-            a, b, c, d = work[i]
+            a, b, c, d = work[i, 0], work[i, 1], work[i, 2], work[i, 3]
             work[i] = 0.0
             for p in range(starts[i], filled[i]):
-                e, f, g, h = lower[p]
-                to = work[rows[p]]
-                to[0] -= a * e + b * f
-                to[1] -= a * g + b * h
-                to[2] -= c * e + d * f
-                to[3] -= c * g + d * h
-            s, t, u = inverse[i]
-            own = lower[filled[i]]
-            own[0], own[1], own[2], own[3] = a * s + b * t, a * t + b * u, c * s + d * t, c * t + d * u
+                e, f, g, h, r = lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3], rows[p]
+                work[r, 0] -= a * e + b * f
+                work[r, 1] -= a * g + b * h
+                work[r, 2] -= c * e + d * f
+                work[r, 3] -= c * g + d * h
+            s, t, u = inverse[i, 0], inverse[i, 1], inverse[i, 2]
+            e, f, g, h, p = a * s + b * t, a * t + b * u, c * s + d * t, c * t + d * u, filled[i]
+            lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3] = e, f, g, h
             filled[i] += 1
-            xx -= own[0] * a + own[1] * b
-            xy -= own[0] * c + own[1] * d
-            yy -= own[2] * c + own[3] * d
+            xx -= e * a + f * b
+            xy -= e * c + f * d
+            yy -= g * c + h * d
         scale = 1.0 / (xx * yy - xy * xy)
         inverse[k, 0], inverse[k, 1], inverse[k, 2] = yy * scale, -xy * scale, xx * scale
 
@@ -61,19 +60,19 @@ def solve_factors(start, stop, starts, rows, lower, inverse, x):
         begin, end = np.uint64(first), np.uint64(min(first + _BLOCK, stop))
         for j in range(np.uint64(n)):
             for p in range(starts[j], starts[j + np.uint64(1)]):
-                i, (a, b, c, d) = np.uint64(rows[p]), lower[p]
+                i, a, b, c, d = np.uint64(rows[p]), lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3]
                 for r in range(begin, end):
                     x[i, 0, r] -= a * x[j, 0, r] + b * x[j, 1, r]
                     x[i, 1, r] -= c * x[j, 0, r] + d * x[j, 1, r]
         for back in range(n):
             own = np.uint64(n - 1 - back)
-            xx, xy, yy = inverse[own]
+            xx, xy, yy = inverse[own, 0], inverse[own, 1], inverse[own, 2]
             for r in range(begin, end):
                 u, v = x[own, 0, r], x[own, 1, r]
                 x[own, 0, r] = xx * u + xy * v
                 x[own, 1, r] = xy * u + yy * v
             for p in range(starts[own], starts[own + np.uint64(1)]):
-                i, (a, b, c, d) = np.uint64(rows[p]), lower[p]
+                i, a, b, c, d = np.uint64(rows[p]), lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3]
                 for r in range(begin, end):
                     x[own, 0, r] -= a * x[i, 0, r] + c * x[i, 1, r]
                     x[own, 1, r] -= b * x[i, 0, r] + d * x[i, 1, r]
