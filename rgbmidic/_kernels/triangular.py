@@ -1,4 +1,4 @@
-"""Solves with a sparse factorisation, and quadratic forms, of many vectors at once, side by side in memory."""
+"""Sparse factorisation; solves with it, and quadratic forms, of many vectors at once, side by side in memory."""
 
 import numpy as np
 
@@ -6,39 +6,76 @@ from rgbmidic._kernels.compilation import compiled
 from rgbmidic._kernels.interpolation import _FAST
 from rgbmidic._kernels.threads import over_ranges
 
-__all__ = ["node_energies", "solve_factors"]
+__all__ = ["factorise", "node_energies", "solve_factors"]
 
 _BLOCK = 32
 """Vectors at a time: those of some 3,000 unknowns stay in a core's own cache."""
 
 
-@over_ranges("x", axis=1, grain=_BLOCK)
 @compiled(fastmath=_FAST)
-def solve_factors(
-    start, stop, lower_values, lower_rows, lower_starts, upper_values, upper_rows, upper_starts, x
-):  # fmt: skip
-    """Solve ``L U x = b`` in place, for x (n, R) float64.
+def factorise(data, given_starts, given_nodes, given, before_starts, before, starts, rows, lower, inverse):
+    """Factorise a symmetric positive definite matrix as ``L D L^T``, with a block of 2 x 2 for each two nodes (Davis,
+    Direct Methods for Sparse Linear Systems, 2006, section 4.8).
 
-    The factors are given by columns with sorted rows: L with a diagonal of ones, U with its diagonal last.
+    Row k of the matrix has the blocks ``data[given[p]]``, (n, 2, 2) places, at the nodes ``given_nodes[p]`` up to k, p
+    from ``given_starts[k]`` to ``given_starts[k + 1]``; row k of L, whose own block is 1, has blocks at the nodes
+    `before` it, and column k at `rows` after it, in their order. `lower` (R, 4) receives the latter, `inverse` (N, 3)
+    entries xx, xy and yy of the inverse of each block of D.
     """
-    n = x.shape[0]
+    work, filled = np.zeros((len(inverse), 4)), starts[:-1].copy()
+    for k in range(len(inverse)):
+        for p in range(given_starts[k], given_starts[k + 1]):
+            i = given_nodes[p]
+            work[i, 0], work[i, 1] = data[given[p, 0, 0]], data[given[p, 0, 1]]
+            work[i, 2], work[i, 3] = data[given[p, 1, 0]], data[given[p, 1, 1]]
+        xx, xy, yy = work[k, 0], work[k, 1], work[k, 3]
+        work[k] = 0.0
+        for q in range(before_starts[k], before_starts[k + 1]):
+            i = before[q]
+            a, b, c, d = work[i, 0], work[i, 1], work[i, 2], work[i, 3]
+            work[i] = 0.0
+            for p in range(starts[i], filled[i]):
+                e, f, g, h, r = lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3], rows[p]
+                work[r, 0] -= a * e + b * f
+                work[r, 1] -= a * g + b * h
+                work[r, 2] -= c * e + d * f
+                work[r, 3] -= c * g + d * h
+            s, t, u = inverse[i, 0], inverse[i, 1], inverse[i, 2]
+            e, f, g, h, p = a * s + b * t, a * t + b * u, c * s + d * t, c * t + d * u, filled[i]
+            lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3] = e, f, g, h
+            filled[i] += 1
+            xx -= e * a + f * b
+            xy -= e * c + f * d
+            yy -= g * c + h * d
+        scale = 1.0 / (xx * yy - xy * xy)
+        inverse[k, 0], inverse[k, 1], inverse[k, 2] = yy * scale, -xy * scale, xx * scale
+
+
+@over_ranges("x", axis=2, grain=_BLOCK)
+@compiled(fastmath=_FAST)
+def solve_factors(start, stop, starts, rows, lower, inverse, x):
+    """Solve ``L D L^T x = b`` in place, for x (N, 2, R) float64 and such factors."""
+    n = len(inverse)
     for first in range(start, stop, _BLOCK):
-        last = np.uint64(min(first + _BLOCK, stop))
+        begin, end = np.uint64(first), np.uint64(min(first + _BLOCK, stop))
         for j in range(np.uint64(n)):
-            for p in range(np.int64(lower_starts[j]) + 1, np.int64(lower_starts[j + np.uint64(1)])):
-                i, value = np.uint64(lower_rows[p]), lower_values[p]
-                for c in range(np.uint64(first), last):
-                    x[i, c] -= value * x[j, c]
+            for p in range(starts[j], starts[j + np.uint64(1)]):
+                i, a, b, c, d = np.uint64(rows[p]), lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3]
+                for r in range(begin, end):
+                    x[i, 0, r] -= a * x[j, 0, r] + b * x[j, 1, r]
+                    x[i, 1, r] -= c * x[j, 0, r] + d * x[j, 1, r]
         for back in range(n):
             own = np.uint64(n - 1 - back)
-            end = np.int64(upper_starts[own + np.uint64(1)]) - 1
-            inverse = 1.0 / upper_values[end]
-            for c in range(np.uint64(first), last):
-                x[own, c] *= inverse
-            for p in range(np.int64(upper_starts[own]), end):
-                i, value = np.uint64(upper_rows[p]), upper_values[p]
-                for c in range(np.uint64(first), last):
-                    x[i, c] -= value * x[own, c]
+            xx, xy, yy = inverse[own, 0], inverse[own, 1], inverse[own, 2]
+            for r in range(begin, end):
+                u, v = x[own, 0, r], x[own, 1, r]
+                x[own, 0, r] = xx * u + xy * v
+                x[own, 1, r] = xy * u + yy * v
+            for p in range(starts[own], starts[own + np.uint64(1)]):
+                i, a, b, c, d = np.uint64(rows[p]), lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3]
+                for r in range(begin, end):
+                    x[own, 0, r] -= a * x[i, 0, r] + c * x[i, 1, r]
+                    x[own, 1, r] -= b * x[i, 0, r] + d * x[i, 1, r]
 
 
 @over_ranges("x", axis=1, grain=_BLOCK)

@@ -1,4 +1,4 @@
-"""From sums per element to the sparse normal equations of the whole mesh, and their factorisation."""
+"""From sums per element to the sparse normal equations of the whole mesh, ready to be factorised."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
-from rgbmidic._kernels.triangular import solve_factors
+from rgbmidic.correlation.elimination import Elimination
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.sparse import with_data
 from rgbmidic.typing import FloatArray
 
-__all__ = ["Assembly", "factorise"]
+__all__ = ["Assembly"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +34,8 @@ class Assembly:
         The unit matrix's data in it.
     nodal_area : ndarray, shape (N,), float64
         A third of the area of the elements around each node, square px.
+    elimination : Elimination
+        Of the assembled matrices.
     """
 
     entries: sp.csc_matrix
@@ -43,6 +44,7 @@ class Assembly:
     smoothness: sp.csc_matrix
     diagonal: FloatArray
     nodal_area: FloatArray
+    elimination: Elimination
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh) -> Assembly:
@@ -70,6 +72,7 @@ class Assembly:
             smoothness=sp.csc_matrix((smooth, indices, indptr), shape=(2 * count, 2 * count)),
             diagonal=diagonal,
             nodal_area=mesh.to_nodes(mesh.areas / 3),
+            elimination=Elimination.of_pairs(row, column, slots),
         )
 
     @property
@@ -81,6 +84,10 @@ class Assembly:
         """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N); `more` is
         added to its data."""
         return with_data(self.smoothness, self.entries @ blocks.ravel() + more)
+
+    def factorise(self, matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
+        """Factorise such a matrix, positive definite; see `Elimination.factorise`."""
+        return self.elimination.factorise(matrix.data)
 
     def node_blocks(self, blocks: FloatArray) -> FloatArray:
         """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""
@@ -100,17 +107,3 @@ def _sums(rows: npt.NDArray[np.int64], number: npt.NDArray[np.int64], count: int
     """The matrix that adds up entries: each of its columns counts in the next `number` of the `rows`."""
     indptr = np.concatenate([[0], np.cumsum(number)])
     return sp.csc_matrix((np.ones(rows.size), rows.ravel(), indptr), shape=(count, number.size))
-
-
-def factorise(matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
-    """Factorise a symmetric positive definite matrix; gives the function that solves for right-hand sides."""
-    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    parts = [part for factor in (factors.L, factors.U) for part in (factor.data, factor.indices, factor.indptr)]
-
-    def solve(right_sides: FloatArray) -> FloatArray:
-        solution = np.empty((len(right_sides), right_sides[0].size))
-        solution[factors.perm_r] = right_sides.reshape(solution.shape)
-        solve_factors(*parts, solution)
-        return solution[factors.perm_c].reshape(right_sides.shape)
-
-    return solve

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic.correlation.assembly import factorise
 from rgbmidic.correlation.median import median
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -107,7 +106,7 @@ class Equations:
             textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
         held = scale * (_SMOOTHNESS * assembly.smoothness.data + 1e-9 * assembly.diagonal)
-        solve = factorise(assembly.matrix(blocks, held))
+        solve = assembly.factorise(assembly.matrix(blocks, held))
         coupled = per_light[1:] if functions.shape[1] else []
         border, corner = _border([assembly.matrix(blocks) for blocks in coupled], functions)
         solved = solve(border) if border.shape[1] else border

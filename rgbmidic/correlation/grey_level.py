@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from rgbmidic._kernels.correlation import element_vector, interpolate_nodal
-from rgbmidic.correlation.assembly import factorise
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
+from rgbmidic.mesh.sparse import with_data
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["corrected_values"]
@@ -54,11 +54,11 @@ def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: Floa
     scale = float(np.sqrt((weight * g * g).sum() / weight.sum())) or 1.0
     g = g / np.float32(scale)
     system = assembly.matrix(reference.blocks(weight, g, np.ones_like(g)))
-    smooth = _SMOOTHNESS * system.diagonal().mean() * assembly.smoothness
+    smooth = _SMOOTHNESS * system.diagonal().mean() * assembly.smoothness.data
     parts = np.zeros((len(reference.mesh.elements), 3, 2))
     geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
     element_vector(weight, f, g, np.ones_like(g), *geometry, parts)
-    nodal = factorise((system + smooth).tocsc())(assembly.vector(parts)).reshape(-1, 2)
+    nodal = assembly.factorise(with_data(system, system.data + smooth))(assembly.vector(parts)).reshape(-1, 2)
     fields = np.empty((2, f.size), dtype=np.float32)
     interpolate_nodal(nodal, reference.mesh.elements, *geometry, fields)
     gain = np.maximum(fields[0] / np.float32(scale), np.float32(_LEAST_GAIN))

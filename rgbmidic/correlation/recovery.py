@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse.linalg import splu
 
-from rgbmidic.correlation.assembly import factorise
 from rgbmidic.correlation.uncertainty.propagation import Functional
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import quadratic_fit
@@ -89,7 +89,7 @@ def linear_fit_offset(mesh: Tri3Mesh) -> FloatArray:
         np.bincount(mesh.elements.ravel(), weights=part.ravel(), minlength=len(mesh.nodes))
         for part in np.moveaxis(parts, -1, 0)
     ]
-    return np.asarray(factorise(mass_matrix(mesh))(np.stack(sums, axis=1)))
+    return np.asarray(splu(mass_matrix(mesh), permc_spec="MMD_AT_PLUS_A").solve(np.stack(sums, axis=1)))
 
 
 def mass_matrix(mesh: Tri3Mesh) -> sp.csc_matrix:

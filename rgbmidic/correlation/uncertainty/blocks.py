@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sp
 
 from rgbmidic._kernels.correlation import element_hessian
 from rgbmidic.correlation.assembly import Assembly
@@ -22,10 +21,8 @@ _ACROSS = 4
 _MANY = 700
 """Blocks, every other one in both directions, whose projections are told from one another by their random signs to half
 a per cent of the share; where a region has fewer, those further apart are projected together, every fourth at most."""
-_SOLVED = 1e-4
-"""Share of what has been fitted below which an iteration of the conjugate gradients is the last."""
 _ANCHOR = 1e-6
-"""Multiple of the identity, over the mean diagonal entry, that holds nodes without texture."""
+"""Multiple of the identity, over the texture of an unknown, that holds nodes without."""
 _LEAST = 0.05
 """Share under which the residual tells nothing of the noise: a region of one block (elements of 4 px leave 0.1)."""
 
@@ -82,24 +79,7 @@ def unfitted_share(
         products = summed(pixels.in_blocks(chosen, side)).sum(axis=1)  # the shape functions of an element add up to 1
         xx_to_yy = assembly.at_nodes(products)
         projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
-    share = 1 - _fitted(assembly.matrix(hessian), np.stack(projected, axis=1)) / total
+    sides, anchor = np.stack(projected, axis=1), _ANCHOR * total / assembly.size
+    solve = assembly.factorise(assembly.matrix(hessian, anchor * assembly.diagonal))
+    share = 1 - float((sides * solve(sides)).sum()) / total
     return share if share > _LEAST else float("nan")
-
-
-def _fitted(matrix: sp.csc_matrix, columns: FloatArray) -> float:
-    """Sum of ``b^T M^-1 b`` over columns b (2 N, m), by conjugate gradients after division by the diagonal."""
-    diagonal = matrix.diagonal()
-    inverse = 1 / (diagonal + _ANCHOR * diagonal.mean())[:, None]
-    rest, total, gained = columns, 0.0, np.inf
-    way = near = inverse * rest
-    square = (rest * near).sum(axis=0)
-    while gained > _SOLVED * total:
-        ahead = matrix @ way
-        step = square / np.maximum((way * ahead).sum(axis=0), 1e-300)
-        gained = float(step @ square)
-        total += gained
-        rest = rest - step * ahead
-        near = inverse * rest
-        before, square = square, (rest * near).sum(axis=0)
-        way = near + square / np.maximum(before, 1e-300) * way
-    return total

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic.correlation.assembly import Assembly, factorise
+from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.equations import SEEN
 from rgbmidic.correlation.images import PREFILTERS, apply_prefilter
 from rgbmidic.correlation.node_status import LOST
@@ -145,7 +145,7 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
         return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
 
     # elements that no light sees must not make the system singular
-    solve = factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
+    solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
     used = np.asarray(seen[mesh.elements].all(axis=1))
     recovery = Recovery.over(mesh, used, density, linear_fit_offset(mesh))
     along_x, colouring = [(recovery.displacement_functionals[0], seen)], NodeColouring.from_mesh(mesh)

@@ -1,0 +1,81 @@
+"""Elimination of the unknowns of a mesh, two a node: its order and structure once, the numbers for every matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from rgbmidic._kernels.triangular import factorise, solve_factors
+from rgbmidic.typing import FloatArray
+
+__all__ = ["Elimination"]
+
+Index = npt.NDArray[np.integer]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Elimination:
+    """Structure of the factors of symmetric matrices with a block of 2 x 2 for each two nodes that share an edge.
+
+    Attributes
+    ----------
+    place : ndarray, shape (N,)
+        When each node is eliminated. All else counts the nodes so.
+    given : tuple of ndarray
+        Rows of the lower half of the matrix: where each starts, nodes, and places (n, 2, 2) in the matrix' data.
+    lower : csc_matrix, shape (N, N)
+        Blocks of the lower factor under its diagonal.
+    before : csr_matrix, shape (N, N)
+        The same by rows.
+    """
+
+    place: Index
+    given: tuple[Index, Index, Index]
+    lower: sp.csc_matrix
+    before: sp.csr_matrix
+
+    @classmethod
+    def of_pairs(cls, row: Index, column: Index, slots: Index) -> Elimination:
+        """For matrices with blocks at the nodes `row` (n,) and `column` (n,), column after column, diagonal included,
+        whose data have them at `slots` (n, 2, 2). Who has fewest neighbours left goes first."""
+        edges = np.bincount(column)
+        # negative beside the diagonal: nothing that is filled in cancels
+        values = np.where(row == column, edges[column] + 1.0, -1.0)
+        graph = sp.csc_matrix((values, row, np.concatenate([[0], np.cumsum(edges)])), shape=(edges.size,) * 2)
+        factors = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        lower = sp.csc_matrix(sp.tril(factors.L, -1))
+        lower.sort_indices()
+        place = factors.perm_c
+        half = np.flatnonzero(place[column] <= place[row])
+        half = half[np.argsort(place[row[half]], kind="stable")]
+        starts = np.searchsorted(place[row[half]], np.arange(edges.size + 1))
+        given = starts, place[column[half]], np.ascontiguousarray(slots[half])
+        return cls(place=place, given=given, lower=lower, before=sp.csr_matrix(lower))
+
+    def factorise(self, data: FloatArray) -> Callable[[FloatArray], FloatArray]:
+        """Factorise a positive definite matrix given by its data; the function that solves for right-hand sides (2 N,)
+        or (2 N, R).
+
+        Raises
+        ------
+        RuntimeError
+            The matrix is singular in double precision.
+        """
+        lower, inverse = np.empty((self.lower.nnz, 4)), np.empty((self.place.size, 3))
+        structure = self.lower.indptr, self.lower.indices
+        factorise(data, *self.given, self.before.indptr, self.before.indices, *structure, lower, inverse)
+        if not np.isfinite(inverse).all():
+            raise RuntimeError("the matrix is singular")
+
+        def solve(right_sides: FloatArray) -> FloatArray:
+            solution = np.empty((self.place.size, 2, right_sides[0].size))
+            solution[self.place] = right_sides.reshape(solution.shape)
+            solve_factors(*structure, lower, inverse, solution)
+            return solution[self.place].reshape(right_sides.shape)
+
+        return solve
