@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -59,17 +58,6 @@ class CameraRaw(FrameSource):
             return int(raw.sizes.height), int(raw.sizes.width)
 
     def _stored(self, index: int) -> StoredFrame:
-        known = next((frame for plain in _plain if (frame := plain.frame_of(self.path))), None)
-        frame, as_is = (known, True) if known else self._decoded()
-        assert frame.black_level is not None
-        assert frame.white_level is not None
-        _check_filled(frame.values, frame.black_level, frame.white_level, stored_as_is=as_is, path=self.path)
-        if as_is and not known and (plain := _Plain.of(self.path, frame)):
-            _plain.append(plain)
-        return frame
-
-    def _decoded(self) -> tuple[StoredFrame, bool]:
-        """What LibRaw makes of the file, and whether its samples are stored uncompressed."""
         structure = RawStructure.read(self.path)
         with _libraw(self.path) as raw:
             cell = _colour_cell(raw, self.path)
@@ -80,56 +68,16 @@ class CameraRaw(FrameSource):
         if values.shape != (sizes.height, sizes.width):
             raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
         told = structure.black_level(sizes.top_margin, sizes.left_margin) if structure else None
-        frame = StoredFrame(
+        black = black if told is None else told
+        as_is = structure is not None and structure.stored_as_is
+        _check_filled(values, black, white, stored_as_is=as_is, path=self.path)
+        return StoredFrame(
             values=values,
             kind="monochrome" if monochrome else "bayer",
             cfa=None if monochrome else names,
-            black_level=black if told is None else told,
+            black_level=black,
             white_level=white,
         )
-        return frame, structure is not None and structure.stored_as_is
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Plain:
-    """A file whose 16 bit samples are those that LibRaw gives: another with the same bytes around them is the same but
-    for these, and LibRaw, which takes 15 ms for 1 Mpx, need not look at it.
-
-    Attributes
-    ----------
-    before, after
-        The bytes around the samples.
-    frame
-        What the file tells.
-    """
-
-    before: bytes
-    after: bytes
-    frame: StoredFrame
-
-    @classmethod
-    def of(cls, path: Path, frame: StoredFrame) -> _Plain | None:
-        """None where the samples do not lie in the file in one piece."""
-        content, samples = path.read_bytes(), frame.values.astype("<u2").tobytes()
-        start = content.find(samples[: 2 * frame.values.shape[1]])
-        if start < 0 or content[start : start + len(samples)] != samples:
-            return None
-        return cls(before=content[:start], after=content[start + len(samples) :], frame=frame)
-
-    def frame_of(self, path: Path) -> StoredFrame | None:
-        """The frame of a file; None where it differs in more than the samples."""
-        start, size = len(self.before), self.frame.values.nbytes
-        if path.stat().st_size != start + size + len(self.after):
-            return None
-        content = path.read_bytes()
-        if content[:start] != self.before or content[start + size :] != self.after:
-            return None
-        values = np.frombuffer(content, dtype="<u2", count=size // 2, offset=start)
-        return replace(self.frame, values=values.reshape(self.frame.values.shape).astype(np.uint16))
-
-
-_plain: deque[_Plain] = deque(maxlen=1)
-"""The last such file that LibRaw has read in this process."""
 
 
 @contextmanager

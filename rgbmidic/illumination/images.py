@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.colour_factors import BLOCK, enlarged
 from rgbmidic.illumination.linearise import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -82,6 +81,8 @@ class IlluminationImages:
         0 where its contrast is that of the light with the most contrast there, towards 1 in its reflection; None where
         the separation does not tell.
         """
+        from rgbmidic.illumination.colour_factors import BLOCK, enlarged  # reading a result takes no kernels
+
         return None if self.reflection is None else enlarged(self.reflection, BLOCK, self.shape, step)
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,33 +27,6 @@ def dng(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("raw") / "whole.dng"
     write_dng(path, noisy_mosaic())
     return path
-
-
-@pytest.fixture(autouse=True)
-def nothing_known() -> None:
-    """No test's file spares that of another its LibRaw."""
-    camera_raw._plain.clear()
-
-
-def test_a_file_that_differs_in_its_samples_alone_is_read_without_libraw(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first, paths = noisy_mosaic(), [tmp_path / f"{name}.dng" for name in "abcd"]
-    others = [replace(first, values=first.values[::-1]), replace(first, black_level=first.black_level + 1)]
-    for path, mosaic in zip(paths, [first, *others, first], strict=True):
-        write_dng(path, mosaic)
-    paths[3].write_bytes(paths[3].read_bytes()[:-2])
-    opened, imread = [], rawpy.imread
-    monkeypatch.setattr(rawpy, "imread", lambda name: opened.append(name) or imread(name))
-    for path, mosaic in zip(paths[:3], [first, *others], strict=True):
-        frame = read_frame(path)
-        assert isinstance(frame, Mosaic)
-        np.testing.assert_array_equal(frame.values, mosaic.values)
-        assert (frame.cfa, frame.white_level) == (mosaic.cfa, mosaic.white_level)
-        np.testing.assert_array_equal(frame.black_level, mosaic.black_level)
-    assert opened == [str(paths[0]), str(paths[2])]
-    with pytest.raises(FrameError, match="damaged"):
-        read_frame(paths[3])
 
 
 @pytest.mark.parametrize("cfa", BAYER_PATTERNS)
