@@ -11,7 +11,8 @@ centres 25 px apart over the same region, and start from zero.
 ``star``: v = 0.5 cos(2 pi y / period) px with a period that grows from 100 to 300 px along x, noise of 1 DN.
 ``affine``: 1 % strain and a turn of 2 degrees, without noise and with noise of 2.55 DN (1 %); ``affine, 3 lights``:
 three noisy views of it together. ``raw``: the second frame of a raw Bayer series under three lights, from file to
-record, beside three pairs of each peer.
+record, beside three pairs of each peer. ``sequence``: the same in a series of which every frame moves by as much as
+``star``, in as many processes as threads, its start left out; the seconds are those from one frame to the next.
 Accuracy is over the points away from the edge; pyxel-dic has one thread only.
 """
 
@@ -40,7 +41,8 @@ MARGIN, STEP = 30, 25
 CONTENDERS = ("rgbmidic", "pyvale", "pyxel-dic")
 CASES = ("star", "affine", "affine, 1 % noise")
 TIMED = ("star", "raw")
-"""Cases run several times; the others once, for their error."""
+FRAMES, STARTED = 24, 6
+"""Cases run several times, the others once; frames of the sequence, and those after which its time counts."""
 _STRAIN, _TURN = 0.01, np.radians(2.0)
 
 Points = tuple[FloatArray, FloatArray]
@@ -114,11 +116,12 @@ def write_raw_test(folder: Path, f: FloatArray, g: FloatArray) -> None:
     from rgbmidic.lab.virtual import plate_scene, record
 
     scene = plate_scene(size=len(f))
-    for number, image in enumerate((f, g)):
+    for number in range(FRAMES + 1):
+        image = (f, g)[number % 2]
         lights = np.stack([level * image for level in (7.0, 6.0, 6.5)])
         frame = record(lights, scene.camera, scene.lights, seed=number)
         assert isinstance(frame, Mosaic)
-        write_dng(folder / f"frame_{number}.dng", frame)
+        write_dng(folder / f"frame_{number:02d}.dng", frame)
     crosstalk = scene.camera.true_crosstalk(scene.lights)
     Calibration(crosstalk=crosstalk, noise=scene.camera.noise).write(folder / "calibration.json")
     edge = len(f) - 1 - MARGIN
@@ -180,6 +183,19 @@ def raw_frame(folder: Path) -> Callable[[], Any]:
     return lambda: measure_frame(plan, 1, start)
 
 
+def sequence(folder: Path, processes: int) -> float:
+    """Seconds a frame of the raw series, measured as `rgbmidic run` does, without pictures."""
+    from rgbmidic import measure, read_test
+
+    times: list[float] = []
+    with tempfile.TemporaryDirectory() as out:
+        settings = read_test(folder / "TEST.toml")
+        measure(
+            settings, Path(out) / "result", workers=processes, progress=lambda *_: times.append(time.perf_counter())
+        )
+    return (times[-1] - times[STARTED]) / (len(times) - 1 - STARTED)
+
+
 def error(case: str, found: Points, size: int) -> float:
     """rms over the components of the error in px, away from the image's edge."""
     points, displacement = found
@@ -204,18 +220,23 @@ def serve(name: str, folder: Path, threads: int) -> None:
         try:
             if case == "raw":
                 frame = frame or raw_frame(folder)
-                begin = time.perf_counter()
-                frame()
+                row["seconds"] = _time(frame)[0]
+            elif case == "sequence":
+                row["seconds"] = sequence(folder, threads)
             else:
                 f, g = _images(folder, case)
-                begin = time.perf_counter()
-                found = run(f, g, threads)
-            row["seconds"] = time.perf_counter() - begin
-            if case != "raw":
+                row["seconds"], found = _time(lambda f=f, g=g: run(f, g, threads))
                 row |= {"nodes": len(found[0]), "error": error(case, found, f.shape[-1])}
         except Exception as failure:  # what a peer cannot do is a result, too
             row["failed"] = f"{type(failure).__name__}: {failure}"
         print(json.dumps({**row, "memory": peak_memory()}), file=answers, flush=True)
+
+
+def _time(work: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds of some work, and what it gives."""
+    begin = time.perf_counter()
+    found = work()
+    return time.perf_counter() - begin, found
 
 
 def _images(folder: Path, case: str) -> tuple[AnyArray, AnyArray]:
@@ -275,7 +296,7 @@ def compare(folder: Path, size: int, threads: int, repeats: int, base: str | Non
     contenders = [Contender(name, label, folder, threads, path) for name, label, path in there]
     rows = []
     try:
-        for case in (*CASES, "affine, 3 lights", "raw"):
+        for case in (*CASES, "affine, 3 lights", "raw", "sequence"):
             able = contenders if case in CASES else [one for one in contenders if one.name == "rgbmidic"]
             found: dict[str, dict[str, Any]] = {}
             for turn in range(1 + repeats if case in TIMED else 1):
@@ -306,7 +327,10 @@ def show(rows: list[dict[str, Any]]) -> None:
         )
     for row in rows:
         if row["case"] == "star" and "seconds" in row and not row["contender"].startswith("rgbmidic"):
-            print(f"three pairs with {row['contender']} / a raw frame with ours: {3 * row['seconds'] / own['raw']:.2f}")
+            alone, within = (3 * row["seconds"] / own[case] for case in ("raw", "sequence"))
+            print(
+                f"three pairs with {row['contender']} / ours: a raw frame {alone:.2f}, one of a sequence {within:.2f}"
+            )
 
 
 def main() -> None:

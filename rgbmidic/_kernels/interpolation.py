@@ -44,7 +44,9 @@ def bspline_coefficients(image: FloatImage, out: FloatImage, taps: FloatImage = 
 def _filter_columns(start, stop, image, taps, out):
     """Filter down the columns, whole rows at a time: by `taps`, then by the recursions, causal and anticausal."""
     n, z = image.shape[0], _POLE
-    line, before = np.empty(stop - start, dtype=np.float32), np.zeros(stop - start, dtype=np.float32)
+    line, before = np.empty(stop - start, dtype=np.float32), np.empty(stop - start, dtype=np.float32)
+    for j in range(before.size):
+        before[j] = 0
     for i in range(-_REACH, n):
         middle = image[_mirrored(i, n), start:stop]
         for j in range(line.size):

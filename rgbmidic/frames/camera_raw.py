@@ -125,7 +125,7 @@ class _Plain:
         if content[:start] != self.before or content[start + size :] != self.after:
             return None
         values = np.frombuffer(content, dtype="<u2", count=size // 2, offset=start)
-        return replace(self.frame, values=values.reshape(self.frame.values.shape))
+        return replace(self.frame, values=values.reshape(self.frame.values.shape).astype(np.uint16))
 
 
 _plain: deque[_Plain] = deque(maxlen=1)

@@ -208,13 +208,13 @@ def _smooth(sums: FloatImage, counts: FloatImage, sigma: float) -> FloatImage:
             return grid
         return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
 
-    out = np.empty_like(sums)
     weights = np.broadcast_to([blurred(number) for number in counts], sums.shape)
-    for total, number, weight, target in zip(sums, np.broadcast_to(counts, sums.shape), weights, out, strict=True):
-        overall = total.sum(dtype=np.float64) / max(number.sum(dtype=np.float64), 1.0)
-        enough = weight > 1e-3 * max(float(number.max()), 1.0)
-        np.divide(blurred(total), weight, out=target, where=enough)
-        target[~enough] = overall
+    out, enough = np.empty_like(sums), weights > 1e-3 * np.maximum(counts.max(axis=(1, 2), keepdims=True), 1)
+    for total, weight, known, target in zip(sums, weights, enough, out, strict=True):
+        np.divide(blurred(total), weight, out=target, where=known)
+    if not enough.all():
+        overall = sums.sum(axis=(1, 2)) / np.maximum(counts.sum(axis=(1, 2)), 1)
+        np.copyto(out, overall[:, None, None], where=~enough)
     return out
 
 

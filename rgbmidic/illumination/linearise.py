@@ -91,8 +91,7 @@ def linearise(frame: Mosaic | ChannelFrame, noise: NoiseModel | None = None) -> 
     if isinstance(frame, ChannelFrame):
         values = frame.values.astype(np.float32) - frame.black_level.astype(np.float32)[:, None, None]
         return LinearChannels(values=values, valid=~saturated, full_scale=full_scale)
-    values, black = np.empty(frame.values.shape, dtype=np.float32), frame.black_level.astype(np.float32)
-    for row in (0, 1):
-        line = np.resize(black[row], frame.values.shape[1])
-        np.subtract(frame.values[row::2], line, out=values[row::2])
+    values = frame.values.astype(np.float32)
+    for row, black in enumerate(frame.black_level.astype(np.float32)):
+        values[row::2] -= np.tile(black, -(-values.shape[1] // 2))[: values.shape[1]]
     return LinearMosaic(values=values, saturated=saturated, cfa=frame.cfa, full_scale=full_scale, noise=noise)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from rgbmidic._kernels.texture import divide_by_mean
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatImage
 
@@ -42,14 +43,12 @@ def normalise(images: FloatImage, sigma: float, full_scale: float) -> FloatImage
     """
     if not sigma > 0:
         raise InputError(f"the width of the local mean must be positive, not {sigma!r} px")
-    out = np.empty_like(images)
+    out, dark = np.empty_like(images), np.float32(DARK * full_scale)
     for image, normalised in zip(images, out, strict=True):
-        mean = local_mean(image, sigma)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            np.divide(image, mean, out=normalised)
-            seen = mean > DARK * full_scale
-        if not seen.all():
-            normalised[~seen] = np.nan
+        if sigma < _WIDE or not np.isfinite(image).all():
+            divide_by_mean(image, local_mean(image, sigma), 1, dark, normalised)
+        else:
+            divide_by_mean(image, _half_blur(image, sigma), 2, dark, normalised)
     return out
 
 
@@ -64,15 +63,22 @@ def local_mean(image: FloatImage, sigma: float) -> FloatImage:
 
 
 def _blur(image: FloatImage, sigma: float) -> FloatImage:
-    """Gaussian mean of an image (H, W); of one of half the size where that is as good, at a sixth of the time."""
+    """Gaussian mean of an image (H, W)."""
     if sigma < _WIDE:
         return _gaussian(image, sigma)
+    half = _half_blur(image, sigma)
+    return np.asarray(cv2.resize(half, (half.shape[1], 2 * len(half)), interpolation=cv2.INTER_LINEAR)[: len(image)])
+
+
+def _half_blur(image: FloatImage, sigma: float) -> FloatImage:
+    """Gaussian mean of each two rows, from an image of half the size: as good, at a sixth of the time."""
     height, width = image.shape
     odd = height % 2, width % 2
     even = cv2.copyMakeBorder(image, 0, odd[0], 0, odd[1], cv2.BORDER_REPLICATE) if any(odd) else image
     half = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
     blurred = _gaussian(np.asarray(half), np.sqrt(sigma**2 - _RESIZED) / 2)
-    return np.asarray(cv2.resize(blurred, even.shape[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width])
+    wide = cv2.resize(blurred, (even.shape[1], len(half)), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(wide[:, :width])
 
 
 def _gaussian(image: FloatImage, sigma: float) -> FloatImage:

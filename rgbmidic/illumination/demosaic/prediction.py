@@ -119,6 +119,7 @@ def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, FloatArr
     return texture(apart) + OFFSET_VARIANCE, np.exp(-(apart**2) / (4 * SPARKLE_VARIANCE))
 
 
+@lru_cache(maxsize=64)
 def _channels_around(cfa: str, size: int) -> list[npt.NDArray[np.intp]]:
     """Channel of each sample of the square, for the four phases of its centre: (0, 0), (0, 1), (1, 0), (1, 1)."""
     cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
