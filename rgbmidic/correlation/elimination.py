@@ -48,13 +48,16 @@ class Elimination:
         values = np.where(row == column, edges[column] + 1.0, -1.0)
         graph = sp.csc_matrix((values, row, np.concatenate([[0], np.cumsum(edges)])), shape=(edges.size,) * 2)
         factors = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        lower = sp.csc_matrix(sp.tril(factors.L, -1))
-        lower.sort_indices()
-        place = factors.perm_c
+        whole, place = factors.L, factors.perm_c
+        whole.sort_indices()
+        below = np.ones(whole.nnz, dtype=bool)
+        below[whole.indptr[:-1]] = False  # the diagonal is the first of each column
+        rows, starts = whole.indices[below], np.concatenate([[0], np.cumsum(np.diff(whole.indptr) - 1)])
+        lower = sp.csc_matrix((np.ones(rows.size, dtype=bool), rows, starts), shape=whole.shape)
         half = np.flatnonzero(place[column] <= place[row])
         half = half[np.argsort(place[row[half]], kind="stable")]
-        starts = np.searchsorted(place[row[half]], np.arange(edges.size + 1))
-        given = starts, place[column[half]], np.ascontiguousarray(slots[half])
+        given_starts = np.searchsorted(place[row[half]], np.arange(edges.size + 1))
+        given = given_starts, place[column[half]], np.ascontiguousarray(slots[half])
         return cls(place=place, given=given, lower=lower, before=sp.csr_matrix(lower))
 
     def factorise(self, data: FloatArray) -> Callable[[FloatArray], FloatArray]:

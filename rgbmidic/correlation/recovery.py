@@ -89,7 +89,9 @@ def linear_fit_offset(mesh: Tri3Mesh) -> FloatArray:
         np.bincount(mesh.elements.ravel(), weights=part.ravel(), minlength=len(mesh.nodes))
         for part in np.moveaxis(parts, -1, 0)
     ]
-    return np.asarray(splu(mass_matrix(mesh), permc_spec="MMD_AT_PLUS_A").solve(np.stack(sums, axis=1)))
+    options = {"SymmetricMode": True}
+    factors = splu(mass_matrix(mesh), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return np.asarray(factors.solve(np.stack(sums, axis=1)))
 
 
 def mass_matrix(mesh: Tri3Mesh) -> sp.csc_matrix:

@@ -149,4 +149,6 @@ def _reached(mesh: Tri3Mesh, used: BoolArray, share: FloatArray) -> sp.csr_matri
     beside = sp.csr_matrix((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(itself.size, itself.size))
     row = np.repeat(itself, np.diff(beside.indptr))
     through = with_data(beside, (~(mesh.on_boundary & (share > _TIP)))[row] | (beside.indices == row))
-    return sp.csr_matrix(beside @ through)
+    reached = sp.csr_matrix(beside @ through)
+    reached.sort_indices()  # or scipy might, later, in one of the matrices that share them
+    return reached
