@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic.correlation.median import median
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -183,6 +182,6 @@ def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[Boo
     smallest = half - np.hypot((xx - yy) / 2, xy)
     smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only
     density = smallest / area
-    typical = median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
+    typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
     seen = density > least * typical if typical > 0 else np.zeros(len(density), dtype=bool)
-    return seen, float(median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
+    return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0

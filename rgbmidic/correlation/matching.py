@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic.correlation.median import median, of_three
 from rgbmidic.correlation.precision import Precision
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.mesh import Tri3Mesh
@@ -37,7 +36,7 @@ def matching_elements(
     own = correlation(fg, ff, gg)
     # a few speckles can match by chance; those of all elements around a node hardly
     around = correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
-    coefficient = np.minimum(own, of_three(*around[mesh.elements.T]))
+    coefficient = np.minimum(own, np.sort(around[mesh.elements], axis=1)[:, 1])
     if least is not None:
         return np.asarray(coefficient >= least)
     poor, good = _MATCHED if precision is None else _MATCHED_PRECISE
@@ -84,7 +83,7 @@ def misfit(mesh: Tri3Mesh, squares: FloatArray, measured: BoolArray) -> FloatArr
     """
     square, _, count = (mesh.to_nodes(part) for part in squares.sum(axis=0).T)
     around = square / np.maximum(count, 1.0)
-    typical = median(around[measured]) if measured.any() else 0.0
+    typical = float(np.median(around[measured])) if measured.any() else 0.0
     return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)
 
 

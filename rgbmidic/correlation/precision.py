@@ -8,7 +8,6 @@ from itertools import combinations
 import numpy as np
 
 from rgbmidic._kernels.robust import best_mean, robust_weights
-from rgbmidic.correlation.median import median
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.scores import displacing_share
@@ -62,7 +61,7 @@ def learn_precision(residual: Residual) -> Precision:
     pixels, weights = residual.reference.pixels, residual.weights
     covariance = window_covariance(pixels, residual.difference, weights)
     variance = covariance[range(len(weights)), range(len(weights))]
-    typical = median(variance[variance > 0]) if variance.any() else 0.0
+    typical = float(np.median(variance[variance > 0])) if variance.any() else 0.0
     if typical <= 0:
         return Precision(factor=np.ones_like(weights), bend=np.ones_like(weights[0]))
     floor = np.float32(max(0.1 * typical, 1e-6 * float(np.var(_some(residual.values, weights), dtype=np.float64))))
@@ -73,7 +72,7 @@ def learn_precision(residual: Residual) -> Precision:
     np.maximum(around, floor / len(share), out=around)
     trusted = displacing_share(residual.reference, mean, used / around)
     trusted *= around
-    unit = np.float32(median(_some(trusted, used))) if used.any() else np.float32(0)
+    unit = np.float32(np.median(_some(trusted, used))) if used.any() else np.float32(0)
     robust_weights(mean, around, trusted, np.float32(unit), np.float32(_FREEDOM), share, bend)
     return Precision(factor=share, bend=bend)
 

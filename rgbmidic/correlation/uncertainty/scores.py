@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from rgbmidic._kernels.robust import scores
-from rgbmidic.correlation.median import median
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.blocks import BLOCK, block_side
@@ -110,7 +109,7 @@ def _typical_square(x: FloatArray, y: FloatArray, count: FloatArray) -> float:
     """
     whole = count >= 0.5 * count.max(initial=0.0)
     square = (x**2 + y**2)[whole] / np.maximum(count[whole], 1.0)
-    return median(square) / (2 * np.log(2)) if square.size else 0.0
+    return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
 
 
 def _per_element(reference: Reference, grid: FloatArray, side: int) -> FloatArray:
