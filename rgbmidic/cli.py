@@ -359,7 +359,7 @@ def demo(
     with _progress("demo") as progress:
         rows = run_demo(out, lambda line: _messages.print(line, soft_wrap=True), _calibrate_demo, progress)
     _messages.print(f"5 of 5: pictures of the result in {out / 'figures'}", soft_wrap=True)
-    write_figures(Result.open(out / "result"), out / "figures", (1, len(rows)), processes=threads())
+    write_figures(Result.open(out / "result"), out / "figures", (len(rows),), processes=threads())
     table = Table(title="Displacement error against the exact truth, px (a sphere turning under moving reflections)")
     for heading in ("angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"):
         table.add_column(heading, justify="right")

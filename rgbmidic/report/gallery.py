@@ -47,7 +47,7 @@ _OF_FRAME: Mapping[str, Callable[[Result, int], Figure | None]] = {
     "reflections": reflection_figure,
 }
 _NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)})_[0-9]{{6,}})\.png")
-_FEW = 8
+_FEW = 5
 """Pictures for which another process does not pay: it starts in one to two seconds, a picture takes half of one."""
 
 _Picture = tuple[str, int | None]
