@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import re
+import signal
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rgbmidic.errors import ResultError
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -81,7 +83,7 @@ def write_figures(
     InputError
         There is no such frame.
     ResultError
-        The result is damaged or the folder cannot be written.
+        The result is damaged, the folder cannot be written, or a process that draws is ended.
     """
     folder = Path(folder)
     with writing(folder):
@@ -92,10 +94,21 @@ def write_figures(
     pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]
     pictures += [(kind, frame) for frame in frames for kind in _OF_FRAME]
     parts = max(1, min(processes, len(pictures) // _FEW))
-    with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=_ignore_interrupt) as pool:
         others = [pool.submit(_draw_of, result.path, folder, pictures[part::parts]) for part in range(1, parts)]
-        drawn = {*_draw(result, folder, pictures[::parts])}.union(*(other.result() for other in others))
+        drawn = {*_draw(result, folder, pictures[::parts])}
+        try:
+            drawn.update(*(other.result() for other in others))
+        except BrokenExecutor:
+            raise ResultError(
+                f"a process that drew pictures into {folder} was ended; draw them anew: rgbmidic figures {result.path}"
+            ) from None
     return tuple(file for picture in pictures if (file := _file(folder, *picture)) in drawn)
+
+
+def _ignore_interrupt() -> None:
+    """Ctrl-C reaches all processes; the first one decides."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _draw_of(path: Path, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
