@@ -94,7 +94,7 @@ def write_figures(
     pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]
     pictures += [(kind, frame) for frame in frames for kind in _OF_FRAME]
     parts = max(1, min(processes, len(pictures) // _FEW))
-    with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=_ignore_interrupt) as pool:
+    with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=_end_when_interrupted) as pool:
         others = [pool.submit(_draw_of, result.path, folder, pictures[part::parts]) for part in range(1, parts)]
         drawn = {*_draw(result, folder, pictures[::parts])}
         try:
@@ -106,9 +106,9 @@ def write_figures(
     return tuple(file for picture in pictures if (file := _file(folder, *picture)) in drawn)
 
 
-def _ignore_interrupt() -> None:
-    """Ctrl-C reaches all processes; the first one decides."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _end_when_interrupted() -> None:
+    """Ctrl-C reaches all processes: this one ends without a word, the first one tells."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _draw_of(path: Path, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
