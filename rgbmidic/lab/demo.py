@@ -52,7 +52,7 @@ crosstalk = [[1.0, 0.10, 0.02], [0.14, 1.0, 0.16], [0.03, 0.12, 1.0]]
 seed = 2026
 target = "speckled"
 """
-ANGLES = (0.33, 1.0, 2.0, 4.0, 8.0)
+ANGLES = (0.33, 1.0, 2.0, 8.0)
 """Rotations of the sphere, degrees."""
 
 
