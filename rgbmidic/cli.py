@@ -107,7 +107,6 @@ def run(
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
-    from rgbmidic.lab.rehearsal import rehearsed
     from rgbmidic.pipeline import measure
     from rgbmidic.settings import read_range, read_test
 
@@ -117,8 +116,6 @@ def run(
     if overwrite and (resume or frames):
         raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
     _tell_first_run()
-    with rehearsed():
-        pass  # on a first run two processes compile what is needed in two thirds of the time that this one would take
     with _progress("measuring") as progress, _telling_how_to_go_on(test, out, frames):
         result = measure(
             settings,
@@ -584,8 +581,8 @@ def _tell_first_run() -> None:
 
     if not are_compiled():
         _messages.print(
-            "first run on this machine: kernels are compiled for its processor as they are needed, in all about "
-            "half a minute on two cores; later runs take them from a cache",
+            "first run on this machine: kernels are compiled for its processor as they are needed, in all some 40 s; "
+            "later runs take them from a cache",
             soft_wrap=True,
         )
 

@@ -65,21 +65,8 @@ def quadratic_fit(
     weighted = weight[:, None] * basis
     normal = weighted @ basis.transpose(0, 2, 1)
     normal[:, range(1, 6), range(1, 6)] += _RIDGE
-    fits = (_inverse(normal) / mesh.size ** np.array([0, 1, 1, 2, 2, 2])[:, None]) @ weighted
+    fits = (np.linalg.inv(normal) / mesh.size ** np.array([0, 1, 1, 2, 2, 2])[:, None]) @ weighted
     return tuple(with_data(structure, fits[:, term].ravel()[known]) for term in range(6))
-
-
-def _inverse(matrices: FloatArray) -> FloatArray:
-    """Inverses of symmetric positive definite matrices (N, n, n), of all at a time by Gauss and Jordan: one after the
-    other takes four times as long."""
-    number, size, _ = matrices.shape
-    rows = np.concatenate([matrices.T, np.broadcast_to(np.eye(size)[..., None], (size, size, number))], axis=1)
-    for pivot in range(size):
-        rows[pivot] /= rows[pivot, pivot].copy()
-        factors = rows[:, pivot].copy()
-        factors[pivot] = 0
-        rows -= factors[:, None] * rows[pivot]
-    return np.ascontiguousarray(rows[:, size:].T)
 
 
 def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray]) -> FloatImage:

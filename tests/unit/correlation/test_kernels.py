@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import naive_correlation as naive
 import numpy as np
 import pytest
+from bits import assert_same_on_threads
 
 from rgbmidic._kernels import correlation as kernels
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, pixel_gradient, sample_with_gradient
-from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation.reference import _partial_blocks
 from rgbmidic.correlation.residual import curved_deviation
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -220,9 +220,8 @@ def less_curved(case, carried, bend):
     return out
 
 
-def all_outputs(number):
-    """What every parallel kernel writes, computed on a number of threads."""
-    set_threads(number)
+def all_outputs():
+    """What every parallel kernel writes."""
     case = scene(11, "over the edge", shape=(151, 173))
     elements, count = len(case.mesh.elements), case.reference.size
     right, hessian, vector = np.empty((elements, 3, 2)), np.empty((elements, 3, 3, 3)), np.empty((elements, 3, 2))
@@ -240,9 +239,4 @@ def all_outputs(number):
 
 
 def test_the_same_bits_on_one_and_three_threads():
-    before = threads()
-    try:
-        for one, two in zip(all_outputs(1), all_outputs(3), strict=True):
-            np.testing.assert_array_equal(one, two)
-    finally:
-        set_threads(before)
+    assert_same_on_threads(all_outputs)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bits import assert_same_on_threads
 
 from rgbmidic import Region, Tri3Mesh
-from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic._kernels.triangular import node_energies
 from rgbmidic.correlation.assembly import Assembly
 
@@ -57,15 +57,9 @@ def test_the_same_bits_on_one_and_three_threads():
     assembly, matrix = assembled(1.0)
     right = RANDOM.normal(size=(assembly.size, 101))
 
-    def found(number):
-        set_threads(number)
+    def found():
         solved, energies = assembly.factorise(matrix)(right), np.empty((assembly.size // 2, 101))
         node_energies(matrix.data, matrix.indices, matrix.indptr, solved, energies)
         return solved, energies
 
-    before = threads()
-    try:
-        for one, three in zip(found(1), found(3), strict=True):
-            np.testing.assert_array_equal(one, three)
-    finally:
-        set_threads(before)
+    assert_same_on_threads(found)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bits import assert_same_on_threads
 
 from rgbmidic._kernels.grid import product_sums
 from rgbmidic._kernels.robust import scores
-from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 
@@ -69,20 +69,14 @@ def test_scores_of_all_lights_together():
 def test_the_same_bits_on_one_and_three_threads(pixels):
     values = np.random.default_rng(3).uniform(size=(2, pixels.rows.size)).astype(np.float32)
 
-    def found(number):
-        set_threads(number)
+    def found():
         sums, summed = np.zeros((2, 2, 2, *pixels.grid(4)), np.float32), np.zeros((4, 20000), np.float32)
         product_sums(values, values, pixels.lines, pixels.line_offsets, 4, sums)
         scores(*[np.resize(values, (2, 20000))] * 4, summed)
         blocks = pixels.block_sums(values, 5)
         return sums, summed, blocks, pixels.from_blocks(blocks, 5), pixels.window(values)
 
-    before = threads()
-    try:
-        for one, three in zip(found(1), found(3), strict=True):
-            np.testing.assert_array_equal(one, three)
-    finally:
-        set_threads(before)
+    assert_same_on_threads(found)
 
 
 def test_the_image_of_a_field_comes_back(pixels):

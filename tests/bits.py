@@ -1,0 +1,20 @@
+"""That a kernel gives the same bits on any number of threads."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rgbmidic._kernels.threads import set_threads, threads
+
+
+def assert_same_on_threads(work):
+    """`work()` gives equal arrays on one and on three threads."""
+    before, found = threads(), []
+    try:
+        for number in (1, 3):
+            set_threads(number)
+            found.append(work())
+    finally:
+        set_threads(before)
+    for one, three in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, three)
