@@ -12,13 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import cache, wraps
 from itertools import pairwise
+from threading import Barrier
 from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
 from rgbmidic.errors import InputError
 
-__all__ = ["one_blas_thread", "over_ranges", "set_threads", "threads"]
+__all__ = ["one_blas_thread", "over_ranges", "set_threads", "start_threads", "threads"]
 
 _VARIABLE = "RGBMIDIC_THREADS"
 _chosen: list[int] = []
@@ -47,6 +48,21 @@ def set_threads(number: int) -> None:
     if number < 1:
         raise InputError(f"the number of threads must be at least 1; given is {number}")
     _chosen[:] = [number]
+
+
+def start_threads() -> None:
+    """Start the threads that share a kernel, which otherwise start with the first one.
+
+    Raises
+    ------
+    RuntimeError
+        The system refuses one.
+    """
+    others = threads() - 1
+    if others:
+        together = Barrier(others)  # each waits for all, so that none does the work of two
+        for one in [_pool(os.getpid(), others).submit(together.wait) for _ in range(others)]:
+            one.result()
 
 
 def over_ranges(array: str, *, axis: int = 0, grain: int = 1) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -7,7 +7,6 @@ brightness of the lights -> record.
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -118,24 +117,18 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
     }
 
 
-_Known = tuple[Plan, tuple[int, ...], Renewal]
-_known: deque[_Known] = deque(maxlen=2)
-"""References that later frames have become in this process: the last two."""
-
-
 def _renewal(plan: Plan, renewed: Sequence[tuple[int, Solution]]) -> Renewal:
     """The reference that the frames `renewed` make in turn."""
-    indices = tuple(index for index, _ in renewed)
-    for known, frames, renewal in _known:
-        if known is plan and frames == indices:
-            return renewal
-    renewal = Renewal.none(plan.reference)
-    for index, solution in renewed:
-        images = plan.separation(plan.series.read(index))
-        weights = plan.weights.deformed(images, index)
-        renewal = renewal.renewed(solution, correlated(images, plan.settings.illumination), weights)
-    _known.append((plan, indices, renewal))
-    return renewal
+
+    def make() -> Renewal:
+        renewal = Renewal.none(plan.reference)
+        for index, solution in renewed:
+            images = plan.separation(plan.series.read(index))
+            weights = plan.weights.deformed(images, index)
+            renewal = renewal.renewed(solution, correlated(images, plan.settings.illumination), weights)
+        return renewal
+
+    return plan.updates.get(tuple(index for index, _ in renewed), make)
 
 
 def _compared(

@@ -6,9 +6,13 @@ reference of the solve.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from threading import Lock
 
 from rgbmidic.correlation import Reference
+from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.errors import FrameError, RegionError
 from rgbmidic.frames import FrameSeries, open_series, read_frame
 from rgbmidic.illumination.calibration import Calibration
@@ -19,7 +23,33 @@ from rgbmidic.pipeline.separation import RawState, Separation, correlated
 from rgbmidic.settings import RegionSettings, TestSettings
 from rgbmidic.weights import LightWeights, prepare_weights
 
-__all__ = ["Plan", "read_region"]
+__all__ = ["Plan", "ReferenceUpdates", "read_region"]
+
+_KEPT_UPDATES = 2
+"""Updated references that a process keeps: frames measured side by side follow this one or the last."""
+
+
+class ReferenceUpdates:
+    """The references that frames of one test have become lately, made once for all threads of a process.
+
+    A copy sent to another process begins empty.
+    """
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[tuple[int, ...], Renewal]] = deque(maxlen=_KEPT_UPDATES)
+        self._lock = Lock()
+
+    def __reduce__(self) -> tuple[type[ReferenceUpdates], tuple[()]]:
+        return ReferenceUpdates, ()
+
+    def get(self, frames: tuple[int, ...], make: Callable[[], Renewal]) -> Renewal:
+        """The reference that the `frames` make in turn: a kept one, else what `make` gives."""
+        with self._lock:
+            for known, renewal in self._kept:
+                if known == frames:
+                    return renewal
+            self._kept.append((frames, make()))
+            return self._kept[-1][1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +74,8 @@ class Plan:
         The reference state as the solve needs it, with the mesh.
     timings
         Whether to tell the time that each stage of a frame takes.
+    updates
+        References that later frames have become.
     """
 
     settings: TestSettings
@@ -54,6 +86,7 @@ class Plan:
     images: IlluminationImages
     reference: Reference
     timings: bool = False
+    updates: ReferenceUpdates = field(default_factory=ReferenceUpdates, repr=False, compare=False)
 
     @classmethod
     def from_settings(cls, settings: TestSettings) -> Plan:

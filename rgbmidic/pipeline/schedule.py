@@ -17,7 +17,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
 from rgbmidic.pipeline.order import children, is_key, lineage, parent
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.workers import Measured, Renewed, Workers
+from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Renewed, Workers
 from rgbmidic.results import FrameRecord, ResultStore
 from rgbmidic.typing import FloatArray
 
@@ -29,7 +29,8 @@ _LOSS = 0.01
 """Share of the nodes that a key frame may lose against the one it starts from before it is measured again from the
 frame just before it."""
 _TRIES = 3
-"""Times that a frame is given to a worker before it is told to be what kills them."""
+"""Times that a worker may die over a frame, all but the first with that frame alone, before the frame is what kills
+them: two may be chance (memory that another program took)."""
 
 _KEPT = ("u", "v", "node_status", "renewals", "best_match")
 _STRAIN = ("exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std")
@@ -55,6 +56,7 @@ class Schedule:
         self._waiting: dict[int, list[int]] = {}
         self._first_tries: dict[int, FrameRecord] = {}
         self._deaths: dict[int, int] = {}
+        self._suspects: list[tuple[int, Start]] = []
         self._running: dict[Future[Measured], tuple[int, Start]] = {}
         for position in places:
             self._want(position)
@@ -62,7 +64,7 @@ class Schedule:
     @property
     def done(self) -> bool:
         """Whether nothing is left to be measured."""
-        return not (self._ready or self._running)
+        return not (self._ready or self._suspects or self._running)
 
     def run(self, workers: Workers, progress: Progress | None = None, *, most: int | None = None) -> None:
         """Have frames measured, and keep each in the store as it finishes.
@@ -83,12 +85,12 @@ class Schedule:
         """
         count = 0
         while not self.done and count != most:
-            while self._ready and len(self._running) < (workers.slots if most is None else 1):
-                position, start = heappop(self._ready)
-                # a key frame looks for what has been lost; those between follow what there is
-                given = replace(start, unmeasured=0.0) if is_key(position) else start
-                future = workers.submit(self._index(position), given, self._renewed(start.renewals))
-                self._running[future] = position, start
+            if self._suspects:  # each alone, so that a further death is its own
+                if not self._running:
+                    self._submit(workers, *self._suspects.pop())
+            else:
+                while self._ready and len(self._running) < (workers.slots if most is None else 1):
+                    self._submit(workers, *heappop(self._ready))
             ended = wait(self._running, return_when=FIRST_COMPLETED).done
             if any(isinstance(_error(future), BrokenExecutor) for future in ended):
                 ended = wait(self._running).done  # with one of its processes all work of an executor ends
@@ -99,12 +101,18 @@ class Schedule:
                     self._take(position, start, record, progress)
                     count += 1
 
+    def _submit(self, workers: Workers, position: int, start: Start) -> None:
+        # a key frame looks for what has been lost; those between follow what there is
+        given = replace(start, unmeasured=0.0) if is_key(position) else start
+        future = workers.submit(self._index(position), given, self._renewed(start.renewals))
+        self._running[future] = position, start
+
     def _index(self, position: int) -> int:
         """Place in the series of a frame of the result."""
         return self._plan.series.chosen[position]
 
     def _outcome(self, future: Future[Measured], position: int, start: Start) -> FrameRecord | None:
-        """What a worker found; None where it died and the frame is to be measured again."""
+        """What a worker found; None where it died and the frame, as all that ran with it, is to be measured alone."""
         error = _error(future)
         if error is None:
             for level, text in future.result().messages:
@@ -114,7 +122,7 @@ class Schedule:
         name = self._plan.series.name(self._index(position))
         logger.warning("a worker died while %s was measured (%s)", name, error or type(error).__name__)
         if deaths < _TRIES:
-            heappush(self._ready, (position, start))
+            self._suspects.append((position, start))
             return None
         return failed_frame(self._plan, self._index(position), f"its worker process died {deaths} times")
 
@@ -209,8 +217,7 @@ def _error(future: Future[Measured]) -> BaseException | None:
     try:
         return future.exception()
     except CancelledError:
-        told = "the cluster has lost all its workers; what was finished is kept: go on with --resume"
-        raise RgbmidicError(told) from None
+        raise RgbmidicError(LOST_CLUSTER) from None
 
 
 def _rank(record: FrameRecord) -> tuple[int, float]:

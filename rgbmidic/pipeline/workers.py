@@ -11,22 +11,28 @@ import signal
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
 from typing import Any, Self
 
 import cv2
 
-from rgbmidic._kernels.threads import set_threads
+from rgbmidic._kernels.threads import set_threads, start_threads
 from rgbmidic.correlation import Solution, Start
-from rgbmidic.errors import ConfigurationError
+from rgbmidic.errors import ConfigurationError, RgbmidicError
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 
-__all__ = ["Measured", "Workers", "available_cores", "open_workers"]
+__all__ = ["LOST_CLUSTER", "Measured", "Workers", "available_cores", "open_workers"]
 
+logger = logging.getLogger(__name__)
+
+_START = 180.0
+"""Seconds in which a worker process must have started: 5 are usual, 40 were seen on two cores shared by eight programs;
+one that gets no memory for its threads never answers."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RGBMIDIC_THREADS")
 """What libraries read, when they start, for the number of their threads."""
 
@@ -85,21 +91,29 @@ class Processes(Workers):
     def __init__(self, plan: Plan, count: int) -> None:
         self.slots = count
         self._plan = pickle.dumps(plan, protocol=pickle.HIGHEST_PROTOCOL)
+        self._processes: set[BaseProcess] = set()
         self._executor: Executor = self._begin()
 
     def _begin(self) -> ProcessPoolExecutor:
         threads = max(available_cores() // self.slots, 1)
+        others = set(multiprocessing.active_children())
         with _environment(dict.fromkeys(_THREADS, str(threads))):
             spawn = multiprocessing.get_context("spawn")  # threads do not survive a fork
             pool = ProcessPoolExecutor(self.slots, spawn, initializer=_prepare, initargs=(self._plan, threads))
             # the processes must start while the environment says how many threads they have
-            started = [pool.submit(os.getpid) for _ in range(self.slots)]
             try:
-                for one in started:
-                    one.result()
-            except BrokenExecutor as error:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise ConfigurationError(f"worker processes cannot be started: {error}") from None
+                for one in [pool.submit(os.getpid) for _ in range(self.slots)]:
+                    one.result(_START)
+            except BaseException as error:
+                _end(pool, set(multiprocessing.active_children()) - others)
+                if not isinstance(error, (BrokenExecutor, OSError, RuntimeError, TimeoutError)):
+                    raise
+                reason = f"no answer in {_START:.0f} s" if isinstance(error, TimeoutError) else error
+                raise ConfigurationError(
+                    f"{self.slots} worker processes cannot be started: {reason}; is there memory and room for their "
+                    "processes and threads? With --workers 1 the frames are measured in this process"
+                ) from None
+        self._processes = set(multiprocessing.active_children()) - others
         return pool
 
     def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
@@ -118,7 +132,7 @@ class Processes(Workers):
 
     def close(self) -> None:
         """Stop, without waiting for what is not finished."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        _end(self._executor, self._processes)
 
 
 class Cluster(Workers):
@@ -131,6 +145,9 @@ class Cluster(Workers):
             raise ConfigurationError(
                 "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
             ) from None
+        self._log = logging.getLogger("distributed")
+        self._level = self._log.level
+        self._log.setLevel(logging.CRITICAL)  # what becomes of the cluster is reported here, without its tracebacks
         try:
             self._client = distributed.Client(address, timeout=30, set_as_default=False)
             self._client.wait_for_workers(1, timeout=120)
@@ -141,18 +158,41 @@ class Cluster(Workers):
 
     @property
     def slots(self) -> int:  # type: ignore[override]
-        """Threads of all workers there are now."""
-        return max(sum(map(int, self._client.nthreads().values())), 1)
+        """Threads of all workers there are now.
+
+        Raises
+        ------
+        RgbmidicError
+            The scheduler does not answer any more.
+        """
+        with _answering():
+            return max(sum(map(int, self._client.nthreads().values())), 1)
 
     def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
         """Have one frame measured by some worker."""
-        future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, renewed, 1)
+        with _answering():
+            future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, renewed, 1)
         return future
 
     def close(self) -> None:
         """Leave the cluster to others, without waiting for what is not finished."""
         self._executor.shutdown(wait=False)
-        self._client.close()
+        with suppress(OSError, RuntimeError, TimeoutError, CancelledError):  # a scheduler that is gone has let go of it
+            self._client.close()
+        self._log.setLevel(self._level)
+
+
+LOST_CLUSTER = "the Dask scheduler and its workers no longer answer; what was finished is kept: go on with --resume"
+
+
+@contextmanager
+def _answering() -> Iterator[None]:
+    """Turn the errors of a scheduler that has gone into one of ours."""
+    try:
+        yield
+    except (OSError, RuntimeError, CancelledError) as error:
+        logger.debug("the Dask scheduler does not answer: %s", error)
+        raise RgbmidicError(LOST_CLUSTER) from None
 
 
 def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Workers:
@@ -195,11 +235,20 @@ _given: tuple[Plan, int] | None = None
 
 
 def _prepare(plan: bytes, threads: int) -> None:
-    """Begin a worker process."""
+    """Begin a worker process, with all the threads it will have: where one cannot be had, it is known at once."""
     global _given
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    _use_threads(threads)
+    start_threads()
     _given = pickle.loads(plan), threads
+
+
+def _end(pool: Executor, processes: set[BaseProcess]) -> None:
+    """End a pool and its processes, also one that would never answer: what they were doing nobody waits for."""
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.kill()
 
 
 def _end_with_parent() -> None:

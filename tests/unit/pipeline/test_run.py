@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import multiprocessing
 import os
+import pickle
 import signal
-from concurrent.futures import BrokenExecutor, Future
+import subprocess
+import sys
+import time
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +20,12 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic.correlation import Start, Status
-from rgbmidic.errors import FrameError, ResultError
+from rgbmidic.errors import ConfigurationError, FrameError, ResultError, RgbmidicError
 from rgbmidic.frames import write_tiff
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import measure, run, schedule, workers
 from rgbmidic.pipeline.frame import measure_frame
+from rgbmidic.pipeline.plan import ReferenceUpdates
 from rgbmidic.results import Result, finish_result
 from rgbmidic.settings import TestSettings
 
@@ -104,6 +110,115 @@ def test_a_frame_that_kills_every_worker_fails_and_the_rest_goes_on(
     result = measure(settings(movie, last=9), tmp_path / "result")
     assert result.frame(5).reason == "its worker process died 3 times"
     assert (result.status[[4, 6, 9]] == Status.CONVERGED).all()
+
+
+def test_a_frame_that_kills_its_worker_takes_no_other_with_it(
+    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Pool(workers.Here):
+        """Three frames at a time; with the worker of one the work of all is lost, as in a pool of processes."""
+
+        slots = 3
+
+        def submit(self, index: int, start: Start, renewed: Any = ()) -> Future[workers.Measured]:
+            future: Future[workers.Measured] = Future()
+            running.append((index, future, super().submit(index, start, renewed)))
+            return future
+
+    def ended_together(futures: Any, **_: Any) -> Any:
+        ended = running[:]
+        running.clear()
+        together.append({index for index, *_ in ended})
+        for _, future, done in ended:
+            if 5 in together[-1]:
+                future.set_exception(BrokenExecutor("killed"))
+            else:
+                future.set_result(done.result())
+        return wait(futures)
+
+    running: list[tuple[int, Future[workers.Measured], Future[workers.Measured]]] = []
+    together: list[set[int]] = []
+    monkeypatch.setattr(schedule, "wait", ended_together)
+    monkeypatch.setattr(run, "open_workers", lambda plan, *_: Pool(plan))
+    # every frame starts from the first: all but it can be measured side by side
+    monkeypatch.setattr(schedule, "parent", lambda position: 0 if position else None)
+    monkeypatch.setattr(schedule, "lineage", lambda position: iter((position, 0) if position else (0,)))
+    monkeypatch.setattr(schedule, "children", lambda position, count: iter(range(1, count) if not position else ()))
+    monkeypatch.setattr(schedule, "is_key", lambda position: False)
+    result = measure(settings(movie, last=9), tmp_path / "result")
+    assert result.frame(5).reason == "its worker process died 3 times"
+    assert np.flatnonzero(result.status != Status.CONVERGED).tolist() == [5]
+    deadly = [batch for batch in together if 5 in batch]
+    assert len(deadly[0]) == 3
+    assert deadly[1:] == [{5}, {5}]
+
+
+class NeverAnswers:
+    """A plan that a worker process never finishes reading, as one that waits for a thread which cannot start."""
+
+    def __reduce__(self) -> tuple[Any, tuple[int]]:
+        return time.sleep, (1000,)
+
+
+def test_workers_that_do_not_start_are_ended_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_START", 2.0)
+    with pytest.raises(ConfigurationError, match=r"cannot be started: no answer in 2 s.*--workers 1"):
+        workers.Processes(NeverAnswers(), 1)  # type: ignore[arg-type]
+    for process in multiprocessing.active_children():
+        process.join(10)
+        assert process.exitcode is not None
+
+
+def test_threads_of_a_process_make_an_updated_reference_once() -> None:
+    updates, made = ReferenceUpdates(), list[object]()
+
+    def make() -> Any:
+        time.sleep(0.05)
+        made.append(object())
+        return made[-1]
+
+    with ThreadPoolExecutor(8) as threads:
+        got = list(threads.map(lambda _: updates.get((1, 2), make), range(8)))
+    assert got == made * 8
+    assert pickle.loads(pickle.dumps(updates)).get((1, 2), make) is not got[0]
+    assert len(made) == 2
+
+
+def test_a_worker_that_never_ends_is_ended_with_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    with workers.Processes({}, 1) as pool:  # type: ignore[arg-type]
+        busy = pool._executor.submit(time.sleep, 1000)
+        while not busy.running():
+            time.sleep(0.01)
+        (process,) = multiprocessing.active_children()
+    process.join(10)
+    assert process.exitcode is not None
+
+
+def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line(movie: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="dask and distributed are not installed")
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--dashboard-address", ":0"]
+    where = tmp_path / "scheduler.json"
+    scheduler = subprocess.Popen([*command, "--scheduler-file", where], stderr=subprocess.DEVNULL)
+    worker = subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", where, "--nthreads", "1"],
+        stderr=subprocess.DEVNULL,
+    )
+
+    def kill(done: int, total: int, line: str) -> None:
+        if done == 3:
+            scheduler.kill()
+
+    try:
+        while not where.exists():
+            time.sleep(0.1)
+        address = json.loads(where.read_text())["address"]
+        with pytest.raises(RgbmidicError, match=r"no longer answer; .* --resume"):
+            measure(settings(movie), tmp_path / "result", scheduler=address, progress=kill)
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
+    assert 3 <= Result.open(tmp_path / "result", partial=True).finished.sum() < COUNT
 
 
 @pytest.mark.parametrize("stop", [1, 13, 35])
