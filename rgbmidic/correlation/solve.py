@@ -156,11 +156,12 @@ def _nothing_left(weighting: Weighting) -> str:
 
 
 def _hidden(lights: BoolArray) -> str:
-    named = ", ".join(map(str, np.flatnonzero(lights)))
+    numbers = [str(number) for number in np.flatnonzero(lights)]
+    named = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
     return (
-        f"the rigid motions of lights {named} (light 0 is the first) are not in the images: they share too little seen "
-        "texture with light 0, directly or through other lights, to tell their rigid motion from displacement. Widen "
-        'what is seen (region, weights), measure the bodies apart, or set solver.rigid = "none"'
+        f"{named} too little seen texture with light 0 (the first), directly or through others, to tell a rigid motion "
+        "from displacement: widen what is seen (region, weights), measure the bodies apart, or set "
+        'solver.rigid = "none"'
     )
 
 
