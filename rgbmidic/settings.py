@@ -627,9 +627,17 @@ def read_range(text: str, where: str) -> range:
     return range(int(found[1]), int(found[2]))
 
 
+_LONGEST = 100_000
+"""Most frames in a range for an average. A reference of n frames adds 1/n to a frame's variance: 100 are enough, and
+this is a thousand times that. A longer range is a slip, and took a minute and 3 GB until the frames refused it."""
+
+
 def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path) -> tuple[Any, ...]:
     if kinds == (int, Ellipsis) and isinstance(value, str):
-        return tuple(read_range(value, where))
+        given = read_range(value, where)
+        if len(given) > _LONGEST:
+            raise ConfigurationError(f'{where} = "{value}" names {len(given)} frames; at most {_LONGEST} are allowed')
+        return tuple(given)
     if len(kinds) == 2 and kinds[1] is Ellipsis:
         entries = value if _depth(value) > _hint_depth(kinds[0]) else [value]  # a single one needs no brackets
         return tuple(convert_value(entry, kinds[0], where, base) for entry in entries)

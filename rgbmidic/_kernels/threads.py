@@ -7,9 +7,10 @@ is the same bits on any number of threads.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from functools import cache, wraps
 from itertools import pairwise
 from threading import Barrier
@@ -23,6 +24,8 @@ __all__ = ["one_blas_thread", "over_ranges", "set_threads", "start_threads", "th
 
 _VARIABLE = "RGBMIDIC_THREADS"
 _chosen: list[int] = []
+_limits: list[Any] = []
+_lock = threading.Lock()
 
 
 def threads() -> int:
@@ -111,11 +114,22 @@ def _pool(process: int, workers: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="rgbmidic")
 
 
-def one_blas_thread() -> AbstractContextManager[object]:
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
     """Keep the linear algebra of scipy and numpy from sharing small work: the triangular solves of a frame, some 50
-    right-hand sides at a time, take two to three times as long on two threads (measured), and their sums may differ."""
-    limited: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
-    return limited
+    right-hand sides at a time, take two to three times as long on two threads (measured), and their sums may differ.
+
+    The limit is the process's: the first thread that comes sets it, and the last that goes lifts it.
+    """
+    with _lock:
+        _limits.append(_limits[-1] if _limits else _blas().limit(limits=1, user_api="blas"))
+    try:
+        yield
+    finally:
+        with _lock:
+            limit = _limits.pop()
+            if not _limits:
+                limit.restore_original_limits()
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The linear algebra of one pass: Hessian, smoothness for what nobody sees, rigid motions of the lights."""
+"""The linear algebra of one pass: Hessian, smoothness for what nobody sees, rigid motions of the lights (`rigid`)."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 
 from rgbmidic.correlation.reference import Reference
+from rgbmidic.correlation.rigid import RigidMotions
+from rgbmidic.mesh.sparse import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["SEEN", "Equations", "rigid_functions"]
+__all__ = ["SEEN", "Equations"]
 
-
-_RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
-"""Number of rigid functions of a light."""
 _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
 _ROUNDING = 1e-4
@@ -24,15 +22,6 @@ SEEN = 0.05
 """A node is measured if it has this share of the median texture around a node of its area..."""
 _INFORMED = 0.01
 """...and this share of the median information, its texture over the variance of the residual: 10 times the noise."""
-
-
-def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
-    """Nodal values (2 N, m) of the rigid motions: shifts in x and y (px), rotation (rad) about the mesh's middle."""
-    arm = nodes - nodes.mean(axis=0)
-    columns = np.zeros((len(nodes), 2, 3))
-    columns[:, 0, 0] = columns[:, 1, 1] = 1
-    columns[:, 0, 2], columns[:, 1, 2] = -arm[:, 1], arm[:, 0]
-    return columns.reshape(-1, 3)[:, : _RIGID_FUNCTIONS[rigid]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,10 +46,8 @@ class Equations:
         Entries xx, xy and yy of the nodes' own blocks of the Hessian.
     solve
         Solves the normal equations with it.
-    border, border_solved : ndarray, shape (2 N, (k - 1) m)
-        Hessian of each further light times the rigid functions, and the solution for it.
-    schur : ndarray
-        Schur complement of the rigid unknowns.
+    rigid
+        The rigid motions of the lights after the first; None where there are none.
     textured : ndarray, shape (N,), bool
         Nodes that see enough texture.
     light_share : ndarray, shape (N, k), float64
@@ -74,9 +61,7 @@ class Equations:
     node_blocks: FloatArray
     smoothness: float
     solve: Callable[[FloatArray], FloatArray]
-    border: FloatArray
-    border_solved: FloatArray
-    schur: FloatArray
+    rigid: RigidMotions | None
     textured: BoolArray
     light_share: FloatArray
 
@@ -106,9 +91,11 @@ class Equations:
         # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
         held = scale * (_SMOOTHNESS * assembly.smoothness.data + 1e-9 * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
-        coupled = per_light[1:] if functions.shape[1] else []
-        border, corner = _border([assembly.matrix(blocks) for blocks in coupled], functions)
-        solved = solve(border) if border.shape[1] else border
+        rigid = None
+        if functions.shape[1] and len(per_light) > 1:
+            shown = np.asarray(textured[reference.mesh.elements].all(axis=1))
+            hold = with_data(assembly.smoothness, held)
+            rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, shown)
         return cls(
             weights=weights,
             rotation=rotation,
@@ -117,9 +104,7 @@ class Equations:
             node_blocks=own,
             smoothness=_SMOOTHNESS * scale,
             solve=solve,
-            border=border,
-            border_solved=solved,
-            schur=corner - border.T @ solved,
+            rigid=rigid,
             textured=textured,
             light_share=_light_share(reference, per_light),
         )
@@ -128,14 +113,16 @@ class Equations:
         """Texture times weight around each node, over its area, (N,): what the inverse variance of a node goes with."""
         return np.asarray((self.node_blocks[0] + self.node_blocks[2]) / reference.assembly.nodal_area)
 
-    def increment(self, right_side: FloatArray, rigid_side: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Solve for the motion of the nodes (N, 2) and of the rigid functions ((k - 1) m,)."""
-        free = self.solve(right_side)
-        rigid = np.zeros(self.border.shape[1])
-        if rigid.size:
-            rigid[:] = np.linalg.lstsq(self.schur, rigid_side - self.border.T @ free, rcond=1e-9)[0]
-        motion = (free - self.border_solved @ rigid).reshape(-1, 2)
-        return np.einsum("nij,nj->ni", self.rotation, motion), rigid
+    def increment(
+        self, right_side: FloatArray, held_side: FloatArray, rigid_side: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Solve for the motion of the nodes (N, 2) and of the rigid functions ((k - 1) m,); `held_side` (2 N,) is the
+        smoothness' part of the `right_side`."""
+        motion, rigid = self.solve(right_side), np.zeros(0)
+        if self.rigid is not None:
+            rigid = self.rigid.increment(motion, held_side, rigid_side)
+            motion = motion - self.rigid.follows @ rigid
+        return np.einsum("nij,nj->ni", self.rotation, motion.reshape(-1, 2)), rigid
 
     def turned_back(self, columns: FloatArray) -> FloatArray:
         """Nodal vectors (2 N, m) in the axes of the reference."""
@@ -152,17 +139,6 @@ def _rotation(gradient: FloatArray) -> FloatArray:
     angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
-
-
-def _border(hessians: list[sp.csc_matrix], functions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Coupling of the nodes with the rigid unknowns of the further lights, and these with themselves."""
-    count = functions.shape[1]
-    columns = [hessian @ functions for hessian in hessians]
-    corner = np.zeros((count * len(columns),) * 2)
-    for i, column in enumerate(columns):
-        part = slice(i * count, (i + 1) * count)
-        corner[part, part] = functions.T @ column
-    return np.concatenate(columns, axis=1) if columns else np.empty((len(functions), 0)), corner
 
 
 def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArray:

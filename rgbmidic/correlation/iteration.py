@@ -107,8 +107,7 @@ def _stepped(
     problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
 ) -> Estimate:
     """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
-    right_side, rigid_side = _right_sides(problem, equations, values, estimate, known)
-    motion, shifts = equations.increment(right_side, rigid_side)
+    motion, shifts = equations.increment(*_right_sides(problem, equations, values, estimate, known))
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
     rigid = estimate.rigid.copy()
@@ -127,11 +126,11 @@ def _stepped(
 
 def _right_sides(
     problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
-) -> tuple[FloatArray, FloatArray]:
-    """Right-hand sides of the nodes (2 N,) and of the rigid functions ((k - 1) m,)."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Right-hand sides of the nodes (2 N,), the smoothness' part of it, and of the rigid functions ((k - 1) m,)."""
     bend = problem.reference.assembly.smoothness @ estimate.displacement.ravel()
-    total = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
-    rigid = []
+    held = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
+    total, rigid = held.copy(), []
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         weight = equations.weights[light]
         if known is None:
@@ -141,7 +140,7 @@ def _right_sides(
         total += vector
         if light:
             rigid.append(equations.functions.T @ vector)
-    return total, np.concatenate(rigid) if rigid else np.empty(0)
+    return total, held, np.concatenate(rigid) if rigid else np.empty(0)
 
 
 def _light_displacements(problem: Problem, estimate: Estimate) -> list[FloatArray]:

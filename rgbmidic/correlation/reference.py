@@ -30,7 +30,7 @@ from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 __all__ = ["Deformed", "Reference", "drawn"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Deformed:
     """The k images of a deformed state, ready to be interpolated.
 
@@ -64,7 +64,7 @@ class Deformed:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reference:
     """The reference state with its mesh; everything a frame needs and no frame changes.
 

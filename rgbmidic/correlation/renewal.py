@@ -17,6 +17,7 @@ from rgbmidic.correlation.images import usable_reach
 from rgbmidic.correlation.matching import correlation
 from rgbmidic.correlation.reference import Deformed, Reference, drawn
 from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.rigid import rigid_functions
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.correlation.track import Start, track
 from rgbmidic.errors import InputError
@@ -100,7 +101,7 @@ class Renewal:
         """
         if self.scores is None:
             return step
-        own = 1 - 2 * _shared(self.scores, _scores(self.reference, deformed, step.displacement))
+        own = 1 - 2 * _shared(self.scores, _scores(self.reference, deformed, step.displacement, step.rigid))
         return replace(
             step,
             nodes=self.first.mesh.nodes,
@@ -117,7 +118,8 @@ class Renewal:
 
         NaN where a node has no displacement, and where no light sees the element in both images.
         """
-        residual, known = _residual(self.reference, deformed, solution.displacement - self.displacement)
+        step = solution.displacement - self.displacement, solution.rigid - self.rigid
+        residual, known = _residual(self.reference, deformed, *step)
         lights = zip(*residual.centred_products(), strict=True)
         own = np.array([correlation(fg, ff, gg) for fg, ff, gg in lights])
         best = np.where(residual.moments[..., 0] > 0, own, -np.inf).max(axis=0)
@@ -162,7 +164,8 @@ class Renewal:
         reference = Reference.prepare(images, region, weights, mesh=moved, prefilter=prefilter)
         step = displacement - self.displacement
         gaps = np.where(measured[:, None], step, np.nan)
-        scores = _scores(self.reference, Deformed.prepare(images, weights, prefilter=prefilter), gaps)
+        deformed = Deformed.prepare(images, weights, prefilter=prefilter)
+        scores = _scores(self.reference, deformed, gaps, solution.rigid - self.rigid)
         turn = np.eye(2) + self.reference.mesh.element_gradient(step)
         return Renewal(
             first=self.first,
@@ -215,10 +218,10 @@ def _covered(mesh: Tri3Mesh, chosen: BoolArray, shape: tuple[int, ...]) -> BoolA
     return owner >= 0
 
 
-def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray) -> FloatArray:
+def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, rigid: FloatArray) -> FloatArray:
     """Sums (E, 2) over each element of the weighted residual at a displacement times the gradient; NaN where a node has
     no displacement."""
-    residual, known = _residual(reference, deformed, displacement)
+    residual, known = _residual(reference, deformed, displacement, rigid)
     pixels = reference.pixels
     total, parts = np.zeros((len(pixels.origin), 2)), np.zeros((len(pixels.origin), 3, 2))
     geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
@@ -230,9 +233,14 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray) 
     return total
 
 
-def _residual(reference: Reference, deformed: Deformed, displacement: FloatArray) -> tuple[Residual, BoolArray]:
-    """The residual at a displacement (N, 2) with gaps, and the elements (E,) all of whose nodes have one."""
+def _residual(
+    reference: Reference, deformed: Deformed, displacement: FloatArray, rigid: FloatArray
+) -> tuple[Residual, BoolArray]:
+    """The residual at a displacement (N, 2) with gaps and the lights' rigid coefficients (k, m), NaN for one that sees
+    nothing; and the elements (E,) all of whose nodes have a displacement."""
     found = np.asarray(np.isfinite(displacement).all(axis=1))
-    motion = [np.nan_to_num(displacement)] * len(reference.values)
+    functions = rigid_functions(reference.mesh.nodes, "translation+rotation")[:, : rigid.shape[1]]
+    own = (np.nan_to_num(rigid) @ functions.T).reshape(len(rigid), *displacement.shape)
+    motion = list(np.nan_to_num(displacement) + own)
     known = np.asarray(found[reference.mesh.elements].all(axis=1))
     return Residual.at(reference, deformed, reference.values, motion), known

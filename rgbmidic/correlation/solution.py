@@ -37,7 +37,7 @@ class NodeStatus(IntEnum):
     """Not measured; the value is carried over from measured nodes within the distance asked for."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
     """Displacement field of one frame.
 
@@ -64,8 +64,8 @@ class Solution:
     reason : str
         Why the frame is not converged; empty otherwise.
     rigid : ndarray, shape (k, m), float64
-        Coefficients beta of the rigid functions of each light (0 for the first): shift in x and y in px, then
-        rotation in rad about the middle of the mesh.
+        Coefficients beta of the rigid functions of each light (0 for the first, NaN for one that sees nothing): shift
+        in x and y in px, then rotation in rad about the middle of the mesh.
     residual : ndarray, shape (k,), float64
         Weighted rms of ``f - g(x + u)`` of each light, in grey levels of the filtered images; NaN where a light has
         no weight.

@@ -18,12 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import one_blas_thread
-from rgbmidic.correlation.equations import Equations, rigid_functions
+from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.iteration import Estimate, Problem, UnsolvableError, compare, iterate
 from rgbmidic.correlation.matching import misfit
 from rgbmidic.correlation.node_status import Evidence, judge, one_sided_texture
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
+from rgbmidic.correlation.rigid import rigid_functions
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
 from rgbmidic.correlation.weighting import (
     FIRST_PASS,
@@ -139,7 +140,7 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
         equations = Equations.build(
             problem.reference, weighting.weights, problem.functions, estimate.displacement, given
         )
-    except RuntimeError as error:  # what SuperLU raises on a matrix that is singular in double precision
+    except np.linalg.LinAlgError as error:
         raise UnsolvableError(f"the equations cannot be solved: {error}", estimate) from None
     if not equations.textured.any():
         raise UnsolvableError(_nothing_left(weighting), estimate)
@@ -152,6 +153,16 @@ def _nothing_left(weighting: Weighting) -> str:
     if not weighting.residual.weights.any():
         return "no light sees the region: every weight is zero"
     return "the images have no texture in the region"
+
+
+def _hidden(lights: BoolArray) -> str:
+    numbers = [str(number) for number in np.flatnonzero(lights)]
+    named = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
+    return (
+        f"{named} too little seen texture with light 0 (the first), directly or through others, to tell a rigid motion "
+        "from displacement: widen what is seen (region, weights), measure the bodies apart, or set "
+        'solver.rigid = "none"'
+    )
 
 
 @stage("conclusion")
@@ -168,6 +179,8 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     squares = weighting.residual.squares(equations.weights)
     misfits = misfit(mesh, squares, equations.textured)
     node_status = _judged(estimate, equations, weighting, mismatched, std, misfits)
+    if equations.rigid is not None and equations.rigid.hidden.any():
+        raise UnsolvableError(_hidden(equations.rigid.hidden), estimate)
     measured = node_status == NodeStatus.MEASURED
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
     square, total, _ = squares.sum(axis=1).T
@@ -185,7 +198,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         misfit=np.where(measured, misfits, np.nan),
         status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
         reason="" if converged else f"the last iteration still moved a node by {history[-1]:.3g} px",
-        rigid=estimate.rigid,
+        rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
         weight_share=_shares(equations.weights),
         history=history,

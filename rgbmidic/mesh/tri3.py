@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +28,7 @@ serve the filters only."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tri3Mesh:
-    """Triangles on the reference image.
+    """Triangles on the reference image. Its arrays are not writable: what is derived from them is kept.
 
     Attributes
     ----------
@@ -46,7 +48,7 @@ class Tri3Mesh:
     size: float = field(init=False)
 
     def __post_init__(self) -> None:
-        nodes = np.ascontiguousarray(self.nodes, dtype=np.float64)
+        nodes = np.array(self.nodes, dtype=np.float64, order="C")
         elements = np.array(self.elements, dtype=np.int32)
         if nodes.ndim != 2 or nodes.shape[1] != 2 or elements.ndim != 2 or elements.shape[1] != 3 or not len(elements):
             raise InputError(
@@ -58,10 +60,14 @@ class Tri3Mesh:
         if (area == 0).any():
             raise InputError(f"element {int(np.argmin(np.abs(area)))} of the mesh has no area")
         elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
-        object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "elements", elements)
-        object.__setattr__(self, "areas", np.abs(area))
+        for name, values in (("nodes", nodes), ("elements", elements), ("areas", np.abs(area))):
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
         object.__setattr__(self, "size", float(np.sqrt(2 * np.median(self.areas))))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy by pickle is not writable either."""
+        return partial(Tri3Mesh, nodes=self.nodes, elements=self.elements), ()
 
     @classmethod
     def from_region(cls, region: Region, element_size: float, cracks: Sequence[npt.ArrayLike] = ()) -> Tri3Mesh:

@@ -108,7 +108,10 @@ _RENEWALS = (
     "places in the result of the frames that became the reference in turn, up to this one: it was itself compared with "
     "the last before it, or with the test's reference"
 )
-_RIGID = "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad)"
+_RIGID = (
+    "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for one "
+    "that sees nothing"
+)
 _REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not tell it"
 _SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
 _ENDS = ("converged", "not converged", "failed")

@@ -25,6 +25,8 @@ DRAWS = 100
 RATIO = (0.9, 1.1)  # stated over observed, median of the field
 COVERAGE = (0.90, 0.99)  # of 95 % intervals
 IN_MOTION = (0.8, 1.25)  # rms(error / u_std) of a frame
+RIGID = (0.9, 1.15)  # rms(error / u_std) with rigid motions of the lights: measured .97 to 1.12
+RIGID_DRAWS = 20
 SPOILED = 1.5  # the same, beside what is spoiled
 BETTER = 1.05  # error of the best threshold over that of the statistics, on sparkling paint
 SIZE, REGION, ANGLES = 400, (30, 30, 369, 369), (0.33, 1.0, 4.0)
@@ -61,6 +63,45 @@ def test_intervals_cover_the_truth(draws: tuple[list[Solution], np.ndarray]) -> 
     left = found[0].nodes[:, 0] < 60
     for place in (left, ~left):
         assert COVERAGE[0] < covered[:, place].mean() < COVERAGE[1]
+
+
+OVERLAP = {"full": 999, "barely": 8, "none": 0}
+"""Half the width (px) of what two neighbouring lights both see; none: elements that one of them sees on each side."""
+
+
+@pytest.mark.parametrize(
+    ("overlap", "lights", "rigid"),
+    [("full", 2, "translation"), ("barely", 2, "translation+rotation"), ("none", 3, "translation+rotation")],
+)
+def test_the_uncertainty_holds_that_of_the_rigid_motions_of_lights(overlap: str, lights: int, rigid: str) -> None:
+    shape, region, texture, random = (130, 220), (12, 12, 207, 117), Texture.random(3), np.random.default_rng(7)
+    column, edges = np.arange(shape[1]), np.linspace(12, 208, lights + 1)
+    inside = [
+        (column >= left) & (column < right)
+        for left, right in zip(
+            [0, *(edges[1:-1] - OVERLAP[overlap])], [*(edges[1:-1] + OVERLAP[overlap]), 999], strict=True
+        )
+    ]
+    weights = np.array(inside, dtype=float)[:, None] * np.ones((shape[0], 1))
+    motion = Affine.strain_and_rotation(0.003, 0.2, (0.3, -0.2))
+    turns = random.uniform(-0.005, 0.005, lights) * (rigid != "translation")
+    own = [
+        Affine(
+            shift=tuple(motion.shift + shift),
+            gradient=tuple(map(tuple, motion.gradient + np.array([[0, -turn], [turn, 0]]))),
+        )
+        for shift, turn in zip(random.uniform(-0.6, 0.6, (lights, 2)), turns, strict=True)
+    ]
+    pair = [
+        np.stack([texture.image(shape, one) for one in motions])
+        for motions in ([Affine()] * lights, [motion, *own[1:]])
+    ]
+    ratios = []
+    for _ in range(RIGID_DRAWS):
+        noisy = [images + random.normal(0, 4, images.shape) for images in pair]
+        found = correlate(*noisy, region=region, element_size=20, weights=weights, rigid=rigid, initial=motion.shift)
+        ratios.append((found.displacement - motion.displacement(found.nodes, shape)) / found.displacement_std)
+    assert RIGID[0] < np.sqrt(np.mean(np.square(ratios))) < RIGID[1]
 
 
 class Sphere:

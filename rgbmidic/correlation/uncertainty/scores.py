@@ -6,6 +6,9 @@ between the lights; the variance of its sum over blocks wider than that reach ho
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import combinations_with_replacement
+
 import cv2
 import numpy as np
 
@@ -15,7 +18,7 @@ from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.uncertainty.blocks import BLOCK, block_side
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
-__all__ = ["displacing_share", "score_covariance"]
+__all__ = ["displacing_share", "light_covariances", "score_covariance"]
 
 _LEAST_RATIO = 1e-2
 """Least share of a residual's variance that is taken to displace."""
@@ -52,6 +55,38 @@ def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArra
     return np.asarray(texture * scale[:, None, None])
 
 
+def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple[int, int, FloatArray]]:
+    """Covariance of the right-hand sides of each two lights a and b >= a with the solve's `weights` (k, P): their
+    numbers, and its element blocks (E, 3, 3, 3).
+
+    A light's own is as in `score_covariance`; that of two is the root of both, times the correlation of their scores
+    where both see. Of what the lights have in common the fit leaves the fraction `unfitted`, which is put back before
+    the scores are summed; it takes nothing of what they differ by.
+    """
+    reference = residual.reference
+    side, slopes = block_side(reference.pixels, reference.mesh.size), (reference.gradient_x, reference.gradient_y)
+    fields = np.empty((4, weights.shape[1]), dtype=np.float32)
+    scores(residual.difference, weights, *slopes, fields)
+    common = np.divide(fields[:2], fields[2], out=np.zeros_like(fields[:2]), where=fields[2] > 0)
+    lost = np.float32(1 / np.sqrt(reference.unfitted) - 1)
+    own, roots = [], []
+    for light, (difference, weight, gx, gy) in enumerate(zip(residual.difference, weights, *slopes, strict=True)):
+        whole = difference + lost * (gx * common[0] + gy * common[1])
+        own.append(_unit_scores(reference, whole[None], weight[None], (gx[None], gy[None]), side))
+        along_x, _, along_y = _per_element(reference, _averaged_ratios(*own[light], side), side)
+        share = _share_along_x(reference, reference.hessian_blocks(light, weight))
+        roots.append(np.sqrt([along_x / share, along_y / (1 - share)]))
+    for a, b in combinations_with_replacement(range(len(weights)), 2):
+        # the gradients of two lights are parallel
+        slope = (np.copysign(np.sqrt(np.maximum(axis[a] * axis[b], 0)), axis[a]) for axis in slopes)
+        texture = reference.blocks(np.sqrt(weights[a] * weights[b]), *slope)
+        (x, y), (other_x, other_y) = roots[a], roots[b]
+        scale = np.stack([x * other_x, (x * other_y + y * other_x) / 2, y * other_y], axis=-1)
+        if a != b:
+            scale *= _per_element(reference, _correlation(own[a], own[b], side)[None], side)[0, :, None]
+        yield a, b, texture * scale[:, None, None]
+
+
 def _share_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
     """Share (E,) of the gradients along x in the `texture` (E, 3, 3, 3) around each element."""
     mesh = reference.mesh
@@ -75,12 +110,27 @@ def _score_ratios(
     A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
     smooth, and averaged, is its ratio to the information; xx + yy is 1 for white noise and ideal weights.
     """
+    return _averaged_ratios(*_unit_scores(reference, difference, weights, gradient, side), side)
+
+
+def _unit_scores(
+    reference: Reference,
+    difference: FloatImage,
+    weights: FloatImage,
+    gradient: FloatImage | tuple[FloatImage, FloatImage],
+    side: int,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Scores in x and y of blocks over the root of their information, and their pixels; shape (rows, columns)."""
     fields = np.empty((4, difference.shape[1]), dtype=np.float32)
     scores(difference, weights, *gradient, fields)
     x, y, information, count = reference.pixels.block_sums(fields, side).astype(np.float64)
     level = _blur(information, _EVEN) / np.maximum(_blur(count, _EVEN), 1e-6)
     scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
-    x, y = x * scale, y * scale
+    return x * scale, y * scale, count
+
+
+def _averaged_ratios(x: FloatArray, y: FloatArray, count: FloatArray, side: int) -> FloatArray:
+    """Products xx, xy, yy of such scores per pixel, averaged; shape (3, rows, columns)."""
     typical = _typical_square(x, y, count)
     around = _blur(count, _SCORE_RANGE / side)
     prior = _PRIOR * side**2
@@ -89,6 +139,20 @@ def _score_ratios(
         for product, expected in ((x * x, typical), (x * y, 0.0), (y * y, typical))
     ]
     return np.asarray(np.stack(ratios) * _few_blocks(around, count, side))
+
+
+def _correlation(first: tuple[FloatArray, ...], second: tuple[FloatArray, ...], side: int) -> FloatArray:
+    """Correlation (rows, columns) of the scores of two lights over the blocks around that both see."""
+    (x, y, count), (other_x, other_y, other_count) = first, second
+    both = (count > 0) & (other_count > 0)
+    squares = (x * x + y * y, other_x * other_x + other_y * other_y)
+    prior = [2 * _PRIOR * side**2 * _typical_square(*scores) for scores in (first, second)]
+    product = _blur(both * (x * other_x + y * other_y), _SCORE_RANGE / side)
+    first_square, second_square = (
+        _blur(both * square, _SCORE_RANGE / side) + held for square, held in zip(squares, prior, strict=True)
+    )
+    scale = np.sqrt(first_square * second_square)
+    return np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
 
 
 def _few_blocks(around: FloatArray, count: FloatArray, side: int) -> FloatArray:

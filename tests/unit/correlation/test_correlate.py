@@ -136,6 +136,13 @@ def test_texture_in_one_direction_only_is_no_texture_and_no_crash(prefilter):
     assert np.isnan(found.displacement).all()
 
 
+def test_solutions_can_be_compared_and_kept_in_a_set(pair):
+    one, other = (correlate(*pair, initial=SHIFT) for _ in range(2))
+    assert one == one
+    assert one != other
+    assert len({one, other}) == 2
+
+
 @pytest.mark.parametrize("degrees", [8, 30, 85])
 def test_a_turn_costs_no_iterations(degrees):
     shape, lights = (160, 160), (Texture.random(3), Texture.random(4))

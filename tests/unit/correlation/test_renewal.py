@@ -240,3 +240,19 @@ def test_a_frame_in_which_nothing_is_measured_is_no_reference():
     lost = replace(solution, node_status=np.full_like(solution.node_status, NodeStatus.DECORRELATED))
     with pytest.raises(InputError, match="no element is measured"):
         first.renewed(lost, stack(texture.image(SHAPE)))
+
+
+def test_a_light_that_moves_for_itself_calls_for_no_reference():
+    texture, own = Texture.random(6), (0.3, 2.8)
+    region = Region.from_rectangle(RECTANGLE, SHAPE)
+    first = np.stack([texture.image(SHAPE)] * 2).astype(np.float32)
+    then = np.stack([texture.image(SHAPE, Affine(shift=(shift, 0.1))) for shift in own]).astype(np.float32)
+    weights = np.ones_like(first)
+    weights[0, :, 90:] = weights[1, :, :60] = 0
+    mesh = Tri3Mesh.from_region(region, 25)
+    renewal = Renewal.none(Reference.prepare(first, region, weights, mesh=mesh))
+    deformed = Deformed.prepare(then, weights)
+    start = Start(displacement=np.full(mesh.nodes.shape, 0.2))
+    solution = renewal.track(deformed, start, replace(OPTIONS, rigid="translation", prefilter="none"))
+    np.testing.assert_allclose(solution.rigid[1], (2.5, 0), atol=0.01)
+    assert np.nanmin(renewal.match(deformed, solution)) > 0.99

@@ -6,13 +6,17 @@ import pickle
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 from shared_kernel import summed
+from textures import Texture
+from threadpoolctl import threadpool_info, threadpool_limits
 
+from rgbmidic import correlate
 from rgbmidic._kernels.grid import block_sums
-from rgbmidic._kernels.threads import over_ranges, set_threads, threads
+from rgbmidic._kernels.threads import one_blas_thread, over_ranges, set_threads, threads
 from rgbmidic.errors import InputError
 
 
@@ -65,6 +69,30 @@ def test_a_failure_in_any_thread_is_told():
 def test_many_threads_may_call_at_once():
     with ThreadPoolExecutor(8) as callers:
         assert all(callers.map(summed, range(40)))
+
+
+def blas_threads():
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_the_last_solve_that_ends_gives_the_threads_of_linear_algebra_back():
+    with threadpool_limits(2, "blas"):
+        before, first, second = blas_threads(), one_blas_thread(), one_blas_thread()
+        with ExitStack() as still:
+            with first:
+                still.enter_context(second)
+            assert blas_threads() == {1}
+        assert blas_threads() == before
+
+
+def test_solves_in_several_threads_give_the_bits_of_one():
+    def found(seed):
+        image = Texture.random(seed).image((90, 100))
+        return correlate(image, np.roll(image, 1, axis=1), initial=(1, 0)).displacement.tobytes()
+
+    alone = [found(seed) for seed in range(6)]
+    with ThreadPoolExecutor(6) as callers:
+        assert list(callers.map(found, range(6))) == alone
 
 
 @pytest.mark.parametrize("way", sorted({"fork", "spawn"} & set(multiprocessing.get_all_start_methods())))

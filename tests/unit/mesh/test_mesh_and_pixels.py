@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pickle
 import re
 
 import naive_mesh
@@ -186,6 +187,18 @@ def test_the_size_of_the_elements_is_about_what_is_asked_for():
     assert mesh.areas == pytest.approx(25 * 25 / 2)
     outlined = Tri3Mesh.from_region(REGIONS["mask with a hole"], 13)
     assert np.median(np.sqrt(2 * outlined.areas)) == pytest.approx(13, rel=0.3)
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_a_mesh_under_which_things_are_kept_cannot_be_written_to(copied):
+    given = np.array([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]])
+    mesh = Tri3Mesh(nodes=given, elements=np.array([[0, 1, 2]]))
+    mesh = pickle.loads(pickle.dumps(mesh)) if copied else mesh
+    for name in ("nodes", "elements", "areas"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(mesh, name)[0] = 1
+    given[0] = 5  # the caller's own array stays writable, and is another one
+    assert mesh.nodes[0].tolist() == [0, 0]
 
 
 def test_neighbours_and_sums_at_the_nodes():
