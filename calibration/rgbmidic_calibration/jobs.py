@@ -197,7 +197,9 @@ def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float
 
 def _camera(frame: Mosaic | ChannelFrame) -> dict[str, Any]:
     """Camera settings of a calibration, from one of its frames."""
+    kind = "bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome"
     return {
+        "kind": kind,
         "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
         "black_level": float(frame.black_level.mean()),
         "white_level": frame.white_level,
