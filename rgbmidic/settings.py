@@ -121,7 +121,7 @@ class FrameSettings:
         if self.lights > 1 and (len(self.path) > 1 or self.kind != "monochrome"):
             raise ConfigurationError(
                 f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
-                'them in one series: state kind = "monochrome" and a single path'
+                f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}'
             )
         if self.last is not None and self.last < self.first:
             raise ConfigurationError(f"frames.last must be at least frames.first ({self.first}), not {self.last}")
