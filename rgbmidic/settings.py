@@ -1,7 +1,8 @@
-"""The settings of a test: frozen, read from TOML, validated once, here.
+"""The settings of a test: frozen, checked and normalised once, here, whether read from TOML or built in Python.
 
 Paths in the file are relative to the file. Only ``frames.path``, a region and, for colour frames,
-``calibration.file`` are needed; an unknown key is an error that names it.
+``calibration.file`` are needed; an unknown key is an error that names it. A value of numpy, a `Path` in place of a text
+and a single entry in place of a list of one are what they stand for, in a file as in Python.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache
-from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from pathlib import Path, PurePath
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from rgbmidic.errors import ConfigurationError
 
@@ -109,7 +110,7 @@ class FrameSettings:
     crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)
 
     def __post_init__(self) -> None:
-        _check_bounds(self, "frames")
+        _normalise(self, "frames")
         if not self.path or not all(self.path):
             raise ConfigurationError("frames.path must name the frame files")
         if len(self.path) > 1 and self.kind != "monochrome":
@@ -120,14 +121,16 @@ class FrameSettings:
         if self.lights > 1 and (len(self.path) > 1 or self.kind != "monochrome"):
             raise ConfigurationError(
                 f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
-                'them in one series: state kind = "monochrome" and a single path'
+                f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}'
             )
         if self.last is not None and self.last < self.first:
             raise ConfigurationError(f"frames.last must be at least frames.first ({self.first}), not {self.last}")
         if not self.reference or len(set(self.reference)) < len(self.reference):
             raise ConfigurationError(f"frames.reference must name different frames, not {list(self.reference)}")
-        if self.cfa is not None and self.cfa.upper() not in BAYER_PATTERNS:
-            raise ConfigurationError(f'frames.cfa must be one of {", ".join(BAYER_PATTERNS)}, not "{self.cfa}"')
+        if self.cfa is not None:
+            object.__setattr__(self, "cfa", self.cfa.upper())
+            if self.cfa not in BAYER_PATTERNS:
+                raise ConfigurationError(f'frames.cfa must be one of {", ".join(BAYER_PATTERNS)}, not "{self.cfa}"')
         if self.black_level is not None and self.white_level is not None and self.white_level <= self.black_level:
             raise ConfigurationError(
                 f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}"
@@ -152,7 +155,7 @@ class IlluminationSettings:
     normalise: float = _bounded(10.0, at_least=0)
 
     def __post_init__(self) -> None:
-        _check_bounds(self, "illumination")
+        _normalise(self, "illumination")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,7 +180,7 @@ class RegionSettings:
     holes: tuple[tuple[tuple[float, float], ...], ...] = ()
 
     def __post_init__(self) -> None:
-        _check_bounds(self, "region")
+        _normalise(self, "region")
         kinds = ["rectangle", "polygon", "mask"]
         if (stated := sum(getattr(self, kind) is not None for kind in kinds)) != 1:
             raise ConfigurationError(f"[region] needs exactly one of {', '.join(kinds)}; given are {stated}")
@@ -227,7 +230,7 @@ class WeightSettings:
     limit_deg: float | None = _bounded(None, above=0, below=180)
 
     def __post_init__(self) -> None:
-        _check_bounds(self, "weights")
+        _normalise(self, "weights")
         if (self.method == "geometry") != (self.geometry is not None):
             raise ConfigurationError('weights.method = "geometry" and weights.geometry = "SCENE.toml" go together')
         for key in ("height_map", "limit_deg"):
@@ -266,7 +269,7 @@ class SolverSettings:
     max_iterations: int = _bounded(50, at_least=1)
 
     def __post_init__(self) -> None:
-        _check_bounds(self, "solver")
+        _normalise(self, "solver")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -288,7 +291,7 @@ class ScaleSettings:
     frame_rate: float | None = _bounded(None, above=0)
 
     def __post_init__(self) -> None:
-        _check_bounds(self, "scale")
+        _normalise(self, "scale")
         if self.mm_per_pixel_std and self.mm_per_pixel is None:
             raise ConfigurationError(
                 "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing"
@@ -341,7 +344,7 @@ class ProbeSettings:
     rigid_motion: Literal["none", "tell", "remove"] = "none"
 
     def __post_init__(self) -> None:
-        _check_bounds(self, "probes")
+        _normalise(self, "probes")
         if 0 < self.window < 4:
             raise ConfigurationError(f"probes.window must be 0 or at least 4 frames, not {self.window}")
         for key in ("circles", "strain_gauges"):
@@ -397,6 +400,9 @@ class SetupSettings:
     operator: str | None = None
     notes: str | None = None
 
+    def __post_init__(self) -> None:
+        _normalise(self, "setup")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TestSettings:
@@ -432,7 +438,7 @@ class TestSettings:
     base: Path = field(default_factory=Path, metadata={"key": ""})
 
     def __post_init__(self) -> None:
-        _check_bounds(self, "")
+        _normalise(self, "")
         for number, crack in enumerate(self.cracks):
             if len(crack) < 2:
                 raise ConfigurationError(
@@ -461,18 +467,21 @@ class TestSettings:
             A section or key is unknown, missing, of the wrong type, out of range, or contradicts another.
         """
         base = Path(base).resolve()
-        sections = _sections(cls)
+        hints, sections = _hints(cast(Any, cls)), _sections(cls)
+        places = {_place(entry): entry.name for entry in fields(cls)}
         check_names(document, sections, "section", "the file")
         values: dict[str, Any] = {"base": base}
         for name, content in document.items():
             if not isinstance(content, Mapping):
                 raise ConfigurationError(f"[{name}] must be a section with keys, not {content!r}")
-            check_names(content, sections[name], "key", f"[{name}]")
-            given = {key: convert_value(content[key], sections[name][key], f"{name}.{key}", base) for key in content}
-            values |= _placed(cls, name, given)
-        missing = [entry.name for entry in fields(cls) if _is_required(entry) and entry.name not in values]
-        if missing:
-            raise ConfigurationError(f"the section [{missing[0]}] is missing")
+            if name in hints:
+                values[name] = read_section(hints[name], name, content, base)
+            else:
+                check_names(content, sections[name], "key", f"[{name}]")
+                values |= {places[name, key]: _from(base, content[key], sections[name][key]) for key in content}
+        for entry in fields(cls):
+            if _is_required(entry) and entry.name not in values:
+                raise ConfigurationError(f"the section [{entry.name}] is missing")
         return cls(**values)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:
@@ -494,9 +503,17 @@ class TestSettings:
 
 def read_section(kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".") -> _Section:
     """One section of the settings from its keys and plain values; errors as `TestSettings.from_mapping`."""
-    hints = get_type_hints(kind)
+    hints = _hints(cast(Any, kind))
     check_names(content, hints, "key", f"[{name}]")
-    return kind(**{key: convert_value(content[key], hints[key], f"{name}.{key}", Path(base)) for key in content})
+    for entry in fields(cast(Any, kind)):
+        if _is_required(entry) and entry.name not in content:
+            raise ConfigurationError(f"{name}.{entry.name} is missing")
+    return kind(**{key: _from(Path(base), content[key], hints[key]) for key in content})
+
+
+def _from(base: Path, value: Any, hint: Any) -> Any:
+    """A value of the file; where it names a file, from the folder that relative paths start from."""
+    return base / value if Path in (hint, *get_args(hint)) and isinstance(value, str | PurePath) else value
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -545,27 +562,15 @@ def _is_required(entry: Field[Any]) -> bool:
 
 def _sections(settings: type[TestSettings]) -> dict[str, dict[str, Any]]:
     """For every section its keys with the types of their values."""
-    hints = get_type_hints(settings)
+    hints = _hints(cast(Any, settings))
     sections: dict[str, dict[str, Any]] = {}
     for entry in fields(settings):
         section, key = _place(entry)
         if key:
             sections.setdefault(section, {})[key] = hints[entry.name]
         elif section:
-            sections[section] = get_type_hints(hints[entry.name])
+            sections[section] = _hints(hints[entry.name])
     return sections
-
-
-def _placed(settings: type[TestSettings], section: str, given: dict[str, Any]) -> dict[str, Any]:
-    """Values of a section as arguments of `TestSettings`: one settings object, or the fields that the keys name."""
-    hints = get_type_hints(settings)
-    if section not in hints:
-        places = {_place(entry): entry.name for entry in fields(settings)}
-        return {places[section, key]: value for key, value in given.items()}
-    missing = [entry.name for entry in fields(hints[section]) if _is_required(entry) and entry.name not in given]
-    if missing:
-        raise ConfigurationError(f"{section}.{missing[0]} is missing")
-    return {section: hints[section](**given)}
 
 
 def check_names(given: Iterable[str], allowed: Iterable[str], what: str, where: str) -> None:
@@ -587,10 +592,12 @@ _WORDS = {
 }
 
 
-def convert_value(value: Any, hint: Any, where: str, base: Path) -> Any:
-    """A value of the file as the type that the field states; what does not fit is an error that names the key."""
-    origin, kinds = get_origin(hint), get_args(hint)
-    if origin in (Union, UnionType):  # X | None: a file states no None; a number | a word
+def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> Any:
+    """A value as the type that a field states; what is not losslessly of it is an error that names the field."""
+    value, origin, kinds = _python(value), get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):  # X | None; a number | a word
+        if value is None and NoneType in kinds:
+            return None
         words = [word for kind in kinds[1:] if get_origin(kind) is Literal for word in get_args(kind)]
         if value in words:
             return value
@@ -604,13 +611,20 @@ def convert_value(value: Any, hint: Any, where: str, base: Path) -> Any:
         if value in kinds:
             return value
         raise ConfigurationError(f"{where} must be one of {', '.join(map(_quoted, kinds))}, not {_quoted(value)}")
-    if hint is Path and isinstance(value, str):
-        return base / value
-    if type(value) is int and abs(value) >= 2**63:
+    if isinstance(value, str | PurePath) and hint in (str, Path):
+        return str(value) if hint is str else Path(base) / value
+    if isinstance(value, int) and abs(value) >= 2**63:
         raise ConfigurationError(f"{where} is a number of {len(str(abs(value)))} digits: TOML has up to 2**63")
-    if (hint is float and type(value) is int) or type(value) is hint:
-        return hint(value)
-    raise ConfigurationError(f"{where} must be {_WORDS[hint]}, not {_quoted(value)}")
+    if isinstance(value, int | float if hint is float else hint) and isinstance(value, bool) == (hint is bool):
+        return value if is_dataclass(hint) else hint(value)
+    raise ConfigurationError(f"{where} must be {_WORDS.get(hint) or hint.__name__}, not {_quoted(value)}")
+
+
+def _python(value: Any) -> Any:
+    """Scalars and arrays of numpy as Python's, at any depth."""
+    if type(value).__module__ == "numpy":
+        value = value.tolist()
+    return tuple(map(_python, value)) if isinstance(value, list | tuple) else value
 
 
 def read_range(text: str, where: str) -> range:
@@ -632,23 +646,24 @@ _LONGEST = 100_000
 this is a thousand times that. A longer range is a slip, and took a minute and 3 GB until the frames refused it."""
 
 
-def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path) -> tuple[Any, ...]:
+def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path | str) -> tuple[Any, ...]:
     if kinds == (int, Ellipsis) and isinstance(value, str):
-        given = read_range(value, where)
-        if len(given) > _LONGEST:
-            raise ConfigurationError(f'{where} = "{value}" names {len(given)} frames; at most {_LONGEST} are allowed')
-        return tuple(given)
+        value = read_range(value, where)
+    if isinstance(value, range):
+        if len(value) > _LONGEST:
+            raise ConfigurationError(f"{where} names {len(value)} frames; at most {_LONGEST} are allowed")
+        value = tuple(value)
     if len(kinds) == 2 and kinds[1] is Ellipsis:
         entries = value if _depth(value) > _hint_depth(kinds[0]) else [value]  # a single one needs no brackets
         return tuple(convert_value(entry, kinds[0], where, base) for entry in entries)
-    if not isinstance(value, list | tuple) or len(value) != len(kinds):
+    if not isinstance(value, tuple) or len(value) != len(kinds):
         raise ConfigurationError(f"{where} must be {len(kinds)} values in brackets, not {_quoted(value)}")
     return tuple(convert_value(entry, kind, where, base) for entry, kind in zip(value, kinds, strict=True))
 
 
 def _depth(value: Any) -> int:
     """How deep lists are nested in a value; an empty one may be of any depth."""
-    return 1 + min(map(_depth, value), default=9) if isinstance(value, list | tuple) else 0
+    return 1 + min(map(_depth, value), default=9) if isinstance(value, tuple) else 0
 
 
 def _hint_depth(hint: Any) -> int:
@@ -656,7 +671,7 @@ def _hint_depth(hint: Any) -> int:
 
 
 def _quoted(value: Any) -> str:
-    return f'"{value}"' if isinstance(value, str) else repr(value)
+    return f'"{value}"' if isinstance(value, str) else repr(_plain(value))
 
 
 def _plain(value: Any) -> Any:
@@ -665,14 +680,13 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _check_bounds(settings: Any, section: str) -> None:
+def _normalise(settings: Any, section: str) -> None:
+    """Every field of settings in the type that it states and within its bounds; all settings begin with this."""
     hints = _hints(settings.__class__)
     for entry in fields(settings):
-        value = getattr(settings, entry.name)
-        where = entry.metadata.get("key", f"{section}.{entry.name}")
-        hint = hints[entry.name]
-        if value is not None and any(get_origin(kind) is Literal for kind in (hint, *get_args(hint)[:1])):
-            convert_value(value, hint, where, Path())
+        where = entry.metadata.get("key") or f"{section}.{entry.name}".lstrip(".")
+        value = convert_value(getattr(settings, entry.name), hints[entry.name], where)
+        object.__setattr__(settings, entry.name, value)
         for number in _numbers(value):
             if not math.isfinite(number):
                 raise ConfigurationError(f"{where} must be finite, not {number}")

@@ -41,7 +41,7 @@ class CaptureFiles:
     ) -> CaptureFiles:
         """Files that a pattern or folder names; `stated` is what the user says of them (its path is not used).
 
-        Pattern and levels that neither the files nor the user tell come from the `calibration`.
+        What neither the files nor the user tell comes from the `calibration`, which must agree with both.
 
         Raises
         ------

@@ -119,8 +119,8 @@ def calibration(result: Calibration, path: Path) -> None:
     """Print all that a calibration file tells."""
     console = _console()
     console.print(f"[bold]{escape(str(path))}[/]: {', '.join(_sections(result)) or 'empty'}")
-    camera = {"pattern": result.cfa, "black level": result.black_level, "white level": result.white_level}
-    told = [f"{name} {value}" for name, value in camera.items() if value is not None]
+    names = {"kind": "kind", "cfa": "pattern", "black_level": "black level", "white_level": "white level"}
+    told = [f"{word} {value}" for name, word in names.items() if (value := getattr(result, name)) is not None]
     told += [f"{result.shape[1]} x {result.shape[0]} px"] if result.shape else []
     console.print(f"camera: {', '.join(told) or 'nothing stated'}")
     if result.crosstalk is not None:

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from rgbmidic.command import read_shape
 from rgbmidic.errors import ConfigurationError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration.blocks import BlockMeans, block_means
@@ -96,9 +96,8 @@ def calibrate_crosstalk(
 ) -> tuple[Calibration, CrosstalkEstimate]:
     """Crosstalk section from capture files: patterns by light, pattern of the dark frames, what is stated of them."""
     found, dark_files = find_groups(lights, dark, told)
-    first: list[Mosaic | ChannelFrame] = []
-    means = {name: _reduce(files, block, first) for name, files in found.items()}
-    dark_means = _reduce(dark_files, block, first) if dark_files else []
+    means = {name: _reduce(files, block) for name, files in found.items()}
+    dark_means = _reduce(dark_files, block) if dark_files else []
     groups = [*found.values(), *([dark_files] if dark_files else [])]
     labels = {group.role.removeprefix("light "): group.labels for group in groups}
     estimate = estimate_crosstalk(means, dark_means, order=order, allow=allow, labels=labels)
@@ -113,7 +112,7 @@ def calibrate_crosstalk(
     calibration = Calibration(
         crosstalk=estimate.crosstalk,
         provenance={"crosstalk": provenance("crosstalk", groups, details)},
-        **_camera(first[0]),
+        **_camera(groups[0]),
     )
     return calibration, estimate
 
@@ -138,11 +137,10 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
     estimate = photon_transfer(dark_stack, stacks)
     all_files = [dark_files, *(files for files, _ in groups)]
     details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in groups]}
-    frame = next(dark_files.frames())
     return Calibration(
         camera_noise=estimate.camera_noise,
         provenance={"noise": provenance("noise", all_files, details)},
-        **_camera(frame),
+        **_camera(dark_files),
     ), estimate
 
 
@@ -166,11 +164,10 @@ def calibrate_registration(
         "element_size": element_size,
         "residual_rms_px": {match.name: match.rms for match in estimate.matches},
     }
-    frame = next(groups[0].frames())
     return Calibration(
         registration=estimate.registration,
         provenance={"registration": provenance("registration", groups, details)},
-        **_camera(frame),
+        **_camera(groups[0]),
     ), estimate
 
 
@@ -195,21 +192,20 @@ def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float
     return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, told).by_folder()]
 
 
-def _camera(frame: Mosaic | ChannelFrame) -> dict[str, Any]:
-    """Camera settings of a calibration, from one of its frames."""
+def _camera(files: CaptureFiles) -> dict[str, Any]:
+    """Camera settings of a calibration, from the first of its frames; levels that nobody stated or tells stay open."""
+    told, frame = files.series.lights[0][0].told(0), next(files.frames())
+    levels = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
+    said = {name for name in levels for source in (told, files.stated) if getattr(source, name) is not None}
+    kind = "bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome"
     return {
+        "kind": kind,
         "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
-        "black_level": float(frame.black_level.mean()),
-        "white_level": frame.white_level,
+        **{name: level for name, level in levels.items() if name in said},
         "shape": (frame.values.shape[-2], frame.values.shape[-1]),
     }
 
 
-def _reduce(files: CaptureFiles, block: int, first: list[Mosaic | ChannelFrame]) -> list[BlockMeans]:
-    """Block averages of every file; the first frame of all is kept for its levels."""
-    means = []
-    for frame in files.frames():
-        if not first:
-            first.append(frame)
-        means.append(block_means(frame, block=block))
-    return means
+def _reduce(files: CaptureFiles, block: int) -> list[BlockMeans]:
+    """Block averages of every file."""
+    return [block_means(frame, block=block) for frame in files.frames()]

@@ -12,7 +12,7 @@ from rgbmidic.illumination.calibration import Calibration
 __all__ = ["merge_files"]
 
 SECTIONS = ("crosstalk", "camera_noise", "noise", "registration")
-CAMERA = ("cfa", "black_level", "white_level", "shape")
+CAMERA = ("kind", "cfa", "black_level", "white_level", "shape")
 
 
 def merge_files(paths: Sequence[Path]) -> Calibration:

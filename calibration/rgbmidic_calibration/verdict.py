@@ -76,7 +76,8 @@ def check_calibration(
     together
         Patterns of captures with several lights on, by the lights' names joined by ``+``.
     told
-        What is stated of the files; pattern and levels that neither this nor the files tell come from the calibration.
+        What is stated of the files; it, the files and the calibration must agree, and the calibration fills in what
+        neither tells.
     limits
         What may be left.
     region
@@ -85,6 +86,7 @@ def check_calibration(
     limits = limits or Limits()
     calibration = Calibration.read(path)
     files = _find(lights, dark, together, told, calibration)
+    calibration = calibration.cropped(None, next(iter(files.lights.values())).series.shape)
     warnings, skipped = _reused(calibration, files), []
     dark_stack = stack_frames(files.dark.frames(), drifts=False, name="the dark frames") if files.dark else None
     stacks = {name: stack_frames(group.frames(), name=group.role) for name, group in files.lights.items()}

@@ -1,6 +1,7 @@
 """The MIDIC solve: one displacement field from k weighted image pairs (paper, section 3.2)."""
 
 from rgbmidic.correlation.correlate import correlate
+from rgbmidic.correlation.fill import fill
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
@@ -16,6 +17,7 @@ __all__ = [
     "Start",
     "Status",
     "correlate",
+    "fill",
     "solve",
     "track",
 ]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.correlation.fill import fill
 from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.solution import Solution
@@ -60,7 +61,7 @@ def correlate(
     statistics
         Weight every light by the inverse variance of its own residual around each pixel, robustly.
     **options
-        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness,
+        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, fill,
         tolerance, max_iterations.
 
     Returns
@@ -90,8 +91,10 @@ def correlate(
     second = Deformed.prepare(g, as_weights(deformed_weights, f.shape, "deformed_weights"), prefilter=solver.prefilter)
     start = initial_displacement(initial, len(mesh.nodes))
     if start is None:
-        return track(first, second, Start(displacement=None), solver, statistics=statistics)
-    return solve(first, second, start, solver, statistics=statistics)
+        solution = track(first, second, Start(displacement=None), solver, statistics=statistics)
+    else:
+        solution = solve(first, second, start, solver, statistics=statistics)
+    return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 
 def _solver_settings(options: dict[str, Any]) -> SolverSettings:

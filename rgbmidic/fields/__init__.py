@@ -3,7 +3,6 @@
 from rgbmidic.fields.covariance import NodalCovariance
 from rgbmidic.fields.differences import difference_std, frame_covariance, reference_share
 from rgbmidic.fields.evaluate import at_nodes, at_pixels, field_rms
-from rgbmidic.fields.fill import fill
 from rgbmidic.fields.gauges import Gauge, StrainGauge
 from rgbmidic.fields.high_pass import SIGMA, high_pass
 from rgbmidic.fields.history import History, Nodal, Probe
@@ -38,7 +37,6 @@ __all__ = [
     "column",
     "difference_std",
     "field_rms",
-    "fill",
     "frame_covariance",
     "high_pass",
     "make_probe",

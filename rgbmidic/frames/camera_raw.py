@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -50,8 +50,6 @@ class CameraRaw(FrameSource):
     Orientation and default crop of the file are not applied: pixels stay where they are on the sensor. Refused are
     files that LibRaw cannot decode, images already demosaiced, and colour filter arrays that are no Bayer pattern.
     """
-
-    tells_camera: ClassVar[bool] = True
 
     def _shape(self) -> tuple[int, int]:
         with _libraw(self.path) as raw:

@@ -47,8 +47,6 @@ Stored as the steps from one code to the next; the codes above 1014, white, are 
 class CineFile(Movie):
     """A Phantom .cine file. Flips and rotation are settings of the camera's viewer and left to it."""
 
-    tells_camera = True
-
     def _recording(self) -> Recording:
         return _header(self.path).recording
 

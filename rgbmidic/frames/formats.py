@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NoReturn, Protocol
+from typing import Literal, NoReturn
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
 from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
-from rgbmidic.frames.data import ChannelFrame, Mosaic, shift_cfa
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.hdf5 import HDF5_ENDINGS, Hdf5File, split_dataset
 from rgbmidic.frames.headerless import HeaderlessFile, is_headerless
 from rgbmidic.frames.mraw import MRAW_ENDINGS, MrawFile
@@ -18,30 +18,15 @@ from rgbmidic.frames.npy import NpyFile
 from rgbmidic.frames.png import PngFile
 from rgbmidic.frames.seq import SeqFile
 from rgbmidic.frames.source import FrameSource
+from rgbmidic.frames.stored import Camera
 from rgbmidic.frames.tiff import TiffFile
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.frames.tiff_stack import TiffStack, is_tiff_stack
 from rgbmidic.settings import FrameKind, FrameSettings
 
-__all__ = ["FORMATS", "FRAME_ENDINGS", "Camera", "FrameFormat", "advice", "open_source", "read_frame", "reader_name"]
+__all__ = ["FORMATS", "FRAME_ENDINGS", "FrameFormat", "advice", "open_source", "read_frame", "reader_name"]
 
 SampleType = Literal["uint8", "uint16", ">u2"]
-
-
-class Camera(Protocol):
-    """Who knows pattern and levels of the camera: a `Calibration`."""
-
-    @property
-    def cfa(self) -> str | None:
-        """Bayer pattern."""
-
-    @property
-    def black_level(self) -> float | None:
-        """Black level in DN."""
-
-    @property
-    def white_level(self) -> float | None:
-        """White level in DN."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,31 +175,16 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
     stated
         What the user says of it (`path` and `reference` are not used); it must agree with what the file tells.
     camera
-        Pattern and levels, as a calibration knows them, where neither the file nor the user tells them.
+        What a calibration knows of it; it must agree with both, and fills in what neither tells.
     """
     path = Path(path)
     source = next((known.source for known in FORMATS if known.recognises(path, stated)), _UnknownFile)
-    if camera is not None and not source.tells_camera:
-        stated = replace(
-            stated,
-            cfa=stated.cfa or (_pattern(camera, stated) if stated.kind in (None, "bayer") else None),
-            black_level=camera.black_level if stated.black_level is None else stated.black_level,
-            white_level=camera.white_level if stated.white_level is None else stated.white_level,
-        )
-    return source(path=path, stated=stated)
+    return source(path=path, stated=stated, camera=camera)
 
 
 def reader_name(source: FrameSource) -> str:
     """Name of the format that a source is read as."""
     return next((known.name for known in FORMATS if known.source is type(source)), "unknown")
-
-
-def _pattern(camera: Camera, stated: FrameSettings) -> str | None:
-    """The camera's pattern at the first pixel of a frame that is cropped from the camera's."""
-    if camera.cfa is None or stated.crop_origin is None:
-        return camera.cfa
-    column, row = stated.crop_origin
-    return shift_cfa(camera.cfa, row, column)
 
 
 def read_frame(

@@ -15,10 +15,11 @@ from pathlib import Path
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.formats import FRAME_ENDINGS, Camera, advice, open_source
+from rgbmidic.frames.formats import FRAME_ENDINGS, advice, open_source
 from rgbmidic.frames.hdf5 import split_dataset
 from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.source import FrameSource, file_fingerprint
+from rgbmidic.frames.stored import Camera
 from rgbmidic.settings import FrameSettings
 
 logger = logging.getLogger(__name__)
@@ -154,7 +155,7 @@ def open_series(
     base
         Folder that relative paths start from.
     camera
-        Pattern and levels, as a calibration knows them, where neither the files nor the settings tell them.
+        What a calibration knows of them; it must agree with files and settings, and fills in what neither tells.
     in_order
         Whether the frames follow one another in time, so that numbers missing in their names or in the camera's count
         are told (as a warning) and kept as gaps in `FrameSeries.numbers`.

@@ -6,15 +6,15 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, wraps
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import TypeVar
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.recording import Recording
-from rgbmidic.frames.stored import StoredFrame, damaged, raw_frame
+from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings
 
 __all__ = ["FrameSource", "Movie", "file_fingerprint", "file_hash", "remembered"]
@@ -36,13 +36,13 @@ class FrameSource(ABC):
         The file; it need not exist before it is read.
     stated
         What the user says of it.
-    tells_camera
-        Whether the file itself tells pattern and levels.
+    camera
+        What a calibration knows of it.
     """
 
     path: Path
     stated: FrameSettings
-    tells_camera: ClassVar[bool] = False
+    camera: Camera | None = field(default=None, compare=False, repr=False)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -74,11 +74,12 @@ class FrameSource(ABC):
         Raises
         ------
         FrameError
-            The file is missing, damaged, truncated, already demosaiced, or contradicts a statement (both are named).
+            The file is missing, damaged, truncated, already demosaiced, or contradicts a statement or the calibration
+            (both are named).
         IndexError
             There is no such frame.
         """
-        return raw_frame(self.told(index), self.stated, self.path)
+        return raw_frame(self.told(index), self.stated, self.path, self.camera)
 
     def told(self, index: int) -> StoredFrame:
         """The samples of frame `index` with what the file alone tells of them; raises as `read` does."""

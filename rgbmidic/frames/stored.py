@@ -1,19 +1,21 @@
-"""What a file tells of a frame, and how what the user states joins it."""
+"""What a file tells of a frame, and how what the user states and a calibration knows join it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from rgbmidic.errors import FrameError, InputError
-from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
+from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, shift_cfa
 from rgbmidic.settings import FrameKind, FrameSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
-__all__ = ["CHECKED_FROM", "MAXIMUM_BYTES", "StoredFrame", "check_size", "damaged", "raw_frame"]
+__all__ = ["CHECKED_FROM", "MAXIMUM_BYTES", "Camera", "StoredFrame", "check_size", "damaged", "raw_frame"]
 
 MAXIMUM_BYTES = 2 * 2**30
 """Largest frame that is unpacked: 1 Gpx of 16 bit, where large sensors have 150 Mpx, or 400 Mpx by shifting."""
@@ -27,7 +29,36 @@ in a seventeenth, but empty pictures, which bombs are, in a thousandth.
 
 _T = TypeVar("_T")
 _BLACK_TOLERANCE = 1.0
-"""DN: a file's black levels differ by position, and LibRaw rounds some; less than a grey level is no contradiction."""
+"""DN: a file's black levels differ by position, and LibRaw rounds some; less than a grey level is no contradiction.
+Between two files that both round, captures and frames, a whole one is none."""
+
+
+class Camera(Protocol):
+    """Who knows the camera that frames come from: a `Calibration`; None where it does not say."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+    @property
+    def kinds(self) -> tuple[FrameKind, ...]:
+        """The kinds of frames that it may be of."""
+
+    @property
+    def cfa(self) -> str | None:
+        """Bayer pattern of the first pixels of its own frames."""
+
+    @property
+    def black_level(self) -> float | None:
+        """Black level in DN, the mean over the positions."""
+
+    @property
+    def white_level(self) -> float | None:
+        """White level in DN."""
+
+    @property
+    def shape(self) -> tuple[int, int] | None:
+        """Rows and columns of its own frames."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,21 +136,36 @@ def check_size(path: Path, *, needed: int, stored: int) -> None:
         raise FrameError(f"{path} announces {told}: no frame of a camera can be compressed so much")
 
 
-def raw_frame(stored: StoredFrame, stated: FrameSettings, path: Path) -> Mosaic | ChannelFrame:
-    """The checked frame from what the file tells and what the user states.
+def raw_frame(
+    stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None = None
+) -> Mosaic | ChannelFrame:
+    """The checked frame from what the file tells, what the user states and what a calibration knows.
+
+    Every frame passes here, and nowhere else do the three meet: docs/test-file.md has the table. Each fills in what
+    those before it leave open.
 
     Raises
     ------
     FrameError
-        Both say something and do not agree, or something needed is said by neither.
+        Two of them say something and do not agree, or something needed is said by none.
     """
-    _agreed("shape", stated.shape, stored.values.shape[:2], path)
-    _agreed("dtype", stated.dtype and np.dtype(stated.dtype).newbyteorder("=").name, stored.values.dtype.name, path)
-    stored = _grey_saved_as_colour(stored, stated.kind)
-    kind: FrameKind = _agreed("kind", stated.kind, stored.kind, path) or "bayer"
-    white = _white_level(stored, stated.white_level, path)
-    black = _black_level(stored, stated.black_level, path)
-    cfa = _pattern(stored, stated.cfa, kind, path)
+    _agreed("shape", [(None, stated.shape), (path, stored.values.shape[:2])])
+    _agreed("dtype", [(None, _native(stated.dtype)), (path, stored.values.dtype.name)])
+    known = camera.kinds if camera else ()
+    stored = _grey_saved_as_colour(stored, stated.kind or (known[0] if len(known) == 1 else None))
+    kind = _agreed("kind", [(None, stated.kind), (path, stored.kind)])
+    if camera and kind and kind not in known:
+        raise _differ("kind", (path if stated.kind is None else None, kind), (camera.name, " or ".join(known)))
+    kind = kind or (*known, "bayer")[0]
+    if (kind == "rgb") != (stored.values.ndim == 3):
+        who = None if stated.kind or camera is None else camera.name
+        raise FrameError(f"{_says(who, 'kind', kind)}, but {path} has {'one channel' if kind == 'rgb' else 'three'}")
+    if kind != "bayer" and stated.cfa is not None:
+        told = f"{path} is read as {kind}, which has no colour filter array"
+        raise FrameError(f"cfa is stated as {stated.cfa}, but {told}")
+    cfa = _pattern(stored, stated, path, camera) if kind == "bayer" else None
+    white = _white_level(stored, stated, path, camera)
+    black = _black_level(stored, stated, path, camera)
     try:
         if cfa is not None:
             return Mosaic(values=stored.values, cfa=cfa, black_level=black, white_level=white)
@@ -129,50 +175,83 @@ def raw_frame(stored: StoredFrame, stated: FrameSettings, path: Path) -> Mosaic 
         raise FrameError(f"{path}: {error}") from None
 
 
-def _agreed(name: str, stated: _T | None, told: _T | None, path: Path) -> _T | None:
-    if stated is not None and told is not None and stated != told:
-        raise FrameError(f"{name} is stated as {stated}, but {path} says {told}")
-    return told if stated is None else stated
+_Said = tuple[Path | str | None, _T | None]
+"""Who says something, None for the user (in TEST.toml or an option), and what; None: nothing."""
+
+
+def _agreed(name: str, said: Sequence[_Said[_T]]) -> _T | None:
+    """What everybody who says something says, the first in front."""
+    there = [(who, value) for who, value in said if value is not None]
+    for first, second in combinations(there, 2):
+        if first[1] != second[1]:
+            raise _differ(name, first, second)
+    return there[0][1] if there else None
+
+
+def _differ(name: str, first: _Said[Any], second: _Said[Any]) -> FrameError:
+    return FrameError(f"{_says(first[0], name, first[1])}, but {second[0]} says {_in_words(second[1])}")
+
+
+def _says(who: Path | str | None, name: str, value: Any) -> str:
+    return f"{name} is stated as {_in_words(value)}" if who is None else f"{who} says {name} {_in_words(value)}"
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return ", ".join(map(_in_words, (np.unique(value) if np.ptp(value) == 0 else value.ravel()).tolist()))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _native(dtype: str | None) -> str | None:
+    return dtype and np.dtype(dtype).newbyteorder("=").name
 
 
 def _grey_saved_as_colour(stored: StoredFrame, kind: FrameKind | None) -> StoredFrame:
-    """One channel out of three identical ones, where the user states that the frame has only one."""
+    """One channel out of three identical ones, where it is known that the frame has only one."""
     first = stored.values[..., :1]
     if kind not in ("bayer", "monochrome") or stored.kind != "rgb" or not (stored.values == first).all():
         return stored
     return StoredFrame(values=first[..., 0], bits=stored.bits)
 
 
-def _white_level(stored: StoredFrame, stated: float | None, path: Path) -> float:
-    white = _agreed("white_level", stated, stored.white_level, path)
+def _white_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> float:
+    said: list[_Said[float]] = [(None, stated.white_level), (path, stored.white_level)]
+    said += [(camera.name, camera.white_level)] if camera else []
+    white = _agreed("white_level", said)
     largest = float(2**stored.bits - 1 if stored.bits else np.iinfo(stored.values.dtype).max)
     if white is not None and white > largest:
-        raise FrameError(f"white_level is stated as {white}, but the samples of {path} end at {largest:.0f}")
+        who = next(who for who, value in said if value is not None)
+        raise FrameError(f"{_says(who, 'white_level', white)}, but the samples of {path} end at {largest:.0f}")
     return largest if white is None else white
 
 
-def _black_level(stored: StoredFrame, stated: float | None, path: Path) -> FloatArray:
-    told = stored.black_level
-    if told is None:
-        return np.full((1, 1), 0.0 if stated is None else stated)
-    if stated is not None and not (np.abs(told - stated) < _BLACK_TOLERANCE).all():
-        raise FrameError(f"black_level is stated as {stated}, but {path} says {told.ravel().tolist()}")
-    return told
+def _black_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> FloatArray:
+    told, user, known = stored.black_level, stated.black_level, camera.black_level if camera else None
+    if told is not None and user is not None and not (np.abs(told - user) < _BLACK_TOLERANCE).all():
+        raise _differ("black_level", (None, user), (path, told))
+    if camera and known is not None:
+        if user is not None and abs(user - known) >= _BLACK_TOLERANCE:
+            raise _differ("black_level", (None, user), (camera.name, known))
+        if told is not None and abs(told.mean() - known) > _BLACK_TOLERANCE:  # whole numbers both, rounded apart
+            raise _differ("black_level", (path, told), (camera.name, known))
+    level = next((value for value in (user, known) if value is not None), 0.0)
+    return np.full((1, 1), level) if told is None else told
 
 
-def _pattern(stored: StoredFrame, stated: str | None, kind: FrameKind, path: Path) -> str | None:
-    """Bayer pattern of a mosaic; None for a frame without a colour filter array."""
-    if kind == "bayer":
-        cfa = _agreed("cfa", stated and stated.upper(), stored.cfa, path)
-        if cfa is None:
-            raise FrameError(
-                f"{path} does not tell its colour filter array: state cfa ({', '.join(BAYER_PATTERNS)}), or kind "
-                '"monochrome" where the camera has none'
-            )
-        return cfa
-    if stated is not None:
-        raise FrameError(f"cfa is stated as {stated}, but {path} is read as {kind}, which has no colour filter array")
-    if (kind == "rgb") != (stored.values.ndim == 3):
-        told = "three channels" if stored.values.ndim == 3 else "one"
-        raise FrameError(f'kind is stated as "{kind}", but {path} has {told}')
-    return None
+def _pattern(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> str:
+    """Bayer pattern of a mosaic; a camera's holds where the frames begin in its own."""
+    known, who, origin = camera.cfa if camera else None, camera.name if camera else "", stated.crop_origin
+    placed = origin is not None or camera is None or camera.shape in (None, stored.values.shape)
+    if known is not None and origin is not None:
+        known, who = shift_cfa(known, origin[1], origin[0]), f"{who}, at frames.crop_origin = {list(origin)},"
+    hint = "" if placed else "; if the camera cropped the frames, state frames.crop_origin = [x, y]"
+    try:
+        cfa = _agreed("cfa", [(None, stated.cfa), (path, stored.cfa), (who, known)])
+    except FrameError as error:
+        raise FrameError(f"{error}{hint}") from None
+    if cfa is None or not (placed or stated.cfa or stored.cfa):
+        raise FrameError(
+            f"{path} does not tell its colour filter array: state cfa ({', '.join(BAYER_PATTERNS)}), or kind "
+            f'"monochrome" where the camera has none{hint}'
+        )
+    return cfa

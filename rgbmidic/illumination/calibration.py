@@ -29,11 +29,15 @@ from rgbmidic.illumination.camera_noise import CameraNoise
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.registration import Registration
+from rgbmidic.settings import FrameKind
 
 __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk"]
 
 SCHEMA_NAME = "rgbmidic-calibration"
 SCHEMA_VERSION = 1
+
+_PLANES = {"bayer": 4, "rgb": 3, "monochrome": 1}
+_CHANNELS = {"bayer": 3, "rgb": 3, "monochrome": 1}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,10 +52,12 @@ class Calibration:
         All figures of the photon transfer measurement, per colour plane; `noise` is its summary.
     registration
         Lateral registration of the lights; of the same lights, in the same order, as the crosstalk.
-    cfa, black_level, white_level
-        The camera settings of the captures, where they were stated or told by the files.
+    kind, cfa, black_level, white_level
+        The camera settings of the captures, as far as they are known; the black level is the mean over the positions.
     shape
         Rows and columns of the captures.
+    name
+        What messages call it: its file.
     provenance
         Inputs with their hashes, date, software version, by section; kept as written.
     extra
@@ -62,12 +68,14 @@ class Calibration:
     noise: NoiseModel | None = None
     camera_noise: CameraNoise | None = None
     registration: Registration | None = None
+    kind: FrameKind | None = None
     cfa: str | None = None
     black_level: float | None = None
     white_level: float | None = None
     shape: tuple[int, int] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
+    name: str = field(default="the calibration", compare=False)
 
     def __post_init__(self) -> None:
         if self.crosstalk and self.registration and self.crosstalk.lights != self.registration.lights:
@@ -77,6 +85,27 @@ class Calibration:
             )
         if self.noise is None and self.camera_noise is not None:
             object.__setattr__(self, "noise", self.camera_noise.model)
+        if not self.kinds:
+            planes = f"noise of the planes {' '.join(self.camera_noise.planes)}" if self.camera_noise else "no noise"
+            crosstalk = f"a crosstalk of {len(self.crosstalk.matrix)} channels" if self.crosstalk else "no crosstalk"
+            raise CalibrationError(
+                f"it is of frames of two kinds: kind {self.kind}, pattern {self.cfa}, {planes}, {crosstalk}"
+            )
+
+    @property
+    def kinds(self) -> tuple[FrameKind, ...]:
+        """The kinds of frames that it may be of, by all that it holds: one, or more where that leaves it open."""
+        planes = len(self.camera_noise.planes) if self.camera_noise else 0
+        channels = len(self.crosstalk.matrix) if self.crosstalk else 0
+        possible: tuple[FrameKind, ...] = ("bayer", "rgb", "monochrome")
+        return tuple(
+            kind
+            for kind in possible
+            if self.kind in (None, kind)
+            and (self.cfa is None or kind == "bayer")
+            and planes in (0, _PLANES[kind])
+            and channels in (0, _CHANNELS[kind])
+        )
 
     def cropped(self, origin: tuple[int, int] | None, shape: tuple[int, int]) -> Calibration:
         """The calibration for frames that were cropped out of those it was made with.
@@ -155,19 +184,23 @@ class Calibration:
                 f"{SCHEMA_VERSION}. Make the file again with rgbmidic-calibrate"
             )
         try:
-            return cls._from_document(document)
+            return cls._from_document(document, str(path))
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             reason = f"missing key {error}" if isinstance(error, KeyError) else error
             raise CalibrationError(f"{path} is damaged: {reason}") from None
 
     @classmethod
-    def _from_document(cls, document: dict[str, Any]) -> Calibration:
+    def _from_document(cls, document: dict[str, Any], name: str) -> Calibration:
         known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
         camera, noise = (read_section(document, name) or {} for name in ("camera", "noise"))
         if (cfa := camera.get("cfa")) is not None and cfa not in BAYER_PATTERNS:
             raise ValueError(f"camera.cfa is {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
+        if (kind := camera.get("kind")) not in (None, *_PLANES):
+            raise ValueError(f"camera.kind is {kind!r}; allowed are {', '.join(_PLANES)}")
         shape = camera.get("shape")
         return cls(
+            name=name,
+            kind=kind,
             crosstalk=read_crosstalk(read_section(document, "crosstalk")),
             noise=NoiseModel(gain=read_positive(noise, "gain"), read_noise=read_positive(noise, "read_noise"))
             if noise
@@ -185,7 +218,7 @@ class Calibration:
     def to_document(self) -> dict[str, Any]:
         """The JSON document, as plain dictionaries, lists and numbers."""
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION}
-        camera: dict[str, Any] = {"cfa": self.cfa, "black_level": self.black_level, "white_level": self.white_level}
+        camera = {name: getattr(self, name) for name in ("kind", "cfa", "black_level", "white_level")}
         camera["shape"] = None if self.shape is None else list(self.shape)
         document["camera"] = {key: value for key, value in camera.items() if value is not None}
         if self.crosstalk is not None:

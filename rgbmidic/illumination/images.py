@@ -58,20 +58,26 @@ class IlluminationImages:
         object.__setattr__(self, "valid", valid)
 
     @classmethod
-    def in_succession(cls, frames: Sequence[LinearChannels]) -> IlluminationImages:
+    def in_succession(cls, frames: Sequence[LinearChannels], names: Sequence[str] = ()) -> IlluminationImages:
         """Lights fired one after the other before a monochrome camera, from one frame (1, H, W) of each.
 
         Raises
         ------
         InputError
-            The frames have different shapes.
+            The frames have different shapes, or the calibration that `names` come from is of another number of lights.
         """
+        if names and len(names) != len(frames):
+            raise InputError(
+                f"the frames show {len(frames)} lights in succession (frames.path or frames.lights), but the "
+                f"calibration is of {len(names)}: {', '.join(names)}"
+            )
         if len(shapes := {frame.values.shape for frame in frames}) > 1:
             raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")
         return cls(
             values=np.concatenate([frame.values for frame in frames]),
             valid=np.concatenate([frame.valid for frame in frames]),
-            names=("light",) if len(frames) == 1 else tuple(f"light {i + 1}" for i in range(len(frames))),
+            names=tuple(names)
+            or (("light",) if len(frames) == 1 else tuple(f"light {i + 1}" for i in range(len(frames)))),
             full_scale=frames[0].full_scale,
         )
 

@@ -167,8 +167,9 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
 def _separated(settings: TestSettings) -> list[FloatImage]:
     """The lights (k, H, W) of every frame."""
     assert settings.calibration_file is not None
-    separation = Separation(calibration=Calibration.read(settings.calibration_file))
-    frames = open_series(settings.frames, settings.base)
+    calibration = Calibration.read(settings.calibration_file)
+    separation = Separation(calibration=calibration)
+    frames = open_series(settings.frames, settings.base, calibration)
     return [separation(frames.read(index)).values for index in range(len(frames))]
 
 

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation import Deformed, Solution, Start, Status
+from rgbmidic.correlation import Deformed, Solution, Start, Status, fill
 from rgbmidic.correlation.light_levels import brightness_change
 from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.errors import FrameError, RgbmidicError
-from rgbmidic.fields import fill
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.raw_samples import exposure_fault
 from rgbmidic.pipeline.separation import correlated

@@ -55,14 +55,14 @@ class Separation:
         known = self.calibration or Calibration()
         linear = [linearise(frame, known.noise) for frame in frames]
         if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
-            return IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)])
-        if len(linear) > 1:
+            names = known.registration.lights if known.registration else ()
+            images = IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)], names)
+        elif len(linear) > 1:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
-        crosstalk, (only,) = self._crosstalk(), linear
-        if isinstance(only, LinearMosaic):
-            images = separate(only, crosstalk, self.demosaic, texture=self.texture)
+        elif isinstance(only := linear[0], LinearMosaic):
+            images = separate(only, self._crosstalk(), self.demosaic, texture=self.texture)
         else:
-            images = unmix(only, crosstalk)
+            images = unmix(only, self._crosstalk())
         return images if known.registration is None else align(images, known.registration)
 
     def reference(self, first: RawState, others: Iterable[RawState] = ()) -> tuple[IlluminationImages, Separation]:

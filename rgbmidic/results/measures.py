@@ -51,11 +51,16 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     there = result.finished
     stamps, numbers = result.time_ns[there], result.number[there]
     if (stamps == UNKNOWN_TIME).any():
-        rate = scale.frame_rate or result.provenance.get("frame_rate")
+        own = result.provenance.get("frame_rate")
+        rate = scale.frame_rate or own
         seconds = numbers / rate if rate else None
+        if own:
+            _compare(own, scale.frame_rate, "the camera was set to %.6g: the former is taken")
     else:
         seconds = stamps * 1e-9
-        _compare(seconds, numbers, scale.frame_rate)
+        if len(seconds) > 1:
+            own = float(np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)))
+            _compare(own, scale.frame_rate, "the frames' own times %.6g: these are taken")
     if seconds is None:
         return None
     times = np.full(len(result), np.nan)
@@ -63,14 +68,10 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     return times
 
 
-def _compare(seconds: FloatArray, numbers: FloatArray, stated: float | None) -> None:
-    """Tell where a stated frame rate is not that of the stamps."""
-    if stated and len(seconds) > 1:
-        own = float(np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)))
-        if abs(own / stated - 1) > _DIFFERENT:
-            logger.warning(
-                "scale.frame_rate states %g frames per second, the frames' own times %.6g: these are taken", stated, own
-            )
+def _compare(own: float, stated: float | None, told: str) -> None:
+    """Tell where a stated frame rate is not that of the files."""
+    if stated and abs(own / stated - 1) > _DIFFERENT:
+        logger.warning(f"scale.frame_rate states %g frames per second, {told}", stated, own)
 
 
 def exposure(result: Result) -> float | None:

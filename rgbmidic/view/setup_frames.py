@@ -52,7 +52,10 @@ class Footage:
         calibration = Calibration.read(draft.file.parent / file) if isinstance(file, str) else None
         series = open_series(draft.frames, draft.file.parent, calibration)
         first = series.read(0)[0]
-        return cls(series=series, calibration=calibration, shape=(first.values.shape[-2], first.values.shape[-1]))
+        shape = first.values.shape[-2], first.values.shape[-1]
+        if calibration is not None:
+            calibration = calibration.cropped(draft.frames.crop_origin, shape)
+        return cls(series=series, calibration=calibration, shape=shape)
 
     def raw(self, index: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
         """A raw frame as a picture (H, W), and where it is saturated; errors as `FrameSeries.read`."""

@@ -10,9 +10,8 @@ import pytest
 from textures import Texture
 
 from rgbmidic import NodeStatus, Region, Tri3Mesh, correlate
-from rgbmidic.correlation import Deformed, Reference, Start, track
+from rgbmidic.correlation import Deformed, Reference, Start, fill, track
 from rgbmidic.correlation.images import as_light_stack
-from rgbmidic.fields import fill
 from rgbmidic.settings import SolverSettings
 
 SHAPE = (240, 320)

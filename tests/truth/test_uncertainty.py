@@ -11,8 +11,8 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic import correlate
-from rgbmidic.correlation import NodeStatus, Solution
-from rgbmidic.fields import at_nodes, field_rms, fill
+from rgbmidic.correlation import NodeStatus, Solution, fill
+from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import linearise
 from rgbmidic.illumination.separate import separate

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
+import rgbmidic.settings
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings import (
     BAYER_PATTERNS,
     FrameSettings,
     IlluminationSettings,
+    ProbeSettings,
     RegionSettings,
     ScaleSettings,
+    SetupSettings,
     SolverSettings,
     TestSettings,
     WeightSettings,
@@ -243,8 +247,142 @@ _settings = st.builds(
 )
 
 
-@examples(max_examples=40)
+@examples(max_examples=40, deadline=None)
 @given(settings=_settings)
 def test_settings_come_back_from_their_plain_form(settings: TestSettings) -> None:
     document: dict[str, dict[str, Any]] = settings.to_mapping()
     assert TestSettings.from_mapping(document, settings.base) == settings
+
+
+PLACE, SQUARE = (20.0, 15.0, 90.5, 60.0), ((0.0, 0.0), (9.0, 0.0), (9.0, 9.5))
+BUILT: dict[str, Any] = {
+    "frames": FrameSettings(
+        path=("frames/*.tif",),
+        kind="monochrome",
+        cfa="GRBG",
+        black_level=64,
+        white_level=4095,
+        reference=(0, 2),
+        first=1,
+        last=9,
+        step=2,
+        lights=2,
+        renew=True,
+        shape=(40, 60),
+        dtype="uint16",
+        crop_origin=(3, 0),
+    ),
+    "illumination": IlluminationSettings(demosaic="malvar", normalise=8.5),
+    "region": RegionSettings(rectangle=PLACE, holes=(SQUARE, SQUARE)),
+    "region of corners": RegionSettings(polygon=SQUARE),
+    "region of a mask": RegionSettings(mask=Path("mask.png")),
+    "weights": WeightSettings(
+        method="geometry",
+        threshold=0.5,
+        blur=3.5,
+        geometry=Path("scene.toml"),
+        height_map=Path("height.npy"),
+        limit_deg=15,
+    ),
+    "solver": SolverSettings(
+        prefilter="gaussian", rigid="translation", brightness="local", fill=50, tolerance=0.5, max_iterations=7
+    ),
+    "scale": ScaleSettings(mm_per_pixel=0.5, mm_per_pixel_std=0.25, frame_rate=1000),
+    "probes": ProbeSettings(
+        points=((1.0, 2.0),),
+        lines=(PLACE,),
+        circles=((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
+        regions=(PLACE,),
+        gauges=(PLACE, PLACE),
+        straight_gauges=(PLACE,),
+        strain_gauges=((1.0, 2.0, 30.0),),
+        measure="biot",
+        window=7,
+        rigid_motion="remove",
+    ),
+    "setup": SetupSettings(**{entry.name: f"some {entry.name}" for entry in fields(SetupSettings)}),
+}
+BUILT["test"] = TestSettings(
+    **{name: built for name, built in BUILT.items() if " " not in name},
+    calibration_file=Path("calibration.json"),
+    element_size=20,
+    cracks=(SQUARE,),
+    base=Path("/data"),
+)
+"""Settings of every kind with a value in every field."""
+STATED = [
+    pytest.param(built, entry.name, id=f"{name}.{entry.name}")
+    for name, built in BUILT.items()
+    for entry in fields(built)
+    if getattr(built, entry.name) not in (None, ())
+]
+
+
+def test_every_field_of_every_kind_of_settings_is_tried() -> None:
+    kinds = [kind for kind in vars(rgbmidic.settings).values() if isinstance(kind, type) and is_dataclass(kind)]
+    tried = {(type(param.values[0]), param.values[1]) for param in STATED}
+    assert tried == {(kind, entry.name) for kind in kinds for entry in fields(kind)}
+
+
+def _as_numpy(value: Any) -> Any:
+    """The same in the types that a script has it in: of numpy, texts for paths and paths for texts with a slash."""
+    if isinstance(value, str):
+        return Path(value) if "/" in value else np.str_(value)
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, tuple):
+        numbers = all(isinstance(entry, float | int) for entry in value)
+        return np.array(value) if numbers else [_as_numpy(entry) for entry in value]
+    return value if is_dataclass(value) else np.asarray(value)[()]
+
+
+def _types(value: Any) -> Any:
+    return tuple(map(_types, value)) if isinstance(value, tuple) else type(value)
+
+
+@pytest.mark.parametrize(("built", "name"), STATED)
+def test_settings_built_in_python_take_what_is_losslessly_of_the_type(built: Any, name: str) -> None:
+    value = getattr(built, name)
+    found = getattr(replace(built, **{name: _as_numpy(value)}), name)
+    assert found == value
+    assert _types(found) == _types(value)
+    if isinstance(value, tuple) and len(value) == 1:
+        assert getattr(replace(built, **{name: value[0]}), name) == value  # a single one needs no brackets
+
+
+@pytest.mark.parametrize(("built", "name"), STATED)
+def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: str) -> None:
+    value = getattr(built, name)
+    inner = np.asarray(value, dtype=object).ravel()[0] if isinstance(value, tuple) else value
+    wrong: list[Any] = [3j, {}, object(), [[[[1]]]]]
+    wrong += [1, "true"] if isinstance(inner, bool) else [True]
+    wrong += ["1e-3", float("nan")] if isinstance(inner, int | float) else [3]
+    wrong += [1.5] if type(inner) is int else []
+    section = next(section.split()[0] for section, settings in BUILT.items() if settings is built)
+    prefix = "" if section == "test" else rf"{section}\."
+    key = {"calibration_file": r"calibration\.file", "element_size": r"mesh\.element_size", "cracks": r"mesh\.cracks"}
+    for instead in wrong:
+        with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:
+            replace(built, **{name: instead})
+        assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_number_is_told_at_construction_by_its_field() -> None:
+    with pytest.raises(ConfigurationError, match=r'solver\.tolerance must be a number, not "1e-3"'):
+        SolverSettings(tolerance="1e-3")  # type: ignore[arg-type]
+
+
+def test_a_mapping_may_hold_numbers_of_numpy_and_paths(tmp_path: Path) -> None:
+    built = TestSettings.from_mapping(
+        {
+            "frames": {"path": tmp_path / "*.dng", "reference": np.arange(3), "first": np.int64(1)},
+            "region": {"rectangle": np.array([1.0, 2.0, 30.0, 40.0])},
+            "calibration": {"file": Path("calibration.json")},
+            "solver": {"tolerance": np.float64(1e-4)},
+        },
+        tmp_path,
+    )
+    assert built.frames == FrameSettings(path=(str(tmp_path / "*.dng"),), reference=(0, 1, 2), first=1)
+    assert built.region.rectangle == (1.0, 2.0, 30.0, 40.0)
+    assert built.calibration_file == tmp_path / "calibration.json"
+    assert built.solver.tolerance == 1e-4

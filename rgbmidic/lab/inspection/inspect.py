@@ -162,7 +162,8 @@ def inspect_frame(
     samples = SampleFacts.of(channels, region.mask, known.noise, linear[0].full_scale)
     crosstalk = view.crosstalk(known.crosstalk or Crosstalk.identity(("red", "green", "blue")))
     tell(1, 3, "lights, and what separating them gets wrong")
-    separated = _separated(linear, crosstalk, demosaic, samples.noise, np.random.default_rng(seed))
+    names = known.registration.lights if known.registration else ()
+    separated = _separated(linear, crosstalk, demosaic, samples.noise, names, np.random.default_rng(seed))
     images = separated.images
     if known.registration is not None:
         images = align(images, known.registration.cropped(view.origin))
@@ -207,18 +208,20 @@ def inspect_frame(
 
 
 def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) -> FrameSettings:
-    """The test's frame settings, or none, with what is stated in their place (`FrameSettings`; None: not stated).
+    """The test's frame settings, or none, with what else is stated (`FrameSettings`; None: not stated).
 
     Raises
     ------
     ConfigurationError
-        Something stated is not allowed, or several frames that are not monochrome.
+        Something stated is not allowed or not what the test states, or several frames that are not monochrome.
     """
     given = {key: value for key, value in stated.items() if value is not None}
-    if len(given.get("shape", (1, 1))) != 2:
-        raise ConfigurationError("shape is two numbers, rows and columns")
     if test is not None:
-        return replace(test.frames, **given)
+        joined = replace(test.frames, **given)
+        for key in given:
+            if (before := getattr(test.frames, key)) not in (None, now := getattr(joined, key)):
+                raise ConfigurationError(f"frames.{key} is {before} in TEST.toml, but the option states {now}")
+        return joined
     return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
 
 
@@ -231,9 +234,17 @@ class _Separated:
 
 
 def _separated(
-    linear: Linear, crosstalk: Crosstalk, method: str, noise: NoiseModel, random: np.random.Generator
+    linear: Linear,
+    crosstalk: Crosstalk,
+    method: str,
+    noise: NoiseModel,
+    names: Sequence[str],
+    random: np.random.Generator,
 ) -> _Separated:
-    """Separate a state as the test would; reflection index and speckle of a mosaic are those of the default method."""
+    """Separate a state as the test would; reflection index and speckle of a mosaic are those of the default method.
+
+    `names` are those of lights in succession, where they are known.
+    """
     first = linear[0]
     if isinstance(first, LinearMosaic):
         model = ReflectionAwareDemosaicer(crosstalk=crosstalk).reconstruct(first)
@@ -246,7 +257,8 @@ def _separated(
     full = [frame for frame in linear if isinstance(frame, LinearChannels)]
 
     def lights(frames: Sequence[LinearChannels]) -> IlluminationImages:
-        return IlluminationImages.in_succession(frames) if len(frames[0].values) == 1 else unmix(frames[0], crosstalk)
+        single = len(frames[0].values) == 1
+        return IlluminationImages.in_succession(frames, names) if single else unmix(frames[0], crosstalk)
 
     return _Separated(images=lights(full), disturbances=Disturbances.of_channels(full, lights, noise, random))
 

@@ -72,6 +72,14 @@ def test_files_that_tell_their_levels_need_no_statement(run, tmp_path):
     assert Calibration.read(tmp_path / "c.json").cfa == "RGGB"
 
 
+def test_levels_that_nobody_states_are_not_held_against_a_test(run, tmp_path):
+    for options, levels in [(["--cfa", "RGGB"], (None, None)), (STATED[:4], (64, None))]:
+        out = tmp_path / f"{len(options)}.json"
+        assert run("crosstalk", "--dark", "dark/*.tif", *LIGHTS, *options, "--out", str(out))[0] == 0
+        made = Calibration.read(out)
+        assert (made.kind, made.black_level, made.white_level) == ("bayer", *levels)
+
+
 def test_an_existing_file_is_kept_unless_told_otherwise(run, tmp_path):
     out = tmp_path / "c.json"
     out.write_text("mine")

@@ -52,6 +52,19 @@ def test_a_stack_of_one_light_is_that_light(pair):
     np.testing.assert_array_equal(correlate(f[None], g[None]).displacement, correlate(f, g).displacement)
 
 
+@pytest.mark.parametrize("initial", [None, SHIFT])
+def test_gaps_are_filled_where_that_is_asked_for(pair, initial):
+    images = [np.where(np.arange(SHAPE[1]) > 70, np.nan, image) for image in pair]
+    options = {"region": (12, 12, 95, 75), "element_size": 12, "initial": initial}
+    gaps, filled = (correlate(*images, fill=distance, **options) for distance in (0, 50))
+    assert not gaps.measured.all()
+    np.testing.assert_array_equal(np.isnan(gaps.displacement).any(axis=1), ~gaps.measured)
+    assert (filled.node_status[~gaps.measured] == NodeStatus.FILLED).all()
+    np.testing.assert_array_equal(filled.displacement[gaps.measured], gaps.displacement[gaps.measured])
+    np.testing.assert_allclose(filled.displacement, np.broadcast_to(SHIFT, filled.displacement.shape), atol=0.1)
+    assert filled.displacement_std[~gaps.measured].min() > np.median(gaps.displacement_std[gaps.measured])
+
+
 @pytest.mark.parametrize("initial", [SHIFT, "nodes"])
 def test_a_start_may_be_one_motion_or_one_per_node(pair, initial):
     blank = correlate(*pair, region=(12, 12, 85, 75))

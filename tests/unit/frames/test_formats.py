@@ -266,7 +266,7 @@ def test_a_source_is_opened_before_its_file_exists_and_has_one_frame(tmp_path: P
         _ = source.shape
     tifffile.imwrite(tmp_path / "f.tif", GREY)
     np.testing.assert_array_equal(source.read(0).values[0], GREY)
-    assert (len(source), source.name(0), source.tells_camera) == (1, "f.tif", False)
+    assert (len(source), source.name(0)) == (1, "f.tif")
     for index in (-1, 1):
         with pytest.raises(IndexError, match=r"f\.tif"):
             source.read(index)

@@ -348,16 +348,18 @@ def test_a_file_is_hashed_once_until_it_changes(tmp_path: Path, monkeypatch: pyt
 
 
 def test_the_camera_fills_in_what_neither_the_file_nor_the_user_tells(tmp_path: Path) -> None:
-    camera = Calibration(cfa="GBRG", black_level=16, white_level=4000)
-    mosaic = noisy_mosaic((24, 30))
-    write_tiff(tmp_path / "f.tif", mosaic)
-    write_dng(tmp_path / "f.dng", mosaic)
-    series = open_series(FrameSettings(path=("*.*",), black_level=64), tmp_path, camera)
-    frames = {series.name(index): series.read(index)[0] for index in range(2)}
-    told = {name: (frame.cfa, frame.black_level.max(), frame.white_level) for name, frame in frames.items()}
-    assert told == {"f.tif": ("GBRG", 64, 4000), "f.dng": (mosaic.cfa, 64, 4095)}
-    (channel,) = open_series(FrameSettings(path=("f.tif",), kind="monochrome"), tmp_path, camera).read(0)
-    assert (channel.black_level.tolist(), channel.white_level) == ([16], 4000)
+    write_tiff(tmp_path / "f.tif", noisy_mosaic((24, 30)))
+
+    def read(camera: Calibration, **stated: Any) -> Any:
+        (frame,) = open_series(FrameSettings(path=("f.tif",), **stated), tmp_path, camera).read(0)
+        return frame
+
+    frame = read(Calibration(cfa="GBRG", black_level=16, white_level=4000))
+    assert (frame.cfa, frame.black_level.tolist(), frame.white_level) == ("GBRG", [[16, 16], [16, 16]], 4000)
+    assert read(Calibration(cfa="GBRG", shape=(24, 30)), white_level=4095).white_level == 4095
+    assert read(Calibration(cfa="GBRG", shape=(48, 60)), crop_origin=(3, 2)).cfa == "BGGR"
+    channel = read(Calibration(kind="monochrome", black_level=16, white_level=4000))
+    assert (channel.values.shape, channel.black_level.tolist(), channel.white_level) == ((1, 24, 30), [16], 4000)
 
 
 def test_real_series(shared_data: Path) -> None:

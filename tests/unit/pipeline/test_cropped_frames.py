@@ -10,7 +10,7 @@ from small_tests import colour_test
 from textures import Texture
 
 from rgbmidic import Calibration, Status, correlate, measure, read_frame, read_test
-from rgbmidic.errors import CalibrationError
+from rgbmidic.errors import CalibrationError, FrameError
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.writers import write_tiff
 from rgbmidic.illumination.crosstalk import Crosstalk
@@ -94,6 +94,8 @@ def test_an_odd_crop_shifts_the_pattern_of_the_calibration(tmp_path):
     np.testing.assert_allclose(cropped.nodes, whole.nodes - (5.0, 3.0))
     inner = (np.abs(whole.nodes - 72) < 40).all(axis=1)
     np.testing.assert_allclose(cropped.u[:, inner], whole.u[:, inner], atol=5e-3)
-    wrong = Plan.from_settings(test.settings(region={"rectangle": rectangle})).series.read(0)[0]
     right = Plan.from_settings(test.settings(frames={"crop_origin": [5, 3]}, region={"rectangle": rectangle}))
-    assert (wrong.cfa, right.series.read(0)[0].cfa) == ("RGGB", "BGGR")
+    assert right.series.read(0)[0].cfa == "BGGR"
+    for stated in ({}, {"cfa": "BGGR"}, {"cfa": "RGGB", "crop_origin": [5, 3]}):
+        with pytest.raises(FrameError, match=r"frames\.crop_origin"):
+            Plan.from_settings(test.settings(frames=stated, region={"rectangle": rectangle}))

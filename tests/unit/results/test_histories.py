@@ -139,6 +139,15 @@ def test_a_stated_rate_that_is_not_that_of_the_stamps_is_told(result: Result, ca
     np.testing.assert_allclose(found.times[-1], 8 / RATE + 2e-6)
 
 
+def test_a_stated_rate_that_is_not_that_of_the_camera_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    result = make(tmp_path / "out", timed=False, frame_rate=1000.0)
+    found = read(result, points=(PLACE,), scale=ScaleSettings(frame_rate=1001.0))
+    assert not caplog.text
+    found = read(result, points=(PLACE,), scale=ScaleSettings(frame_rate=500.0))
+    assert "states 500 frames per second, the camera was set to 1000: the former is taken" in caplog.text
+    np.testing.assert_allclose(found.times, np.array(NUMBERS) / 500)
+
+
 def test_motion_within_the_exposure_is_told_where_it_blurs(tmp_path: Path) -> None:
     assert not [r for r in read(make(tmp_path / "a", exposure_ns=200_000), points=(PLACE,)).remarks if "blur" in r]
     (blur,) = (r for r in read(make(tmp_path / "b", exposure_ns=600_000), points=(PLACE,)).remarks if "blur" in r)

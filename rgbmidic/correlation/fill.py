@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.sparse as sp
 
-from rgbmidic.correlation import NodeStatus, Solution
+from rgbmidic.correlation.solution import NodeStatus, Solution
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
