@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import tifffile
 from cine_files import write_cine
-from results import make_origin, make_result, random_record
+from results import make_origin, make_result, random_record, smooth_record
 
 from rgbmidic import __version__, cli, report
 from rgbmidic.command import execute, read_shape
@@ -118,18 +118,29 @@ def test_bad_frames_are_status_2_and_an_interruption_130(
 def test_a_termination_ends_a_run_in_the_background_of_a_script_too(
     command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
 ) -> None:
+    """It says how to go on; before there is a result, or while there is but an old one, that there is nothing yet."""
+    out, begins = test_file.parent / "out", False
+
     def measure(*_: Any, **__: Any) -> Result:
+        if begins:
+            make_result(out, overwrite=True, record=smooth_record)
         os.kill(os.getpid(), signal.SIGTERM)
         raise AssertionError("still running")
 
     _replace_pipeline(monkeypatch, measure)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a job behind &
     try:
-        status, _, error = command("run", test_file, "--out", test_file.parent / "out")
+        for begun, resume, told in (
+            (False, False, "nothing was begun: run the same command again"),
+            (True, False, f"rgbmidic run {test_file} --out {out} --resume"),
+            (False, False, "nothing was begun"),
+            (False, True, f"rgbmidic run {test_file} --out {out} --resume"),
+        ):
+            begins = begun
+            status, _, error = command("run", test_file, "--out", out, "--resume" if resume else "--overwrite")
+            assert (status, told in error) == (130, True)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert status == 130
-    assert "--resume" in error
 
 
 def test_run_passes_everything_on_and_tells_what_came_out(
@@ -182,7 +193,7 @@ def test_run_in_which_no_deformed_frame_is_measured_is_a_failure(
         _replace_pipeline(monkeypatch, _measure_of(*ends))
         status, printed, error = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
         assert status == 1
-        assert error.startswith("error: no deformed frame is measured")
+        assert f"error: {len(ends)} of {len(ends)} deformed frames failed" in error
         assert told in error
         assert f"{len(ends)} deformed: 0 converged, {len(ends)} failed" in printed
         assert "75.0%" not in printed
@@ -196,6 +207,11 @@ def test_run_tells_how_many_deformed_frames_failed(
     assert status == 0
     assert "3 deformed: 2 converged, 1 failed" in printed
     assert "50.0% measured" in printed  # 3 of 4 nodes in two frames, none in one; the reference does not count
+    for ends, expected in (("", "torn"), 0), (("", "torn", "torn"), 1):  # half of them, and more
+        _replace_pipeline(monkeypatch, _measure_of(*ends))
+        status, _, error = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
+        assert (status, "2 of 3 deformed frames failed; the first, f2: torn" in error) == (expected, bool(expected))
+        assert Result.open(test_file.parent / "out").finished.all()
 
 
 def test_figures_later(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,7 +123,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(movie: Path, whole: Result,
 def test_parts_in_any_order_make_the_whole(movie: Path, whole: Result, tmp_path: Path) -> None:
     out = tmp_path / "result"
     for part in (range(17, 36), range(17)):
-        with pytest.raises(ResultError, match=r"not a result|is missing"):
+        with pytest.raises(ResultError, match=r"not a result|are missing"):
             finish_result(out)
         measure(settings(movie), out, frames=part)
     finish_result(out)

@@ -18,6 +18,7 @@ from results import make_result
 
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
+from rgbmidic.results.provenance import fingerprint
 from rgbmidic.results.store import load_frames
 from rgbmidic.typing import AnyArray
 
@@ -78,16 +79,15 @@ def test_a_mutated_file_is_read_or_told(copy: Path, name: str) -> None:
     assert all(str(copy) in message for message in told)
 
 
-@pytest.mark.parametrize("ending", ["frames", "index"])
-def test_mutated_frames_are_read_told_or_not_measured_yet(copy: Path, ending: str) -> None:
+def test_mutated_frames_are_read_told_or_not_there(copy: Path) -> None:
     """Also quantity by quantity, and opened as a run that goes on: never anything else than what was written."""
-    file, whole = copy / "solution" / f"000000.{ending}", Result.open(copy)
+    file, whole = copy / "solution" / "000000.frames", Result.open(copy)
     content, records = file.read_bytes(), [whole.frame(index).values for index in range(2)]
-    told, absent = list[str](), 0
-    for mutated in _mutations(content, len(ending), SHARD_COPIES):
+    told, absent, run = list[str](), 0, fingerprint(whole.provenance)
+    for mutated in _mutations(content, 6, SHARD_COPIES):
         file.write_bytes(mutated)
         try:
-            table = load_frames(copy, whole.table.layout.sizes, 2)
+            table = load_frames(copy, whole.table.layout.sizes, 2, run)
             there = np.flatnonzero(table.finished)
             absent += 2 - len(there)
             for index, values in zip(there, table.each(["u", "status", "reason"], there), strict=True):
@@ -105,12 +105,12 @@ def test_a_forged_head_is_told(copy: Path, name: str, size: int) -> None:
     """Sizes that no record has, their checksums right: no memory is taken for what is not there."""
     table = Result.open(copy).table
     file = table.files[0]
-    content = bytearray(file.read_bytes())
+    content, first = bytearray(file.read_bytes()), int(table.start[0])
     place = table.layout.open[name]
     for number in place.shape:
-        content[4 * number : 4 * number + 4] = size.to_bytes(4, "little")
+        content[first + 4 * number : first + 4 * number + 4] = size.to_bytes(4, "little")
     file.write_bytes(content)
-    table.head[0] = zlib.crc32(content[: table.layout.head])
+    table.head[0] = zlib.crc32(content[first : first + table.layout.head])
     tracemalloc.start()
     try:
         with pytest.raises(ResultError, match="damaged in frame 0"):
