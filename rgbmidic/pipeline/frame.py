@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -70,12 +71,15 @@ def measure_frame(plan: Plan, index: int, start: Start, renewed: Sequence[tuple[
 
 def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -> FrameRecord:
     """The record of a frame that could not be measured at all, or even not be read."""
+    time_ns = None
+    with suppress(FrameError):  # a movie that is gone tells no times
+        time_ns = plan.series.time_ns(index)
     return FrameRecord.failed(
         reason,
         nodes=len(plan.reference.mesh.nodes),
         lights=len(plan.images.names),
         number=plan.series.numbers[index],
-        time_ns=plan.series.time_ns(index),
+        time_ns=time_ns,
         unread=unread,
     )
 

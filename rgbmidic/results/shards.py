@@ -275,7 +275,7 @@ def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], b
                     place += len(header) + length
                     continue
                 with mmap.mmap(opened.fileno(), size, access=mmap.ACCESS_READ) as content:
-                    place = content.find(run, search)
+                    place = content.find(run, search, max(size - _HEADER.size + len(run), 0))
                 # a record that is not whole at the end is what a killed process leaves
                 damaged |= place >= 0 or (found is None and len(header) == _HEADER.size)
                 if place < 0:
