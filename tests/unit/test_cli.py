@@ -283,6 +283,24 @@ def test_export_of_an_interrupted_run(command: Run, tmp_path: Path) -> None:
         assert np.isnan(archive["u"]).all(axis=1).tolist() == [True, False, True]
 
 
+def test_export_of_a_damaged_result(command: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    result = make_result(tmp_path / "out", frames=3)
+    file = result.path / "solution" / "000000.frames"
+    content = bytearray(file.read_bytes())
+    content[int(result.table.start[1] + result.table.length[1] // 2)] ^= 16
+    file.write_bytes(content)
+    status, _, error = command("export", result.path, "--out", tmp_path / "a.npz")
+    assert status == 2
+    assert "000000.frames is damaged in frame 1: " in error
+    assert "--partial" in error
+    assert command("export", result.path, "--out", tmp_path / "a.npz", "--partial")[0] == 0
+    assert f"{result.path} is damaged: frames lost: 1 (frame 1)" in caplog.text
+    with np.load(tmp_path / "a.npz") as archive:
+        assert np.isnan(archive["u"]).all(axis=1).tolist() == [False, True, False]
+        np.testing.assert_array_equal(archive["u"][2], result.u[2])
+    assert command("finish", result.path, "--no-figures")[0] == 2
+
+
 def test_frames_says_what_a_reader_sees(command: Run, tmp_path: Path) -> None:
     path, out = tmp_path / "f.cine", tmp_path / "f.tif"
     values = np.random.default_rng(0).integers(0, 4096, (3, 12, 16))

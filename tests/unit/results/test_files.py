@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from damage import damage_results, write_result
 from results import make_result
 
 from rgbmidic.errors import ResultError, RgbmidicError
@@ -97,6 +98,51 @@ def test_mutated_frames_are_read_told_or_not_there(copy: Path) -> None:
             told.append(str(error))
     assert all("000000." in message for message in told)
     assert len(told) + absent > SHARD_COPIES / 2
+
+
+def test_results_damaged_at_random_are_right_or_told(tmp_path: Path) -> None:
+    """Bits, digits of the provenance, pieces lost, doubled or cut off, files swapped with another run's or gone."""
+    ends = damage_results(tmp_path, 40, seed=4)
+    assert sum(ends.values()) == 40
+    assert sum(times for (_, end), times in ends.items() if end == "right") < 20
+    assert any(end == "told, the rest read, healed by --resume" for _, end in ends)
+
+
+@pytest.mark.parametrize("name", ["solution/000001.frames", "reference.npz", "mesh.npz", "provenance.json"])
+def test_a_file_of_another_run_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    """The same mesh, frames and lights, another tolerance of the solver: its numbers are not this run's."""
+    mine, other = write_result(tmp_path / "mine"), write_result(tmp_path / "other", tolerance=2e-3, seed=1)
+    if name == "mesh.npz":
+        np.savez(other / name, nodes=Result.open(other).nodes + 1e-9, elements=Result.open(other).elements)
+    shutil.copy(other / name, mine / name)
+    shown = "000000.frames is of another run" if name == "provenance.json" else f"{name} is .*another"
+    with pytest.raises(ResultError, match=shown):
+        _ = Result.open(mine, partial=True).reference
+
+
+def test_a_damaged_header_or_record_loses_its_frame_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Records of one file of four frames: a bit in a header, a bit in a record; the rest is as it was written."""
+    whole = Result.open(write_result(tmp_path / "out"))
+    file, table = whole.path / "solution" / "000000.frames", whole.table
+    content = bytearray(file.read_bytes())
+    content[int(table.start[1]) - 3] ^= 1
+    content[int(table.start[2] + table.length[2]) - 1] ^= 128
+    file.write_bytes(content)
+    with pytest.raises(
+        ResultError, match=r"\(000000\.frames\): of 6 frames are lost 1 \(frame 1\); .*--resume.*partial"
+    ):
+        Result.open(whole.path)
+    rest = Result.open(whole.path, partial=True)
+    assert rest.finished.tolist() == [True, False, False, True, True, True]
+    assert rest.reasons[1:3] == ("damaged", "damaged")
+    assert "frames lost: 1 (frame 1), 2 (frame 2); " in caplog.text
+    assert np.isnan(rest.u[1:3]).all()
+    np.testing.assert_array_equal(rest.u[[0, 3, 4, 5]], whole.u[[0, 3, 4, 5]])
+    assert rest.refresh().finished.tolist() == rest.finished.tolist()
+    content[int(table.start[1]) - 3] ^= 1  # then only the record is damaged, which shows when it is read
+    file.write_bytes(content)
+    with pytest.raises(ResultError, match=r"000000\.frames is damaged in frame 2: .*--resume"):
+        list(Result.open(whole.path).each("reflection_thumbnail"))
 
 
 @pytest.mark.parametrize("size", [0, 7, 2**31, 2**32 - 1])
