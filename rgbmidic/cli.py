@@ -167,9 +167,7 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
     _print_summary(result, time.perf_counter() - started)
     failed = [index for index in result.deformed if result.status[index] == _FAILED]
     if unread := int(result.unread.sum()):
-        _messages.print(
-            f"note: {unread} frames could not be read: --resume measures them when they can", soft_wrap=True
-        )
+        _messages.print(f"note: frames that could not be read: {unread}; --resume tries them again", soft_wrap=True)
     if len(failed) > _TOO_MANY * len(result.deformed) or not result.deformed:
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
         count = f"{len(failed)} of {len(result.deformed)} deformed frames failed"

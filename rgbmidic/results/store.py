@@ -182,6 +182,7 @@ class ResultStore:
     def discard(self, frames: Collection[int]) -> None:
         """Take frames back, which are to be measured again; a `ResultError` where the disk refuses."""
         if frames:
+            self.reopen()
             discard(self.path / _FRAMES, self._writer.run, frames)
 
     def finished(self) -> BoolArray:

@@ -178,7 +178,8 @@ def _measure_of(*ends: str) -> Callable[..., Result]:
         store = ResultStore.create(out, origin, overwrite=True)
         good = FrameRecord.of(nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_share=np.ones((4, 1)))
         for index, reason in enumerate(("", *ends)):
-            store.write_frame(index, FrameRecord.failed(reason, nodes=4, lights=1) if reason else good)
+            failed = FrameRecord.failed(reason, nodes=4, lights=1, unread=reason == "torn")
+            store.write_frame(index, failed if reason else good)
         store.finish()
         return Result.open(out)
 
@@ -211,6 +212,7 @@ def test_run_tells_how_many_deformed_frames_failed(
         _replace_pipeline(monkeypatch, _measure_of(*ends))
         status, _, error = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
         assert (status, "2 of 3 deformed frames failed; the first, f2: torn" in error) == (expected, bool(expected))
+        assert f"frames that could not be read: {1 + expected}; --resume tries them again" in error
         assert Result.open(test_file.parent / "out").finished.all()
 
 
