@@ -193,13 +193,11 @@ class ResultStore:
         """What is in the folder now, whoever wrote it; reads it."""
         return load_frames(self.path, self.sizes, self.frame_count, self._writer.run)
 
-    def reopen(self) -> bool:
-        """Take the date of its end out of the provenance, before frames are written; whether it was there."""
+    def reopen(self) -> None:
+        """Take the date of its end out of the provenance, before frames are written."""
         provenance = read_provenance(self.path)
-        ended = provenance.pop("finished", None) is not None
-        if ended:
+        if provenance.pop("finished", None) is not None:
             write_json(self.path / PROVENANCE, sealed(provenance))
-        return ended
 
     def finish(self) -> None:
         """`release` and `finish_result`: when every frame is written."""
