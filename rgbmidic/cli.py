@@ -26,6 +26,9 @@ __all__ = ["app", "main"]
 _WIDE = 400
 """Columns that a table may take: where the terminal has fewer it breaks the lines, and nothing is cut off."""
 _CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
+_TOO_MANY = 0.5
+"""Fraction of the deformed frames beyond which failed ones make a run a failure: a specimen that breaks or leaves the
+picture halfway through is an ordinary test, a run that measures the smaller part of its frames is not."""
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 study = typer.Typer(rich_markup_mode=None)
@@ -98,6 +101,9 @@ def run(
     out: Out,
     overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in DIR.")] = False,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="With --resume: measure all frames again that failed.")
+    ] = False,
     frames: Annotated[
         str, typer.Option("--frames", help="Only these, such as 1000:2000; then `rgbmidic finish`.")
     ] = "",
@@ -116,12 +122,13 @@ def run(
     if overwrite and (resume or frames):
         raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
     _tell_first_run()
-    with _progress("measuring") as progress, _telling_how_to_go_on(test, out, frames):
+    with _progress("measuring") as progress, _telling_how_to_go_on(test, out, frames, resume=resume):
         result = measure(
             settings,
             out,
             overwrite=overwrite,
             resume=resume,
+            retry_failed=retry_failed,
             frames=chosen,
             workers=workers or None,
             scheduler=scheduler,
@@ -149,7 +156,7 @@ def finish(
 
 def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
     """Draw a finished result, in as many processes as cores if none are asked for, and tell what became of its frames;
-    a failure where none of them is measured."""
+    a failure where more than `_TOO_MANY` of them failed."""
     from rgbmidic._kernels.threads import threads
     from rgbmidic.report import remove_figures, remove_report, write_figures
 
@@ -159,9 +166,12 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
         write_figures(result, result.path / "figures", processes=processes or threads())
     _print_summary(result, time.perf_counter() - started)
     failed = [index for index in result.deformed if result.status[index] == _FAILED]
-    if len(failed) == len(result.deformed):
+    if unread := int(result.unread.sum()):
+        _messages.print(f"note: frames that could not be read: {unread}; --resume tries them again", soft_wrap=True)
+    if len(failed) > _TOO_MANY * len(result.deformed) or not result.deformed:
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
-        raise typer.Exit(command.fail(f"no deformed frame is measured; {first}", command.FAILURE))
+        count = f"{len(failed)} of {len(result.deformed)} deformed frames failed"
+        raise typer.Exit(command.fail(f"{count}; {first}", command.FAILURE))
 
 
 def _interrupt(*_: object) -> None:
@@ -170,14 +180,23 @@ def _interrupt(*_: object) -> None:
 
 
 @contextmanager
-def _telling_how_to_go_on(test: Path, out: Path, frames: str) -> Iterator[None]:
-    """An interruption, by Ctrl-C or by whoever runs the machine, says how to go on."""
+def _telling_how_to_go_on(test: Path, out: Path, frames: str, *, resume: bool) -> Iterator[None]:
+    """An interruption, by Ctrl-C or by whoever runs the machine, says how to go on, if there is something."""
+    from rgbmidic.results.provenance import PROVENANCE
+
+    def begun() -> bytes:
+        return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""
+
+    before_it = begun()
     before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         yield
     except KeyboardInterrupt:
-        part = f"--frames {frames}" if frames else "--resume"
-        _messages.print(f"go on with: rgbmidic run {test} --out {out} {part}", soft_wrap=True, markup=False)
+        if frames or resume or begun() != before_it:
+            part = f"--frames {frames}" if frames else "--resume"
+            _messages.print(f"go on with: rgbmidic run {test} --out {out} {part}", soft_wrap=True, markup=False)
+        else:
+            _messages.print("nothing was begun: run the same command again", soft_wrap=True)
         raise
     finally:
         signal.signal(signal.SIGTERM, before)

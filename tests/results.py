@@ -46,6 +46,8 @@ def random_record(seed: int) -> FrameRecord:
         "time_ns": seed * 1_000_003,
         "status": seed % 2,
         "reason": "did not converge: é" if seed % 2 else "",
+        "unread": seed % 2,
+        "tries": 1 + seed % 2,
         "iterations": len(history),
         "history": history,
         "inputs": [[f"/data/{seed}.dng", f"{seed:02x}"]],

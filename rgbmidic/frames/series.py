@@ -6,6 +6,7 @@ import glob
 import hashlib
 import logging
 import math
+import os
 import re
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
@@ -109,6 +110,12 @@ class FrameSeries:
             There is no such state.
         """
         return tuple(source.read(inner) for source, inner in self._locate(index))
+
+    def gone(self) -> str:
+        """The lights of which no file exists any more: first file and number of files; empty where there is none."""
+        exists = os.path.exists  # which raises nothing, whatever the disk says
+        lost = [sources for sources in self.lights if not any(exists(source.path) for source in sources)]
+        return "; ".join(f"{sources[0].path} and all {len(sources)} files of its series" for sources in lost)
 
     def name(self, index: int) -> str:
         """Name of state `index`; of several lights in succession joined by " + "."""

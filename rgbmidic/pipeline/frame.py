@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from rgbmidic.correlation import Deformed, Solution, Start, Status, fill
 from rgbmidic.correlation.light_levels import brightness_change
 from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.errors import FrameError, RgbmidicError
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.raw_samples import exposure_fault
 from rgbmidic.pipeline.separation import correlated
@@ -25,7 +27,7 @@ from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["failed_frame", "measure_frame"]
+__all__ = ["failed_frame", "measure_frame", "read_state"]
 
 logger = logging.getLogger(__name__)
 
@@ -57,30 +59,52 @@ def measure_frame(plan: Plan, index: int, start: Start, renewed: Sequence[tuple[
             values = _measure(plan, index, start, _renewal(plan, renewed))
         return FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
     except RgbmidicError as error:
-        reason = str(error)
+        reason, unread = str(error), isinstance(error, _UnreadError)
         logger.warning("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
     except Exception as error:  # whatever it is, the other frames can be measured
-        reason = f"unexpected error: {type(error).__name__}: {error}"
+        reason, unread = f"unexpected error: {type(error).__name__}: {error}", False
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
-    return failed_frame(plan, index, reason)
+    return failed_frame(plan, index, reason, unread=unread)
 
 
-def failed_frame(plan: Plan, index: int, reason: str) -> FrameRecord:
-    """The record of a frame that could not be measured at all."""
+def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -> FrameRecord:
+    """The record of a frame that could not be measured at all, or even not be read."""
+    time_ns = None
+    with suppress(FrameError):  # a movie that is gone tells no times
+        time_ns = plan.series.time_ns(index)
     return FrameRecord.failed(
         reason,
         nodes=len(plan.reference.mesh.nodes),
         lights=len(plan.images.names),
         number=plan.series.numbers[index],
-        time_ns=plan.series.time_ns(index),
+        time_ns=time_ns,
+        unread=unread,
     )
+
+
+class _UnreadError(FrameError):
+    """A frame that cannot be read, at least now."""
+
+
+def read_state(plan: Plan, index: int) -> tuple[tuple[Mosaic | ChannelFrame, ...], dict[str, str]]:
+    """The raw frames of a state, and path and fingerprint of their files.
+
+    Raises
+    ------
+    FrameError
+        They cannot be read.
+    """
+    try:
+        return plan.series.read(index), plan.series.inputs(index)
+    except (FrameError, OSError) as error:
+        raise _UnreadError(str(error)) from error
 
 
 def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str, Any]:
     """What `FrameRecord.from_solution` is given."""
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
     with stage("reading"):
-        state = plan.series.read(index)
+        state, inputs = read_state(plan, index)
     with stage("separation"):
         images = plan.separation(state)
     if images.values.shape != reference.images.shape:
@@ -112,7 +136,7 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
         "renewals": renewals,
         "weights_thumbnail": _in_bytes(weights[:, ::step, ::step]),
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
-        "inputs": plan.series.inputs(index),
+        "inputs": inputs,
     }
 
 
@@ -122,7 +146,7 @@ def _renewal(plan: Plan, renewed: Sequence[tuple[int, Solution]]) -> Renewal:
     def make() -> Renewal:
         renewal = Renewal.none(plan.reference)
         for index, solution in renewed:
-            images = plan.separation(plan.series.read(index))
+            images = plan.separation(read_state(plan, index)[0])
             weights = plan.weights.deformed(images, index)
             renewal = renewal.renewed(solution, correlated(images, plan.settings.illumination), weights)
         return renewal

@@ -7,9 +7,9 @@ once their key frame is, and any range of frames needs only some key frames of t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
-__all__ = ["STRIDE", "children", "lineage", "parent"]
+__all__ = ["STRIDE", "children", "dependants", "is_key", "lineage", "parent"]
 
 STRIDE = 16
 """Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
@@ -40,6 +40,23 @@ def lineage(position: int) -> Iterator[int]:
     while following is not None:
         yield following
         following = parent(following)
+
+
+def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:
+    """The frames that depend on some, directly or through others, of a test with as many frames as `tries`.
+
+    A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
+    """
+    found: set[int] = set()
+    ahead = list(places)
+    while ahead:
+        place = ahead.pop()
+        after = set(children(place, len(tries)))
+        if place + 1 < len(tries) and tries[place + 1] > 1:
+            after.add(place + 1)
+        ahead += after - found
+        found |= after
+    return found
 
 
 def _step(position: int) -> int:

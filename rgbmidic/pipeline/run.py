@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from rgbmidic._kernels import are_compiled
-from rgbmidic.errors import FrameError
+from rgbmidic.correlation import Status
+from rgbmidic.errors import FrameError, InputError, ResultError
+from rgbmidic.pipeline.frame import read_state
+from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.schedule import Schedule
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import Origin, Result, ResultStore
+from rgbmidic.results.provenance import read_provenance
+from rgbmidic.results.store import listed
 from rgbmidic.settings import TestSettings
 
 __all__ = ["measure"]
+
+logger = logging.getLogger(__name__)
 
 FRAMES_A_WORKER = 8
 """Fewer frames are not worth a process, which takes some 5 s to start."""
@@ -28,6 +38,7 @@ def measure(
     *,
     overwrite: bool = False,
     resume: bool = False,
+    retry_failed: bool = False,
     frames: range | None = None,
     workers: int | None = 1,
     scheduler: str | None = None,
@@ -48,7 +59,11 @@ def measure(
     overwrite
         Replace a result that is already there.
     resume
-        Go on with a result that is already there: its settings, calibration and frames must be the same.
+        Go on with a result that is already there: its settings, calibration and frames must be the same. Frames that
+        are damaged there are measured again; so are those that could not be read and now can, with all that started
+        from them.
+    retry_failed
+        With `resume`, measure again all frames that failed, and all that started from them.
     frames
         Only these of the frames that the settings choose, counted as there, into a folder that other processes may fill
         at the same time; when all are measured, `rgbmidic.results.finish_result` ends the result. None: all.
@@ -74,12 +89,20 @@ def measure(
         The settings, the calibration, the region or the reference frames are not usable, the result cannot be written,
         or what is in `out` is another test's.
     """
+    if retry_failed and not resume:
+        raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
     plan = replace(Plan.from_settings(settings), timings=timings)
     places = _places(plan.series.chosen, frames)
     if workers is None:
         workers = max(min(available_cores(), len(places) // FRAMES_A_WORKER), 1)
     with _store(plan, Path(out), places if frames else None, overwrite=overwrite, resume=resume) as store:
+        if resume and frames is None:
+            _take_back(plan, store, retry_failed=retry_failed)
         schedule = Schedule(plan, store, places)
+        if schedule.done and frames is None and "finished" in read_provenance(store.path):
+            logger.warning("%s is finished and whole: nothing is left to be measured", out)
+            return Result.open(out)
+        store.reopen()
         if workers > 1 and not are_compiled():  # the other processes then find all compiled
             with open_workers(plan, 1) as here:
                 schedule.run(here, progress, most=1)
@@ -88,7 +111,45 @@ def measure(
                 schedule.run(others, progress)
         if frames is None:
             store.finish()
-    return Result.open(out, partial=frames is not None)
+    return Result.open(out, partial=frames is not None, check=False)
+
+
+def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
+    """Take back the frames that are to be measured again, and those whose bits depend on what becomes of them.
+
+    A damaged frame comes back with the same bits, unless it had failed because it could not be read.
+    """
+    table = store.table()
+    damaged = table.without_damaged(ended="finished" in read_provenance(store.path)).damaged
+    names, chosen = [plan.series.name(index) for index in plan.series.chosen], plan.series.chosen
+    changed, readable, tries = list[int](), list[int](), [2] * len(names)
+    for place, there in enumerate(table.finished.tolist()):
+        try:
+            kept = next(table.each(["status", "unread", "tries"], [place] if there else []))
+        except (ResultError, StopIteration):  # damaged, or not there: whatever it was
+            changed.append(place)
+            continue
+        tries[place] = kept["tries"]
+        if kept["unread"] and _can_be_read(plan, chosen[place]):
+            readable.append(place)
+        elif retry_failed and kept["status"] == Status.FAILED:
+            changed.append(place)
+    lost = np.flatnonzero(damaged).tolist()
+    again = {*lost, *changed, *readable, *dependants([*changed, *readable], tries)}
+    if lost:
+        logger.warning("lost to damage and measured again: %s", listed(lost, names))
+    if readable:
+        logger.warning(
+            "measured again with what started from it, since it can be read now: %s", listed(readable, names)
+        )
+    store.discard(again)
+
+
+def _can_be_read(plan: Plan, index: int) -> bool:
+    try:
+        return bool(read_state(plan, index))
+    except FrameError:
+        return False
 
 
 def _places(chosen: range, frames: range | None) -> range:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.correlation import NodeStatus, Solution, Start, Status
-from rgbmidic.errors import RgbmidicError
+from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
 from rgbmidic.pipeline.order import children, is_key, lineage, parent
@@ -82,6 +82,8 @@ class Schedule:
         ------
         ResultError
             The store cannot be written.
+        FrameError
+            All files of the frames are gone.
         """
         count = 0
         while not self.done and count != most:
@@ -128,13 +130,16 @@ class Schedule:
 
     def _take(self, position: int, start: Start, record: FrameRecord, progress: Progress | None) -> None:
         """Keep a record, or have the frame measured again, and release what waits for it."""
+        if record.unread and (gone := self._plan.series.gone()):
+            raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
         first = self._first_tries.pop(position, None)
         if first is None and is_key(position) and _loses(record, start):
             self._first_tries[position] = record
             self._measure_after(position - 1, position)
             return
-        if first is not None and _rank(first) <= _rank(record):
-            record = first
+        if first is not None:
+            better = first if _rank(first) <= _rank(record) else record
+            record = replace(better, values={**better.values, "tries": 2})
         self._store.write_frame(position, record)
         self._finished[position] = True
         following = self._following(record.values, start)

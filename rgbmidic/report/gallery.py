@@ -7,6 +7,7 @@ import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -95,7 +96,8 @@ def write_figures(
     pictures += [(kind, frame) for frame in frames for kind in _OF_FRAME]
     parts = max(1, min(processes, len(pictures) // _FEW))
     with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=_end_when_interrupted) as pool:
-        others = [pool.submit(_draw_of, result.path, folder, pictures[part::parts]) for part in range(1, parts)]
+        bare = replace(result)  # without the quantities that were read, which each process reads for itself
+        others = [pool.submit(_draw, bare, folder, pictures[part::parts]) for part in range(1, parts)]
         drawn = {*_draw(result, folder, pictures[::parts])}
         try:
             drawn.update(*(other.result() for other in others))
@@ -109,11 +111,6 @@ def write_figures(
 def _end_when_interrupted() -> None:
     """Ctrl-C reaches all processes: this one ends without a word, the first one tells."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def _draw_of(path: Path, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
-    """What another process does."""
-    return _draw(Result.open(path, partial=True), folder, pictures)
 
 
 def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:

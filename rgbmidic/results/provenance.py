@@ -24,13 +24,28 @@ from rgbmidic.results.quantities import SHARED
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray
 
-__all__ = ["PROVENANCE", "SCHEMA_VERSION", "Origin", "check_same", "digest", "now", "read_provenance"]
+__all__ = [
+    "PROVENANCE",
+    "PUT_BACK",
+    "SCHEMA_VERSION",
+    "Origin",
+    "check_same",
+    "digest",
+    "fingerprint",
+    "is_result",
+    "now",
+    "read_provenance",
+    "sealed",
+]
 
 SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"
+PUT_BACK = "put back the file that was there, or delete it and go on with --resume"
+"""What to do about a file of another run."""
+_SEAL = "sha256"
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
 READING = ("scale", "probes", "setup")
 """Sections of the settings that say how a result is read, and not what is measured."""
@@ -147,51 +162,65 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:56]} ..."
 
 
+def fingerprint(document: Mapping[str, Any]) -> bytes:
+    """Digest of 16 bytes of what `check_same` compares: every record of a run has it in its header."""
+    return hashlib.sha256(_canonical(dict(_compared(document)))).digest()[:16]
+
+
+def sealed(document: Mapping[str, Any]) -> dict[str, Any]:
+    """A provenance with the checksum of all it says, as it is written."""
+    return {**document, _SEAL: hashlib.sha256(_canonical(document)).hexdigest()}
+
+
+def _canonical(document: Mapping[str, Any]) -> bytes:
+    return json.dumps(document, sort_keys=True).encode()
+
+
+def is_result(path: Path) -> bool:
+    """Whether a folder has the provenance of a result, of whatever version and state.
+
+    Raises
+    ------
+    ResultError
+        It has a foreign file of that name, or one that is no JSON.
+    """
+    return _document(path) is not None
+
+
+def _document(path: Path) -> dict[str, Any] | None:
+    try:
+        document = read_json(path / PROVENANCE)
+    except FileNotFoundError:
+        return None
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA_NAME:
+        raise ResultError(f'{path / PROVENANCE} does not belong to a result: its "schema" is not "{SCHEMA_NAME}"')
+    return document
+
+
 def read_provenance(path: Path) -> dict[str, Any]:
     """The provenance of the result in a folder: lights, settings, fingerprints, versions, dates.
 
     Raises
     ------
     ResultError
-        The folder is no result, of another schema version, or damaged.
+        The folder is no result, of another schema version, or what the file says was changed.
     """
-    file = path / PROVENANCE
-    try:
-        document = read_json(file)
-    except FileNotFoundError:
-        raise ResultError(f"{path} is not a result folder: it has no {PROVENANCE}") from None
-    if not isinstance(document, dict) or document.get("schema") != SCHEMA_NAME:
-        raise ResultError(f'{file} does not belong to a result: its "schema" is not "{SCHEMA_NAME}"')
+    document = _document(path)
+    if document is None:
+        raise ResultError(f"{path} is not a result folder: it has no {PROVENANCE}")
     if (version := document.get("schema_version")) != SCHEMA_VERSION:
-        raise ResultError(f"{path} has schema version {version!r}; this version of rgbmidic reads {SCHEMA_VERSION}")
-    if not _as_written(document):
-        raise ResultError(f"{file} is damaged: what it says of settings, frames, lights or inputs is not as written")
+        raise ResultError(
+            f"{path} has schema version {version!r}, this version of rgbmidic reads {SCHEMA_VERSION}; measure the test "
+            "again, or read it with the version of rgbmidic that wrote it"
+        )
+    seal = document.pop(_SEAL, None)
+    if sealed(document)[_SEAL] != seal:
+        raise ResultError(
+            f"{path / PROVENANCE} was changed after it was written: put it back as it was. Another [scale], [setup] or "
+            "other [probes] are stated in TEST.toml: `rgbmidic run TEST.toml --out DIR --resume` keeps them, --test "
+            "TEST.toml of history, export and report reads with them"
+        )
     return document
-
-
-def _as_written(document: dict[str, Any]) -> bool:
-    """Whether the parts that are read have the types with which they were written."""
-    kinds = {
-        "inputs": dict,
-        "versions": dict,
-        "frames": dict,
-        "mesh": str,
-        "created": str,
-        "lights": list,
-        "references": list,
-    }
-    if any(not isinstance(document.get(name), kind) for name, kind in kinds.items()):
-        return False
-    sections = document.get("settings", {})
-    return (
-        all(isinstance(name, str) for name in document["lights"])
-        and all(isinstance(place, int) for place in document["references"])
-        and isinstance(document["frames"].get("count"), int)
-        and isinstance(document["frames"].get("sha256"), str)
-        and isinstance(document.get("calibration", {}), dict)
-        and isinstance(sections, dict)
-        and all(isinstance(keys, dict) for keys in sections.values())
-    )
 
 
 def now() -> str:

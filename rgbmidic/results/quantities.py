@@ -112,6 +112,8 @@ _RIGID = (
     "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for one "
     "that sees nothing"
 )
+_UNREAD = "1 where the frame failed because it could not be read, which `--resume` tries again, else 0"
+_TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
 _REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not tell it"
 _SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
 _ENDS = ("converged", "not converged", "failed")
@@ -124,6 +126,8 @@ _TABLE = (
     Quantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
     Quantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
     Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
+    Quantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
+    Quantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
     Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
     Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
     Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,14 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.provenance import read_provenance
+from rgbmidic.results.provenance import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.results.record import FrameRecord
 from rgbmidic.results.shards import FrameTable
-from rgbmidic.results.store import check_complete, load_frames, read_mesh, read_names, read_reference
+from rgbmidic.results.store import check_complete, listed, load_frames, read_mesh, read_names, read_reference
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 __all__ = ["Result"]
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +61,7 @@ class Result:
     provenance: Mapping[str, Any]
 
     @classmethod
-    def open(cls, path: Path | str, *, partial: bool = False) -> Self:
+    def open(cls, path: Path | str, *, partial: bool = False, check: bool = True) -> Self:
         """Open a result folder.
 
         Parameters
@@ -66,7 +69,10 @@ class Result:
         path
             The folder.
         partial
-            Whether frames may be missing, because a run goes on or was interrupted.
+            Whether frames may be missing, because a run goes on, was interrupted, or its records are damaged.
+        check
+            Whether a `partial` result is read once at opening, so that damaged frames are blank with that reason, and
+            named in a warning; else a damaged frame is an error when it is read.
 
         Raises
         ------
@@ -77,9 +83,15 @@ class Result:
         provenance = read_provenance(path)
         names, lights = read_names(path, provenance), tuple(provenance["lights"])
         mesh = read_mesh(path, provenance)
-        table = load_frames(path, {"node": len(mesh["nodes"]), "light": len(lights)}, len(names))
+        sizes, ended = {"node": len(mesh["nodes"]), "light": len(lights)}, "finished" in provenance
+        table = load_frames(path, sizes, len(names), fingerprint(provenance))
         if not partial:
-            check_complete(path, names, table.finished)
+            check_complete(path, names, table, ended=ended)
+        elif check:
+            table = table.without_damaged(ended=ended)
+            if (lost := np.flatnonzero(table.damaged).tolist()) or table.gaps:
+                files = "".join(f"; {file} is damaged between its records" for file in table.gaps)
+                logger.warning("%s is damaged: frames lost: %s%s", path, listed(lost, names) or "unknown", files)
         return cls(path=path, table=table, **mesh, names=names, lights=lights, provenance=provenance)
 
     def refresh(self) -> Self:
@@ -93,7 +105,10 @@ class Result:
         provenance = read_provenance(self.path)
         if {**provenance, "finished": ""} != {**self.provenance, "finished": ""}:
             raise ResultError(f"{self.path} now holds another result; open it again")
-        return replace(self, table=load_frames(self.path, self.table.layout.sizes, len(self)), provenance=provenance)
+        table = load_frames(self.path, self.table.layout.sizes, len(self), fingerprint(provenance))
+        if self.table.damaged.any():
+            table = table.without_damaged(ended="finished" in provenance)
+        return replace(self, table=table, provenance=provenance)
 
     def __len__(self) -> int:
         """Number of frames T."""
@@ -180,4 +195,4 @@ class Result:
     @cached_property
     def reference(self) -> npt.NDArray[np.uint8] | None:
         """Reference image of each light as a picture, shape (k, H, W); None where none was kept."""
-        return read_reference(self.path, self.table.layout.sizes)
+        return read_reference(self.path, self.table.layout.sizes, fingerprint(self.provenance))

@@ -1,20 +1,23 @@
-"""The frames of a result on disk: pairs of files that only ever grow, and the table of what they hold.
+"""The frames of a result on disk: files that only ever grow, and the table of what they hold.
 
-``000007.frames`` holds records one after the other, ``000007.index`` an entry of 32 bytes for each, written once the
-record is: an entry commits a frame. A process that is killed leaves at most a record without an entry, or part of an
-entry; readers pass over both, and nobody appends to a file of another writer. A frame that is written twice counts as
-it is in the file with the higher number, there as it was written last.
+``000007.frames`` holds records one after the other, each behind a header of 40 bytes that says of which run and which
+frame it is and how long it is: a frame counts once its record is whole. Readers go from header to header; where one is
+damaged they look for the next one of the same run. A process that is killed leaves at most the beginning of a record;
+readers pass over it, and nobody appends to a file of another writer. A frame that is written twice counts as it is in
+the file with the higher number, there as it was written last; one that is taken back has `_NO_FRAME` in its header.
 """
 
 from __future__ import annotations
 
 import itertools
+import mmap
 import os
 import re
+import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,20 +27,25 @@ import numpy.typing as npt
 from rgbmidic.errors import ResultError
 from rgbmidic.results.files import writing
 from rgbmidic.results.layout import RecordLayout
+from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
 from rgbmidic.results.record import FrameRecord
-from rgbmidic.typing import AnyArray, BoolArray
+from rgbmidic.typing import BoolArray
 
-__all__ = ["FrameTable", "ShardWriter", "shard_files"]
+__all__ = ["FrameTable", "ShardWriter", "discard", "shard_files"]
 
 _SHARD_FRAMES = 500
-"""Frames of a pair of files: 100,000 frames are 200 pairs, which open in milliseconds; 5,000 nodes each are 150 MB."""
+"""Frames of a file: 100,000 frames are 200 files; 5,000 nodes each are 150 MB."""
 _BUFFER = 2**16
 """Bytes that the system is asked for at once: a call takes some us, as long as copying these. Small records come by the
 dozen, large ones pass by the buffer."""
 _NAME = re.compile(r"([0-9]{6,})\.(frames|index)")
-_ENTRY = np.dtype([("frame", "<u8"), ("start", "<u8"), ("length", "<u8"), ("head", "<u4"), ("check", "<u4")])
-_CHECKED = _ENTRY.itemsize - 4
-_NOT_YET = "not measured yet"
+"""Index files were written by earlier versions, and go with their result."""
+_HEADER = struct.Struct("<16sQQII")
+"""Digest of the run, frame, bytes of the record, CRC-32 of the record's head, CRC-32 of these 36 bytes."""
+_CHECKED = _HEADER.size - 4
+_NO_FRAME = 2**63 - 1
+_NOT_YET, _DAMAGED = "not measured yet", "damaged"
+_REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
 
 
 def shard_files(folder: Path) -> list[Path]:
@@ -47,12 +55,12 @@ def shard_files(folder: Path) -> list[Path]:
     return []
 
 
-def _number(file: Path) -> tuple[int, str]:
-    return int(file.name.partition(".")[0]), file.suffix
+def _number(file: Path) -> int:
+    return int(file.name.partition(".")[0])
 
 
 class ShardWriter:
-    """Appends records to files of its own; a copy that is sent to another process opens others.
+    """Appends records to a file of its own; a copy that is sent to another process opens another.
 
     Parameters
     ----------
@@ -60,16 +68,17 @@ class ShardWriter:
         Where the files are; it must exist.
     layout
         Of the records.
+    run : bytes, length 16
+        Digest of what the frames of the result share.
     """
 
-    def __init__(self, folder: Path, layout: RecordLayout) -> None:
-        self.folder, self.layout = folder, layout
-        self._records: BinaryIO | None = None
-        self._index: BinaryIO | None = None
+    def __init__(self, folder: Path, layout: RecordLayout, run: bytes) -> None:
+        self.folder, self.layout, self.run = folder, layout, run
+        self._file: BinaryIO | None = None
         self._count = self._end = 0
 
-    def __reduce__(self) -> tuple[type[ShardWriter], tuple[Path, RecordLayout]]:
-        return ShardWriter, (self.folder, self.layout)
+    def __reduce__(self) -> tuple[type[ShardWriter], tuple[Path, RecordLayout, bytes]]:
+        return ShardWriter, (self.folder, self.layout, self.run)
 
     def append(self, frame: int, record: FrameRecord) -> None:
         """Write a frame; it counts from the moment this returns, and not at all where it raises.
@@ -82,40 +91,35 @@ class ShardWriter:
         content, head = self.layout.encode(record.values)
         if self._count == _SHARD_FRAMES:
             self.close()
-        records, index = self._files()
-        entry = np.array([(frame, self._end, len(content), head, 0)], dtype=_ENTRY)
-        entry["check"] = zlib.crc32(entry.tobytes()[:_CHECKED])
-        _write_at(records, self._end, content)
-        _write_at(index, self._count * _ENTRY.itemsize, entry.tobytes())
+        file = self._open()
+        content = _header(self.run, frame, len(content), head) + content
+        _write_at(file, self._end, content)
         self._count, self._end = self._count + 1, self._end + len(content)
 
     def close(self) -> None:
-        """Wait until all is on the disk, and close the files.
+        """Wait until all is on the disk, and close the file.
 
         Raises
         ------
         ResultError
             The disk refuses.
         """
-        files, self._records, self._index = (self._records, self._index), None, None
+        file, self._file = self._file, None
         self._count = self._end = 0
-        for file in files:
-            if file is not None:
-                with writing(file.name), file:
-                    os.fsync(file.fileno())
+        if file is not None:
+            with writing(file.name), file:
+                os.fsync(file.fileno())
 
-    def _files(self) -> tuple[BinaryIO, BinaryIO]:
-        """Files for records and entries; new ones, of a number that nobody has, where none are open."""
-        if self._records is None or self._index is None:
-            used = [_number(file)[0] for file in shard_files(self.folder)]
+    def _open(self) -> BinaryIO:
+        """The file that is written; a new one, of a number that nobody has, where none is open."""
+        if self._file is None:
+            used = [_number(file) for file in shard_files(self.folder)]
             for number in itertools.count(max(used, default=-1) + 1):
                 with writing(self.folder), suppress(FileExistsError):
-                    self._records = (self.folder / f"{number:06d}.frames").open("xb", buffering=0)
-                    self._index = (self.folder / f"{number:06d}.index").open("xb", buffering=0)
+                    self._file = (self.folder / f"{number:06d}.frames").open("xb", buffering=0)
                     break
-        assert self._records is not None
-        assert self._index is not None
-        return self._records, self._index
+        assert self._file is not None
+        return self._file
 
 
 def _write_at(file: BinaryIO, start: int, content: bytes) -> None:
@@ -146,6 +150,10 @@ class FrameTable:
         Which of the files each frame is in; -1 where it is not measured yet.
     start, length, head : ndarray, shape (T,), int64
         First byte of each record, its bytes, checksum of its head.
+    damaged : ndarray, shape (T,), bool
+        Frames that are known to be lost to damage; they are not `finished`.
+    gaps
+        Files in which the header of a record is damaged: frames that are missing may have been there.
     """
 
     layout: RecordLayout
@@ -154,32 +162,52 @@ class FrameTable:
     start: npt.NDArray[np.int64]
     length: npt.NDArray[np.int64]
     head: npt.NDArray[np.int64]
+    damaged: BoolArray
+    gaps: tuple[Path, ...]
 
     @classmethod
-    def load(cls, folder: Path, layout: RecordLayout, count: int) -> FrameTable:
-        """The table of a result of `count` frames.
+    def load(cls, folder: Path, layout: RecordLayout, count: int, run: bytes) -> FrameTable:
+        """The table of a result of `count` frames, of the run with this digest; what is damaged is passed over.
 
         Raises
         ------
         ResultError
-            An index is damaged, or has a frame that the result has not.
+            A file cannot be read, or holds frames of another run.
         """
         shard, start, length, head = np.full(count, -1), *np.zeros((3, count), dtype=np.int64)
-        files = [file.with_suffix(".frames") for file in shard_files(folder) if file.suffix == ".index"]
+        files = [file for file in shard_files(folder) if file.suffix == ".frames"]
+        gaps = []
         for number, file in enumerate(files):
-            entries = _entries(file)
-            frames = entries["frame"]
-            if (frames >= count).any():
-                raise ResultError(f"{file.with_suffix('.index')} is damaged: it names frame {frames.max()} of {count}")
+            records, damaged = _records(file, run)
+            gaps += [file] if damaged else []
+            table = np.array(records, dtype=np.int64).reshape(-1, 4)
+            frames, *columns = table[table[:, 0] != _NO_FRAME].T
             shard[frames] = number
-            for column, name in ((start, "start"), (length, "length"), (head, "head")):
-                column[frames] = entries[name]
-        return cls(layout=layout, files=files, shard=shard, start=start, length=length, head=head)
+            start[frames], length[frames], head[frames] = columns
+        lost = np.zeros(count, dtype=bool)
+        places = {"shard": shard, "start": start, "length": length, "head": head}
+        return cls(layout=layout, files=files, damaged=lost, gaps=tuple(gaps), **places)
 
     @property
     def finished(self) -> BoolArray:
         """Which frames there are, shape (T,)."""
         return np.asarray(self.shard >= 0)
+
+    def without_damaged(self, *, ended: bool) -> FrameTable:
+        """The table without the frames whose records are damaged; reads every record once.
+
+        Parameters
+        ----------
+        ended
+            Whether all frames were there once: what is missing is then damaged too.
+        """
+        damaged = ~self.finished & ended
+        for frame in np.flatnonzero(self.finished).tolist():
+            try:
+                next(self.each(None, [frame]))
+            except ResultError:
+                damaged[frame] = True
+        return replace(self, shard=np.where(damaged, -1, self.shard), damaged=damaged)
 
     def read(self, frame: int) -> FrameRecord:
         """All of one frame; a blank record with the reason where it is not measured yet.
@@ -195,12 +223,14 @@ class FrameTable:
         """The named quantities (None: all) of one frame after the other; errors as `read`."""
         chosen = np.fromiter(frames, dtype=np.int64)
         columns = (column[chosen].tolist() for column in (self.shard, self.start, self.length, self.head))
-        opened, file, blank = -1, None, dict[str, Any]()
+        opened, file = -1, None
+        blanks: dict[bool, dict[str, Any]] = {}
         try:
-            for frame, shard, start, length, head in zip(chosen.tolist(), *columns, strict=True):  # noqa: B007 told below
+            for frame, shard, start, length, head in zip(chosen.tolist(), *columns, strict=True):
                 if shard < 0:
-                    blank = blank or self._blank(names)
-                    yield dict(blank)
+                    lost = bool(self.damaged[frame])
+                    blanks[lost] = blanks.get(lost) or self._blank(names, _DAMAGED if lost else _NOT_YET)
+                    yield dict(blanks[lost])
                     continue
                 if shard != opened:
                     if file is not None:
@@ -211,31 +241,81 @@ class FrameTable:
         except OSError as error:
             raise ResultError(f"{self.files[shard]} cannot be read: {error.strerror or error}") from None
         except (ResultError, ValueError, TypeError, RecursionError, zlib.error) as error:
-            raise ResultError(f"{self.files[shard]} is damaged in frame {frame}: {error}") from None
+            raise ResultError(f"{self.files[shard]} is damaged in frame {frame}: {error}; {_REMEDY}") from None
         finally:
             if file is not None:
                 file.close()
 
-    def _blank(self, names: Sequence[str] | None) -> dict[str, Any]:
+    def _blank(self, names: Sequence[str] | None, reason: str) -> dict[str, Any]:
         sizes = self.layout.sizes
-        values = FrameRecord.failed(_NOT_YET, nodes=sizes["node"], lights=sizes["light"]).values
+        values = FrameRecord.failed(reason, nodes=sizes["node"], lights=sizes["light"]).values
         return {name: values[name] for name in (values if names is None else names)}
 
 
-def _entries(file: Path) -> AnyArray:
-    """The entries that count of one file of records: whole, and of records that are whole."""
-    index = file.with_suffix(".index")
+def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], bool]:
+    """Frame, first byte, length and checksum of the head of each record of a file; whether a header is damaged.
+
+    Raises
+    ------
+    ResultError
+        It cannot be read, or holds a record of another run.
+    """
+    records, damaged, place, search = [], False, 0, 0
     try:
-        content, size = index.read_bytes(), file.stat().st_size
+        with file.open("rb", buffering=0) as opened:
+            size = os.fstat(opened.fileno()).st_size
+            while place < size:
+                opened.seek(place)
+                header = opened.read(_HEADER.size)
+                found = _parsed(header, file, run)
+                search = search if found is None else place + 1
+                if found is not None and place + len(header) + found[1] <= size:
+                    frame, length, head = found
+                    records.append((frame, place + len(header), length, head))
+                    place += len(header) + length
+                    continue
+                with mmap.mmap(opened.fileno(), size, access=mmap.ACCESS_READ) as content:
+                    place = content.find(run, search, max(size - _HEADER.size + len(run), 0))
+                # a record that is not whole at the end is what a killed process leaves
+                damaged |= place >= 0 or (found is None and len(header) == _HEADER.size)
+                if place < 0:
+                    break
+                search = place + 1
     except OSError as error:
-        raise ResultError(f"{error.filename} cannot be read: {error.strerror or error}") from None
-    entries = np.frombuffer(content, dtype=_ENTRY, count=len(content) // _ENTRY.itemsize)
-    places = range(0, len(entries) * _ENTRY.itemsize, _ENTRY.itemsize)
-    checks = np.array([zlib.crc32(content[place : place + _CHECKED]) for place in places], dtype=np.uint32)
-    good = np.flatnonzero(checks == entries["check"])
-    last = good[-1] + 1 if len(good) else 0
-    if len(good) < last:
-        raise ResultError(f"{index} is damaged: the checksum of an entry before its last is wrong")
-    entries = entries[:last]
-    start, length = entries["start"], entries["length"]
-    return np.asarray(entries[(start <= size) & (length <= size) & (start + length <= size)])
+        raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
+    return records, damaged
+
+
+def _parsed(header: bytes, file: Path, run: bytes) -> tuple[int, int, int] | None:
+    """Frame, length and checksum of the head that a header tells; None where it is damaged."""
+    if len(header) < _HEADER.size:
+        return None
+    owner, frame, length, head, check = _HEADER.unpack(header)
+    if zlib.crc32(header[:_CHECKED]) != check:
+        return None
+    if owner != run:
+        raise ResultError(f"{file} is of another run than {file.parent.parent / PROVENANCE}: {PUT_BACK}")
+    return frame, length, head
+
+
+def _header(run: bytes, frame: int, length: int, head: int) -> bytes:
+    checked = _HEADER.pack(run, frame, length, head, 0)[:_CHECKED]
+    return checked + struct.pack("<I", zlib.crc32(checked))
+
+
+def discard(folder: Path, run: bytes, frames: Collection[int]) -> None:
+    """Take back all records of some frames, so that nothing can bring them back; no other run may write meanwhile.
+
+    Raises
+    ------
+    ResultError
+        The disk refuses.
+    """
+    for file in (file for file in shard_files(folder) if file.suffix == ".frames"):
+        old = [record for record in _records(file, run)[0] if record[0] in frames]
+        with writing(file), file.open("r+b") as opened:
+            for _, start, length, head in old:
+                opened.seek(start - _HEADER.size)
+                opened.write(_header(run, _NO_FRAME, length, head))
+            opened.flush()
+            os.fsync(opened.fileno())

@@ -7,7 +7,7 @@ starts first; all else follows from what it has fingerprints of, so that whoever
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,16 +20,28 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results.files import read_arrays, read_json, write_arrays, write_json, write_new_json, writing
 from rgbmidic.results.layout import RecordLayout
 from rgbmidic.results.lock import ALL_FRAMES, Claim
-from rgbmidic.results.provenance import PROVENANCE, Origin, check_same, digest, now, read_provenance
+from rgbmidic.results.provenance import (
+    PROVENANCE,
+    PUT_BACK,
+    Origin,
+    check_same,
+    digest,
+    fingerprint,
+    is_result,
+    now,
+    read_provenance,
+    sealed,
+)
 from rgbmidic.results.quantities import SHARED
 from rgbmidic.results.record import FrameRecord
-from rgbmidic.results.shards import FrameTable, ShardWriter, shard_files
+from rgbmidic.results.shards import FrameTable, ShardWriter, discard, shard_files
 from rgbmidic.typing import AnyArray, BoolArray, FloatImage
 
 __all__ = [
     "ResultStore",
     "check_complete",
     "finish_result",
+    "listed",
     "load_frames",
     "read_mesh",
     "read_names",
@@ -37,6 +49,8 @@ __all__ = [
 ]
 
 _NAMES, _MESH, _REFERENCE, _FRAMES = "frames.json", "mesh.npz", "reference.npz", "solution"
+_LISTED = 5
+"""Frames that a message names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,15 +95,13 @@ class ResultStore:
             The folder is in use by another run, holds a result (and `overwrite` is False) or foreign files under a
             result's names, or cannot be written.
         """
-        store = cls._claimed(Path(path), origin, ALL_FRAMES)
-        with _releasing(store):
-            _make_room(store.path, overwrite=overwrite)
-            _start(store.path, origin)
-        return store
+        return cls._claimed(Path(path), origin, ALL_FRAMES, overwrite=overwrite)
 
     @classmethod
     def resume(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
         """Go on with a result: `finished` tells what is there already.
+
+        How it is read (``[scale]``, ``[setup]``, ``[probes]``) is from now on as `origin` says.
 
         Parameters
         ----------
@@ -107,7 +119,12 @@ class ResultStore:
             being written by another run.
         """
         read_provenance(Path(path))
-        return cls.join(path, origin, frames=frames)
+        store = cls.join(path, origin, frames=frames)
+        with _releasing(store):
+            kept, stated = read_provenance(store.path), origin.provenance().get("settings")
+            if kept.get("settings") != stated:
+                write_json(store.path / PROVENANCE, sealed({**kept, "settings": stated}))
+        return store
 
     @classmethod
     def join(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
@@ -115,24 +132,21 @@ class ResultStore:
 
         Parameters and errors as `resume`; foreign files as `create`.
         """
-        store = cls._claimed(Path(path), origin, range(len(origin.names)) if frames is None else frames)
-        with _releasing(store):
-            _start(store.path, origin)
-        return store
+        return cls._claimed(Path(path), origin, range(len(origin.names)) if frames is None else frames)
 
     @classmethod
-    def _claimed(cls, path: Path, origin: Origin, frames: range) -> Self:
-        """The store with its claim, before anything is in the folder."""
+    def _claimed(cls, path: Path, origin: Origin, frames: range, *, overwrite: bool | None = None) -> Self:
+        """The store with its claim and its beginning; None: whatever is there stays."""
         count, sizes = len(origin.names), {"node": len(origin.mesh["nodes"]), "light": len(origin.lights)}
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-        return cls(
-            path=path,
-            frame_count=count,
-            sizes=sizes,
-            _claim=Claim.take(path, frames),
-            _writer=ShardWriter(path / _FRAMES, RecordLayout.of(sizes)),
-        )
+        claim = Claim.take(path, frames)
+        with _releasing(claim):
+            if overwrite is not None:
+                _make_room(path, overwrite=overwrite)
+            run = _start(path, origin)
+            writer = ShardWriter(path / _FRAMES, RecordLayout.of(sizes), run)
+            return cls(path=path, frame_count=count, sizes=sizes, _claim=claim, _writer=writer)
 
     def __enter__(self) -> Self:
         return self
@@ -165,13 +179,25 @@ class ResultStore:
             raise InputError(f"frame {index} has the sizes {record.sizes}, the result {self.sizes}")
         self._writer.append(index, record)
 
+    def discard(self, frames: Collection[int]) -> None:
+        """Take frames back, which are to be measured again; a `ResultError` where the disk refuses."""
+        if frames:
+            self.reopen()
+            discard(self.path / _FRAMES, self._writer.run, frames)
+
     def finished(self) -> BoolArray:
         """Which frames of the test are in the folder, whoever wrote them, shape (T,)."""
         return self.table().finished
 
     def table(self) -> FrameTable:
         """What is in the folder now, whoever wrote it; reads it."""
-        return load_frames(self.path, self.sizes, self.frame_count)
+        return load_frames(self.path, self.sizes, self.frame_count, self._writer.run)
+
+    def reopen(self) -> None:
+        """Take the date of its end out of the provenance, before frames are written."""
+        provenance = read_provenance(self.path)
+        if provenance.pop("finished", None) is not None:
+            write_json(self.path / PROVENANCE, sealed(provenance))
 
     def finish(self) -> None:
         """`release` and `finish_result`: when every frame is written."""
@@ -180,45 +206,60 @@ class ResultStore:
 
 
 @contextmanager
-def _releasing(store: ResultStore) -> Iterator[None]:
-    """Release a store if the block fails."""
+def _releasing(holder: ResultStore | Claim) -> Iterator[None]:
+    """Release a store or its claim if the block fails."""
     try:
         yield
     except BaseException:
-        store.release()
+        holder.release()
         raise
 
 
 def finish_result(path: Path | str) -> None:
-    """Put the date of its end into the provenance of a result.
+    """Put the date of its end into the provenance of a result, once every record is read and found whole.
 
     Raises
     ------
     ResultError
-        The folder is no result, a frame is missing, or it cannot be written.
+        The folder is no result, a frame is missing or damaged, or it cannot be written.
     """
     path = Path(path)
     provenance = read_provenance(path)
     names = read_names(path, provenance)
     sizes = {"node": len(read_mesh(path, provenance)["nodes"]), "light": len(provenance["lights"])}
-    check_complete(path, names, load_frames(path, sizes, len(names)).finished)
-    write_json(path / PROVENANCE, {**provenance, "finished": now()})
+    ended = "finished" in provenance
+    table = load_frames(path, sizes, len(names), fingerprint(provenance)).without_damaged(ended=ended)
+    check_complete(path, names, table, ended=ended)
+    if not ended:
+        write_json(path / PROVENANCE, sealed({**provenance, "finished": now()}))
 
 
-def check_complete(path: Path, names: tuple[str, ...], finished: BoolArray) -> None:
-    """Raise a `ResultError` that says how many frames are missing, and the first of them."""
-    if not finished.all():
-        first, missing = int(finished.argmin()), int((~finished).sum())
-        more = f" and {missing - 1} more" if missing > 1 else ""
+def check_complete(path: Path, names: tuple[str, ...], table: FrameTable, *, ended: bool) -> None:
+    """Raise a `ResultError` that names the frames that are missing, or lost to damage where the result had `ended`."""
+    missing = np.flatnonzero(~table.finished).tolist()
+    if not missing:
+        return
+    told = listed(missing, names)
+    if ended or table.gaps or table.damaged.any():
+        where = f" ({', '.join(file.name for file in table.gaps)})" if table.gaps else ""
         raise ResultError(
-            f"{path} is incomplete: frame {first} ({names[first]}) of {len(names)} is missing{more}; was the run "
-            "interrupted, or does it go on?"
+            f"{path} is damaged{where}: of {len(names)} frames are lost {told}; `rgbmidic run TEST.toml --out {path} "
+            "--resume` measures them again, --partial (partial=True) reads the rest"
         )
+    raise ResultError(
+        f"{path} is incomplete: of {len(names)} frames are missing {told}; was the run interrupted, or does it go on?"
+    )
 
 
-def load_frames(path: Path, sizes: Mapping[str, int], count: int) -> FrameTable:
-    """What is in the folder of a result of `count` frames now."""
-    return FrameTable.load(path / _FRAMES, RecordLayout.of(sizes), count)
+def listed(frames: Sequence[int], names: Sequence[str]) -> str:
+    """The first frames of a list with their names, and how many more there are."""
+    more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
+    return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:_LISTED]) + more
+
+
+def load_frames(path: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
+    """What is in the folder of a result of `count` frames now, of the run with this digest."""
+    return FrameTable.load(path / _FRAMES, RecordLayout.of(sizes), count, run)
 
 
 def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
@@ -241,11 +282,20 @@ def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
     return mesh
 
 
-def read_reference(path: Path, sizes: Mapping[str, int]) -> npt.NDArray[np.uint8] | None:
-    """Reference image of each light as a picture, shape (k, H, W); None where none was kept."""
-    if not (path / _REFERENCE).is_file():
+def read_reference(path: Path, sizes: Mapping[str, int], run: bytes) -> npt.NDArray[np.uint8] | None:
+    """Reference image of each light as a picture, shape (k, H, W); None where none was kept.
+
+    Raises
+    ------
+    ResultError
+        The file is damaged, or of another run than the one with this digest.
+    """
+    file = path / _REFERENCE
+    if not file.is_file():
         return None
-    pictures: npt.NDArray[np.uint8] = _read(path / _REFERENCE, ["reference"], sizes)["reference"]
+    if read_arrays(file, ["run"])["run"].tobytes() != run:
+        raise ResultError(f"{file} is of another run than {path / PROVENANCE}: {PUT_BACK}")
+    pictures: npt.NDArray[np.uint8] = _read(file, ["reference"], sizes)["reference"]
     return pictures
 
 
@@ -268,9 +318,8 @@ def _pictures(images: FloatImage) -> npt.NDArray[np.uint8]:
 
 def _make_room(path: Path, *, overwrite: bool) -> None:
     """Empty the folder of an old result, its provenance last; nothing else in it is touched."""
-    if not (path / PROVENANCE).exists():
+    if not is_result(path):
         return
-    read_provenance(path)  # refuses foreign files of this name
     if not overwrite:
         raise ResultError(
             f"{path} already holds a result; choose another folder, overwrite it (overwrite=True, --overwrite), or go "
@@ -281,21 +330,35 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
             file.unlink(missing_ok=True)
 
 
-def _start(path: Path, origin: Origin) -> None:
-    """Let the folder hold what all frames share; refuse one of another origin."""
+def _start(path: Path, origin: Origin) -> bytes:
+    """Let the folder hold what all frames share, anew where it is missing or damaged; refuse one of another origin.
+
+    Gives the digest of the run, of the provenance that is there: it may write the same number in another way.
+    """
     foreign = [file for name in (_MESH, _REFERENCE, _NAMES) if (file := path / name).exists()]
     foreign += shard_files(path / _FRAMES)
-    provenance = origin.provenance()
+    stated = origin.provenance()
     if not (path / PROVENANCE).exists():  # looked at after the others: it is the first to appear
         if foreign:
             raise ResultError(f"{path} holds a {foreign[0].name} that is not of a result; give another folder")
-        write_new_json(path / PROVENANCE, provenance)
-    check_same(path, read_provenance(path), provenance)
+        write_new_json(path / PROVENANCE, sealed(stated))
+    kept = read_provenance(path)
+    check_same(path, kept, stated)
     with writing(path):
         (path / _FRAMES).mkdir(exist_ok=True)
-    if not (path / _NAMES).exists():
+    run, sizes = fingerprint(kept), {"light": len(origin.lights)}
+    if not _readable(lambda: read_names(path, kept)):
         write_json(path / _NAMES, list(origin.names))
-    if not (path / _MESH).exists():
+    if not _readable(lambda: read_mesh(path, kept)):
         write_arrays(path / _MESH, origin.mesh)
-    if origin.reference is not None and not (path / _REFERENCE).exists():
-        write_arrays(path / _REFERENCE, {"reference": _pictures(np.asarray(origin.reference, dtype=np.float32))})
+    if origin.reference is not None and not _readable(lambda: read_reference(path, sizes, run)):
+        pictures = _pictures(np.asarray(origin.reference, dtype=np.float32))
+        write_arrays(path / _REFERENCE, {"reference": pictures, "run": np.frombuffer(run, dtype=np.uint8)})
+    return run
+
+
+def _readable(read: Callable[[], object]) -> bool:
+    try:
+        return read() is not None
+    except ResultError:
+        return False

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import tifffile
 from cine_files import write_cine
-from results import make_origin, make_result, random_record
+from results import make_origin, make_result, random_record, smooth_record
 
 from rgbmidic import __version__, cli, report
 from rgbmidic.command import execute, read_shape
@@ -118,18 +118,29 @@ def test_bad_frames_are_status_2_and_an_interruption_130(
 def test_a_termination_ends_a_run_in_the_background_of_a_script_too(
     command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
 ) -> None:
+    """It says how to go on; before there is a result, or while there is but an old one, that there is nothing yet."""
+    out, begins = test_file.parent / "out", False
+
     def measure(*_: Any, **__: Any) -> Result:
+        if begins:
+            make_result(out, overwrite=True, record=smooth_record)
         os.kill(os.getpid(), signal.SIGTERM)
         raise AssertionError("still running")
 
     _replace_pipeline(monkeypatch, measure)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a job behind &
     try:
-        status, _, error = command("run", test_file, "--out", test_file.parent / "out")
+        for begun, resume, told in (
+            (False, False, "nothing was begun: run the same command again"),
+            (True, False, f"rgbmidic run {test_file} --out {out} --resume"),
+            (False, False, "nothing was begun"),
+            (False, True, f"rgbmidic run {test_file} --out {out} --resume"),
+        ):
+            begins = begun
+            status, _, error = command("run", test_file, "--out", out, "--resume" if resume else "--overwrite")
+            assert (status, told in error) == (130, True)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert status == 130
-    assert "--resume" in error
 
 
 def test_run_passes_everything_on_and_tells_what_came_out(
@@ -167,7 +178,8 @@ def _measure_of(*ends: str) -> Callable[..., Result]:
         store = ResultStore.create(out, origin, overwrite=True)
         good = FrameRecord.of(nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_share=np.ones((4, 1)))
         for index, reason in enumerate(("", *ends)):
-            store.write_frame(index, FrameRecord.failed(reason, nodes=4, lights=1) if reason else good)
+            failed = FrameRecord.failed(reason, nodes=4, lights=1, unread=reason == "torn")
+            store.write_frame(index, failed if reason else good)
         store.finish()
         return Result.open(out)
 
@@ -182,7 +194,7 @@ def test_run_in_which_no_deformed_frame_is_measured_is_a_failure(
         _replace_pipeline(monkeypatch, _measure_of(*ends))
         status, printed, error = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
         assert status == 1
-        assert error.startswith("error: no deformed frame is measured")
+        assert f"error: {len(ends)} of {len(ends)} deformed frames failed" in error
         assert told in error
         assert f"{len(ends)} deformed: 0 converged, {len(ends)} failed" in printed
         assert "75.0%" not in printed
@@ -196,6 +208,12 @@ def test_run_tells_how_many_deformed_frames_failed(
     assert status == 0
     assert "3 deformed: 2 converged, 1 failed" in printed
     assert "50.0% measured" in printed  # 3 of 4 nodes in two frames, none in one; the reference does not count
+    for ends, expected in (("", "torn"), 0), (("", "torn", "torn"), 1):  # half of them, and more
+        _replace_pipeline(monkeypatch, _measure_of(*ends))
+        status, _, error = command("run", test_file, "--out", test_file.parent / "out", "--no-figures")
+        assert (status, "2 of 3 deformed frames failed; the first, f2: torn" in error) == (expected, bool(expected))
+        assert f"frames that could not be read: {1 + expected}; --resume tries them again" in error
+        assert Result.open(test_file.parent / "out").finished.all()
 
 
 def test_figures_later(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,6 +283,24 @@ def test_export_of_an_interrupted_run(command: Run, tmp_path: Path) -> None:
     with np.load(tmp_path / "a.npz") as archive:
         assert archive["names"].tolist() == ["frame 0", "frame 1", "frame 2"]
         assert np.isnan(archive["u"]).all(axis=1).tolist() == [True, False, True]
+
+
+def test_export_of_a_damaged_result(command: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    result = make_result(tmp_path / "out", frames=3)
+    file = result.path / "solution" / "000000.frames"
+    content = bytearray(file.read_bytes())
+    content[int(result.table.start[1] + result.table.length[1] // 2)] ^= 16
+    file.write_bytes(content)
+    status, _, error = command("export", result.path, "--out", tmp_path / "a.npz")
+    assert status == 2
+    assert "000000.frames is damaged in frame 1: " in error
+    assert "--partial" in error
+    assert command("export", result.path, "--out", tmp_path / "a.npz", "--partial")[0] == 0
+    assert f"{result.path} is damaged: frames lost: 1 (frame 1)" in caplog.text
+    with np.load(tmp_path / "a.npz") as archive:
+        assert np.isnan(archive["u"]).all(axis=1).tolist() == [False, True, False]
+        np.testing.assert_array_equal(archive["u"][2], result.u[2])
+    assert command("finish", result.path, "--no-figures")[0] == 2
 
 
 def test_frames_says_what_a_reader_sees(command: Run, tmp_path: Path) -> None:

@@ -270,7 +270,7 @@ def test_the_reference_may_be_a_range(tmp_path: Path) -> None:
         assert len(open_series(stated, tmp_path)) == 12
     with pytest.raises(FrameError, match="reference names frame 12, but there are 12"):
         open_series(replace(stated, reference=tuple(range(5, 13))), tmp_path)
-    with pytest.raises(ConfigurationError, match=r'reference names 30000000 frames; at most 100000'):
+    with pytest.raises(ConfigurationError, match=r"reference names 30000000 frames; at most 100000"):
         TestSettings.from_mapping({"frames": {"path": "m.seq", "reference": "0:30000000"}}, tmp_path)
     for text in ("5:5", "5", "a:b", "-1:3", "0:5:2"):
         with pytest.raises(ConfigurationError, match=r"frames\.reference must be a range such as \"0:20\" \(0 to 19\)"):

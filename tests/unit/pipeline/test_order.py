@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rgbmidic.pipeline.order import STRIDE, children, is_key, lineage, parent
+from rgbmidic.pipeline.order import STRIDE, children, dependants, is_key, lineage, parent
 
 
 def test_a_frame_starts_from_the_one_before_it_and_a_key_frame_from_the_key_frame_before() -> None:
@@ -38,3 +38,15 @@ def test_the_line_of_a_frame_is_short(position: int) -> None:
     line = list(lineage(position))
     assert (line[0], line[-1]) == (position, 0)
     assert len(line) <= 1 + (STRIDE - 1) * 5
+
+
+@given(st.data())
+def test_what_depends_on_a_frame_starts_from_it_by_some_way(data: st.DataObject) -> None:
+    tries = data.draw(st.lists(st.sampled_from([1, 1, 1, 2]), min_size=1, max_size=600))
+    places = data.draw(st.sets(st.integers(0, len(tries) - 1), max_size=4))
+    reached = set[int]()
+    for place in range(1, len(tries)):  # what a frame starts from lies before it
+        starts = {parent(place), place - 1} if tries[place] > 1 else {parent(place)}
+        if starts & (reached | places):
+            reached.add(place)
+    assert dependants(places, tries) == reached

@@ -7,6 +7,7 @@ import logging
 import multiprocessing
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,13 +21,13 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic.correlation import Start, Status
-from rgbmidic.errors import ConfigurationError, FrameError, ResultError, RgbmidicError
-from rgbmidic.frames import write_tiff
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, ResultError, RgbmidicError
+from rgbmidic.frames import read_frame, write_tiff
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import measure, run, schedule, workers
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import ReferenceUpdates
-from rgbmidic.results import Result, finish_result
+from rgbmidic.results import Result, finish_result, scale_of
 from rgbmidic.settings import TestSettings
 
 COUNT, SHAPE = 36, (72, 80)
@@ -238,11 +239,134 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(movie: Path, whole: Result,
 def test_parts_in_any_order_make_the_whole(movie: Path, whole: Result, tmp_path: Path) -> None:
     out = tmp_path / "result"
     for part in (range(17, 36), range(17)):
-        with pytest.raises(ResultError, match=r"not a result|is missing"):
+        with pytest.raises(ResultError, match=r"not a result|are missing"):
             finish_result(out)
         measure(settings(movie), out, frames=part)
     finish_result(out)
     same(Result.open(out), whole)
+
+
+def copied(movie: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(movie, folder / "movie"))
+
+
+def counted(measured: list[str]) -> Any:
+    return lambda done, total, line: measured.append(line.partition(".")[0])
+
+
+@pytest.mark.parametrize("away", [(6, 7, 8, 9, 15, 16), (18, 19)])
+def test_frames_that_were_away_for_a_moment_are_measured_when_they_are_back(
+    movie: Path, whole: Result, tmp_path: Path, away: tuple[int, ...], caplog: Any
+) -> None:
+    """Whatever started from before them comes back to the bits of a run without an outage, also if interrupted."""
+    folder, out = copied(movie, tmp_path), tmp_path / "result"
+    files = [folder / f"f{index:03d}.tif" for index in away]
+
+    def outage(done: int, total: int, line: str) -> None:
+        for file in files if done in (4, 30) else ():
+            file.rename(file.with_suffix(".away")) if done == 4 else file.with_suffix(".away").rename(file)
+
+    result = measure(settings(folder), out, progress=outage)
+    assert np.flatnonzero(result.unread).tolist() == sorted((*away, 20))
+    assert np.flatnonzero(result.status == Status.FAILED).tolist() == sorted((*away, 20, 31, 32))
+    measured: list[str] = []
+
+    def interrupt(done: int, total: int, line: str) -> None:
+        measured.append(line)
+        if len(measured) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        measure(settings(folder), out, resume=True, progress=interrupt)
+    assert f"since it can be read now: {away[0]} " in caplog.text
+    again = measure(settings(folder), out, resume=True, progress=counted(measured))
+    assert len(measured) == COUNT - away[0]  # what lies before does not depend on them
+    for index in range(COUNT):  # f020.tif is named with its folder
+        expected = {**whole.frame(index).values, "inputs": None, "reason": None}
+        np.testing.assert_equal({**again.frame(index).values, "inputs": None, "reason": None}, expected)
+
+
+@pytest.mark.parametrize("kind", ["folder", "movie"])
+def test_a_source_that_vanishes_stops_the_run_and_fails_no_frame(
+    movie: Path, whole: Result, tmp_path: Path, kind: str
+) -> None:
+    folder, out = copied(movie, tmp_path), tmp_path / "result"
+    chosen, told = settings(folder), r"frames are gone: .*f000\.tif and all 36 files.*--resume"
+    if kind == "movie":
+        frames = [read_frame(folder / f"f{index:03d}.tif", kind="monochrome").values[0] for index in range(12)]
+        np.save(folder / "stack.npy", np.stack(frames))
+        chosen, told = settings(folder, path="stack.npy"), r"frames are gone: .*stack\.npy.*--resume"
+
+    def vanish(done: int, total: int, line: str) -> None:
+        if done == 10:
+            folder.rename(tmp_path / "elsewhere")
+
+    with pytest.raises(FrameError, match=told):
+        measure(chosen, out, progress=vanish)
+    partial = Result.open(out, partial=True)
+    assert partial.finished.sum() == 10
+    assert (partial.status[:10] == Status.CONVERGED).all()
+    (tmp_path / "elsewhere").rename(folder)
+    resumed = measure(chosen, out, resume=True)
+    np.testing.assert_array_equal(resumed.u, whole.u[: len(resumed)])
+
+
+def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
+    movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
+) -> None:
+    out = Path(shutil.copytree(whole.path, tmp_path / "result"))
+    kept, file = (out / "provenance.json").read_bytes(), out / "solution" / "000000.frames"
+    monkeypatch.setattr("rgbmidic.results.store.now", lambda: "later")
+    measured: list[str] = []
+    same(measure(settings(movie), out, resume=True, progress=counted(measured)), whole)
+    assert "is finished and whole: nothing is left to be measured" in caplog.text
+    assert ((out / "provenance.json").read_bytes(), measured) == (kept, [])
+    content = bytearray(file.read_bytes())
+    content[int(whole.table.start[12] + whole.table.length[12] // 2)] ^= (
+        4  # in the record of one frame, in the header of another
+    )
+    content[int(whole.table.start[25]) - 20] ^= 4
+    file.write_bytes(content)
+    with pytest.raises(
+        ResultError, match=r"damaged \(000000\.frames\): of 36 frames are lost 25 \(f025\.tif\); .*--res"
+    ):
+        Result.open(out)
+    same(measure(settings(movie), out, resume=True, progress=counted(measured)), whole)
+    assert "lost to damage and measured again: 12 (f012.tif), 25 (f025.tif)" in caplog.text
+    assert measured == ["f012", *(f"f{index:03d}" for index in range(25, COUNT))]  # nobody knows that 25 had not failed
+    assert Result.open(out).provenance["finished"] == "later"
+
+
+def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
+    movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(plan: Any, index: int, start: Start, renewed: Any) -> Any:
+        record = measure_frame(plan, index, start, renewed)
+        return schedule.failed_frame(plan, index, "out of memory") if index == 33 else record
+
+    with monkeypatch.context() as patched:
+        patched.setattr("rgbmidic.pipeline.workers.measure_frame", failing)
+        measure(settings(movie), tmp_path / "result")
+    measured: list[str] = []
+    result = measure(settings(movie), tmp_path / "result", resume=True, progress=counted(measured))
+    assert (result.frame(33).reason, measured) == ("out of memory", [])
+    with pytest.raises(InputError, match="--retry-failed goes with --resume"):
+        measure(settings(movie), tmp_path / "result", retry_failed=True)
+    same(measure(settings(movie), tmp_path / "result", resume=True, retry_failed=True), whole)
+
+
+def test_how_a_result_is_read_is_stated_anew_by_going_on_with_it(movie: Path, whole: Result, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(whole.path, tmp_path / "result"))
+    text = (out / "provenance.json").read_text()
+    (out / "provenance.json").write_text(text.replace('"element_size": 18.0', '"element_size": 19.0'))
+    with pytest.raises(ResultError, match=r"provenance\.json was changed after it was written.*--test TEST\.toml"):
+        Result.open(out)
+    (out / "provenance.json").write_text(text)
+    scaled = TestSettings.from_mapping({**settings(movie).to_mapping(), "scale": {"mm_per_pixel": 0.02}}, movie)
+    result = measure(scaled, out, resume=True)
+    assert (scale_of(whole).mm_per_pixel, scale_of(result).mm_per_pixel) == (None, 0.02)
+    assert result.provenance["finished"] == whole.provenance["finished"]
+    same(result, whole)
 
 
 def test_going_on_with_something_else_is_refused_by_name(movie: Path, whole: Result, tmp_path: Path) -> None:

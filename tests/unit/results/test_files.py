@@ -14,10 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from damage import damage_results, write_result
 from results import make_result
 
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
+from rgbmidic.results.provenance import fingerprint
 from rgbmidic.results.store import load_frames
 from rgbmidic.typing import AnyArray
 
@@ -78,16 +80,15 @@ def test_a_mutated_file_is_read_or_told(copy: Path, name: str) -> None:
     assert all(str(copy) in message for message in told)
 
 
-@pytest.mark.parametrize("ending", ["frames", "index"])
-def test_mutated_frames_are_read_told_or_not_measured_yet(copy: Path, ending: str) -> None:
+def test_mutated_frames_are_read_told_or_not_there(copy: Path) -> None:
     """Also quantity by quantity, and opened as a run that goes on: never anything else than what was written."""
-    file, whole = copy / "solution" / f"000000.{ending}", Result.open(copy)
+    file, whole = copy / "solution" / "000000.frames", Result.open(copy)
     content, records = file.read_bytes(), [whole.frame(index).values for index in range(2)]
-    told, absent = list[str](), 0
-    for mutated in _mutations(content, len(ending), SHARD_COPIES):
+    told, absent, run = list[str](), 0, fingerprint(whole.provenance)
+    for mutated in _mutations(content, 6, SHARD_COPIES):
         file.write_bytes(mutated)
         try:
-            table = load_frames(copy, whole.table.layout.sizes, 2)
+            table = load_frames(copy, whole.table.layout.sizes, 2, run)
             there = np.flatnonzero(table.finished)
             absent += 2 - len(there)
             for index, values in zip(there, table.each(["u", "status", "reason"], there), strict=True):
@@ -99,18 +100,63 @@ def test_mutated_frames_are_read_told_or_not_measured_yet(copy: Path, ending: st
     assert len(told) + absent > SHARD_COPIES / 2
 
 
+def test_results_damaged_at_random_are_right_or_told(tmp_path: Path) -> None:
+    """Bits, digits of the provenance, pieces lost, doubled or cut off, files swapped with another run's or gone."""
+    ends = damage_results(tmp_path, 40, seed=4)
+    assert sum(ends.values()) == 40
+    assert sum(times for (_, end), times in ends.items() if end == "right") < 20
+    assert any(end == "told, the rest read, healed by --resume" for _, end in ends)
+
+
+@pytest.mark.parametrize("name", ["solution/000001.frames", "reference.npz", "mesh.npz", "provenance.json"])
+def test_a_file_of_another_run_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    """The same mesh, frames and lights, another tolerance of the solver: its numbers are not this run's."""
+    mine, other = write_result(tmp_path / "mine"), write_result(tmp_path / "other", tolerance=2e-3, seed=1)
+    if name == "mesh.npz":
+        np.savez(other / name, nodes=Result.open(other).nodes + 1e-9, elements=Result.open(other).elements)
+    shutil.copy(other / name, mine / name)
+    shown = "000000.frames is of another run" if name == "provenance.json" else f"{name} is .*another"
+    with pytest.raises(ResultError, match=shown):
+        _ = Result.open(mine, partial=True).reference
+
+
+def test_a_damaged_header_or_record_loses_its_frame_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Records of one file of four frames: a bit in a header, a bit in a record; the rest is as it was written."""
+    whole = Result.open(write_result(tmp_path / "out"))
+    file, table = whole.path / "solution" / "000000.frames", whole.table
+    content = bytearray(file.read_bytes())
+    content[int(table.start[1]) - 3] ^= 1
+    content[int(table.start[2] + table.length[2]) - 1] ^= 128
+    file.write_bytes(content)
+    with pytest.raises(
+        ResultError, match=r"\(000000\.frames\): of 6 frames are lost 1 \(frame 1\); .*--resume.*partial"
+    ):
+        Result.open(whole.path)
+    rest = Result.open(whole.path, partial=True)
+    assert rest.finished.tolist() == [True, False, False, True, True, True]
+    assert rest.reasons[1:3] == ("damaged", "damaged")
+    assert "frames lost: 1 (frame 1), 2 (frame 2); " in caplog.text
+    assert np.isnan(rest.u[1:3]).all()
+    np.testing.assert_array_equal(rest.u[[0, 3, 4, 5]], whole.u[[0, 3, 4, 5]])
+    assert rest.refresh().finished.tolist() == rest.finished.tolist()
+    content[int(table.start[1]) - 3] ^= 1  # then only the record is damaged, which shows when it is read
+    file.write_bytes(content)
+    with pytest.raises(ResultError, match=r"000000\.frames is damaged in frame 2: .*--resume"):
+        list(Result.open(whole.path).each("reflection_thumbnail"))
+
+
 @pytest.mark.parametrize("size", [0, 7, 2**31, 2**32 - 1])
 @pytest.mark.parametrize("name", ["history", "inputs", "rigid", "weights_thumbnail"])
 def test_a_forged_head_is_told(copy: Path, name: str, size: int) -> None:
     """Sizes that no record has, their checksums right: no memory is taken for what is not there."""
     table = Result.open(copy).table
     file = table.files[0]
-    content = bytearray(file.read_bytes())
+    content, first = bytearray(file.read_bytes()), int(table.start[0])
     place = table.layout.open[name]
     for number in place.shape:
-        content[4 * number : 4 * number + 4] = size.to_bytes(4, "little")
+        content[first + 4 * number : first + 4 * number + 4] = size.to_bytes(4, "little")
     file.write_bytes(content)
-    table.head[0] = zlib.crc32(content[: table.layout.head])
+    table.head[0] = zlib.crc32(content[first : first + table.layout.head])
     tracemalloc.start()
     try:
         with pytest.raises(ResultError, match="damaged in frame 0"):

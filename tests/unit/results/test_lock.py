@@ -108,5 +108,5 @@ def test_a_copy_in_another_process_writes_files_of_its_own(tmp_path: Path) -> No
         store.write_frame(0, random_record(0))
         pickle.loads(pickle.dumps(store)).write_frame(1, random_record(1))
         store.write_frame(0, random_record(0))
-    assert len(list((tmp_path / "out" / "solution").glob("*.index"))) == 2
+    assert len(list((tmp_path / "out" / "solution").glob("*.frames"))) == 2
     np.testing.assert_array_equal(Result.open(tmp_path / "out").u, [random_record(0).u, random_record(1).u])
