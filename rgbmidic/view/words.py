@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
+from bokeh.document import Document
 
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Result
@@ -15,7 +16,7 @@ from rgbmidic.typing import FloatArray
 from rgbmidic.view.fields import Field, Values
 from rgbmidic.view.picture import element_at
 
-__all__ = ["frame_words", "guarded", "pointed_words", "warning"]
+__all__ = ["frame_words", "guarded", "pointed_words", "warning", "watched"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +37,12 @@ def guarded(act: Callable[[], None], complain: Callable[[str], None]) -> None:
     except Exception as error:  # the last resort of a page
         logger.exception("the page failed")
         complain(f"{type(error).__name__}: {error}")
+
+
+def watched(document: Document) -> bool:
+    """Whether a browser shows the page: one that was left lives on for a while, and does nothing more."""
+    session = document.session_context.session if document.session_context else None
+    return session is None or session.connection_count > 0
 
 
 def frame_words(result: Result, place: int, field: Field, values: Values, remark: str) -> str:
