@@ -50,7 +50,7 @@ _THEMES = {"dark": "dark_minimal"}
 class _Site(Application):  # type: ignore[misc]  # see pyproject.toml
     """What builds the pages of an address; others are served between two that are let go.
 
-    Bokeh collects garbage, .1 to .3 s of all there is, twice for each page, and lets go of those that were left in a row.
+    Bokeh lets go of all pages that were left in a row, and collects garbage twice for each: .1 to .3 s a time.
     """
 
     async def on_session_destroyed(self, session_context: Any) -> None:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from bokeh.document import Document
 
 from rgbmidic.errors import RgbmidicError
+from rgbmidic.report.style import time_unit
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Result
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.fields import Field, Values
@@ -51,7 +52,9 @@ def frame_words(result: Result, place: int, field: Field, values: Values, remark
     missing = float(np.mean(read["node_status"] != 0))
     measured = bool(result.finished[place])
     end = QUANTITIES["status"].codes[read["status"]] if measured else "not measured yet"
-    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {read['time_ns'] * 1e-9:.6g} s"
+    seconds = read["time_ns"] * 1e-9
+    factor, unit = time_unit(np.array([seconds]))
+    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {factor * seconds:.6g} {unit}"
     lost = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
     lines = [f"Frame {place} of {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{lost}"]
     if read["reason"] and measured:
