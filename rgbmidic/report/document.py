@@ -77,7 +77,7 @@ def write_report(
     probes = probes_of(result) if settings is None else settings.probes
     told = Physical.of(result, None if settings is None else settings.scale)
     text = _Report.of(told, setup, probes, frames).page().html
-    write_complete(out, lambda file: file.write(text.encode(errors="backslashreplace")))  # names that are no UTF-8
+    write_complete(out, lambda file: file.write(text.encode()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
