@@ -98,7 +98,10 @@ class TimeLine:
 
     def __init__(self, frames: int, now: int) -> None:
         self._drawn = -1
-        self._shares, self._faults = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "colour": []})
+        self._shares, self._faults = (
+            ColumnDataSource({"x": [], "y": []}),
+            ColumnDataSource({"x": [], "colour": []}, name="faults"),
+        )
         self.plot = figure(
             sizing_mode="stretch_both",
             x_range=Range1d(-0.5, max(frames - 0.5, 0.5)),
