@@ -177,6 +177,7 @@ def test_a_frame_that_does_not_converge_says_that_its_elements_are_too_small(tmp
     cause = "elements of 5 px are too small for speckles of 5.[5-9] px: .* set mesh.element_size to 12 or more"
     assert result.status[1] != Status.CONVERGED
     assert re.search(cause, result.reasons[1])
+    assert "no start found" not in result.reasons[1]
     start, frame, *more = (record.message for record in caplog.records)
     assert re.match(cause, start)
     assert re.search(cause, frame)
