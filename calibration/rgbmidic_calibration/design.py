@@ -18,6 +18,7 @@ import numpy as np
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.spectra import Led, Sensitivities
+from rgbmidic.report.style import literal
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -227,7 +228,7 @@ def draw_design(result: Design, camera: Sensitivities, lamps: Mapping[str, Lamp]
         for name, column in zip(result.crosstalk.lights, result.crosstalk.matrix.T, strict=True):
             power = lamps[name].power(camera.wavelengths)
             colour = COLOURS[column.argmax()]
-            axes.fill_between(camera.wavelengths, power / power.max(), alpha=0.25, label=name, color=colour)
+            axes.fill_between(camera.wavelengths, power / power.max(), alpha=0.25, label=literal(name), color=colour)
         axes.set(xlabel="wavelength, nm", ylabel="relative")
         axes.legend(fontsize="small")
 

@@ -13,6 +13,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.camera_noise import CameraNoise
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.registration import Registration
+from rgbmidic.report.style import literal
 from rgbmidic_calibration.crosstalk import CHANNELS
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def draw_matrix(axes: Axes, crosstalk: Crosstalk) -> None:
     axes.imshow(matrix, cmap="Greys", vmin=0, vmax=1.4)
     for (row, column), value in np.ndenumerate(matrix):
         axes.text(column, row, f"{value:.3f}", ha="center", va="center", color="w" if value > 0.8 else "k")
-    axes.set_xticks(range(len(crosstalk.lights)), crosstalk.lights)
+    axes.set_xticks(range(len(crosstalk.lights)), list(map(literal, crosstalk.lights)))
     axes.set_yticks(range(len(matrix)), CHANNELS[: len(matrix)])
     axes.set(xlabel="light", ylabel="camera channel")
     axes.set_title(f"crosstalk A, condition number {crosstalk.condition_number:.2f}", fontsize="medium")
@@ -87,7 +88,7 @@ def _draw_field(axes: Axes, crosstalk: Crosstalk) -> None:
     image = axes.imshow(values[..., row, column], extent=(0, width, height, 0), cmap="viridis")
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
     axes.set(xlabel="x, px", ylabel="y, px")
-    axes.set_title(f"{CHANNELS[row]} seen of {crosstalk.lights[column]}", fontsize="medium")
+    axes.set_title(f"{CHANNELS[row]} seen of {literal(crosstalk.lights[column])}", fontsize="medium")
 
 
 def _draw_noise(axes: Axes, noise: CameraNoise) -> None:
@@ -112,7 +113,11 @@ def _draw_registration(axes: Axes, registration: Registration) -> None:
     for index, name in enumerate(registration.lights[1:], start=1):
         u, v = moved[index].T * 0.1 * radius / largest
         colour = COLOURS[index % len(COLOURS)]
-        axes.quiver(points[:, 0], points[:, 1], u, v, color=colour, angles="xy", scale_units="xy", scale=1, label=name)
+        axes.quiver(
+            points[:, 0], points[:, 1], u, v, color=colour, angles="xy", scale_units="xy", scale=1, label=literal(name)
+        )
     axes.set(xlabel="x, px", ylabel="y, px", xlim=(-0.1 * x, 2.1 * x), ylim=(2.1 * y, -0.1 * y), aspect="equal")
-    axes.set_title(f"seen elsewhere than by {registration.lights[0]}, up to {largest:.2f} px", fontsize="medium")
+    axes.set_title(
+        f"seen elsewhere than by {literal(registration.lights[0])}, up to {largest:.2f} px", fontsize="medium"
+    )
     axes.legend(fontsize="small")

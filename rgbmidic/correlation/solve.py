@@ -197,7 +197,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         light_share=equations.light_share,
         misfit=np.where(measured, misfits, np.nan),
         status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
-        reason="" if converged else f"the last iteration still moved a node by {history[-1]:.3g} px",
+        reason="" if converged else _unsettled(problem, estimate, measured),
         rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
         weight_share=_shares(equations.weights),
@@ -236,6 +236,17 @@ def _judged(
             estimate,
         )
     return node_status
+
+
+def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str:
+    """Where the last iteration still moved which of the `measured` nodes (N,)."""
+    motion, tolerance = np.where(measured, estimate.increments[-1], 0.0), problem.options.tolerance
+    x, y = problem.reference.mesh.nodes[motion.argmax()]
+    return (
+        f"iteration {len(estimate.increments)}, the last, still moved {int((motion > tolerance).sum())} of "
+        f"{int(measured.sum())} nodes by more than the tolerance of {tolerance:g} px, most the one at x {x:.0f}, "
+        f"y {y:.0f}: by {motion.max():.3g} px"
+    )
 
 
 def _shares(weights: FloatImage) -> FloatArray:

@@ -106,6 +106,8 @@ def track(
 
 
 def _looked_for(surest: float) -> str:
+    if surest >= NEEDED:
+        return f"at the start found they agree around {surest:.0%} of the nodes, but the solve did not hold one of them"
     return (
         f"no start found: at the best one the images agree around {surest:.0%} of the nodes, of {NEEDED:.0%} needed. "
         f"Looked for were motions up to the region's longer side, at least 128 px, and turns up to about "

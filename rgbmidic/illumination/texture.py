@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import nnls
@@ -17,7 +18,7 @@ from scipy.optimize import nnls
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray
 
-__all__ = ["LAGS", "WHITE_ENERGY", "BandEnergy", "TextureModel", "fit_texture"]
+__all__ = ["LAGS", "WHITE_ENERGY", "BandEnergy", "TextureModel", "fit_texture", "speckle_diameter"]
 
 
 FARTHEST = 4.3
@@ -26,6 +27,8 @@ LAGS = np.array(
     [(i, j) for i in range(5) for j in range(-4, 5) if (i, j) > (0, 0) and np.hypot(i, j) <= FARTHEST], dtype=np.int64
 )
 """Distances (rows, columns) at which products of samples are taken."""
+_BACKGROUND = 20.0
+"""Standard deviation (px) of the local mean over which speckle stands out."""
 NARROWEST = 0.6
 """Standard deviation (px) of the narrowest Gaussian: what a square pixel lets through."""
 OFFSET_PENALTY = 0.05
@@ -239,3 +242,42 @@ def _private_share(model: TextureModel, sums: FloatArray, counts: FloatArray, co
     # how much of the colours' own share is still seen two pixels away, shrunk to 0 where that share is nearly nothing
     coarse = measured / max(float(model(2.0)) / band.own, 1e-3) - common
     return float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + INDISTINCT**2), 0, 1))
+
+
+def speckle_diameter(picture: FloatArray) -> float | None:
+    """Size of the speckle in a picture, without the peak that white noise has at distance 0.
+
+    Parameters
+    ----------
+    picture : ndarray, shape (H, W)
+        Finite at all pixels.
+
+    Returns
+    -------
+    float or None
+        Full width at half maximum of the autocorrelation, averaged over all directions, px; None without a texture.
+    """
+    texture = picture - cv2.GaussianBlur(picture, (0, 0), _BACKGROUND)
+    power = np.abs(np.fft.rfft2(texture, s=[2 * side for side in texture.shape])) ** 2
+    reach = min(int(2 * _BACKGROUND), *(side - 1 for side in texture.shape))
+    lag = np.arange(-reach, reach + 1)
+    pairs = np.multiply.outer(*(1 - np.abs(lag) / side for side in texture.shape))
+    mean, away = np.fft.irfft2(power)[np.ix_(lag, lag)] / pairs, np.hypot(lag[:, None], lag)
+    ring = away.round().astype(int).ravel()
+    product, distance = (np.bincount(ring, part.ravel()) / np.bincount(ring) for part in (mean, away))
+    if not (len(product) > 2 and product[0] > 0):
+        return None
+    product[0] = _without_noise(product, distance)
+    below = np.flatnonzero(product < 0.5 * product[0])
+    if not below.size:
+        return None
+    ends = slice(below[0], below[0] - 2 if below[0] > 1 else None, -1)
+    return float(2 * np.interp(0.5 * product[0], product[ends], distance[ends]))
+
+
+def _without_noise(product: FloatArray, distance: FloatArray) -> float:
+    """The autocorrelation at distance 0 without the peak of white noise there: a Gaussian through the next two."""
+    if not (product[1] > product[2] > 0):
+        return float(product[0])
+    fall = np.log(product[1] / product[2]) / (distance[2] ** 2 - distance[1] ** 2)
+    return float(min(product[1] * np.exp(fall * distance[1] ** 2), product[0]))

@@ -20,9 +20,10 @@ from rgbmidic.correlation.light_levels import brightness_change
 from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.raw_samples import exposure_fault
-from rgbmidic.pipeline.separation import correlated
+from rgbmidic.pipeline.raw_samples import exposure_fault, too_small
+from rgbmidic.pipeline.separation import RawState, correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
@@ -116,10 +117,11 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
     statistics = settings.weights.method == "statistics"
     solution = renewal.track(deformed, start, settings.solver, statistics=statistics)
-    if solution.status is Status.FAILED:
-        if fault := exposure_fault(state, plan.region.mask):
-            solution = replace(solution, reason=f"{fault} ({solution.reason})")
-        logger.warning("frame %d (%s) cannot be measured: %s", index, name, solution.reason)
+    if solution.status is not Status.CONVERGED:
+        causes = _causes(plan, state, images, solution)
+        solution = replace(solution, reason="; ".join([solution.reason, *causes]))
+        end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
+        logger.warning("frame %d (%s) %s: %s", index, name, end, solution.reason)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
     _tell_dark(name, images.names, brightness)
@@ -138,6 +140,25 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": inputs,
     }
+
+
+def _causes(plan: Plan, state: RawState, images: IlluminationImages, solution: Solution) -> list[str]:
+    """What may be why a frame did not converge or cannot be measured, and what to change."""
+    causes = [fault] if (fault := exposure_fault(state, plan.region.mask)) else []
+    there = np.where(np.isfinite(solution.displacement), solution.displacement, 0)
+    gains = brightness_change(plan.images.values, images.values, plan.reference, there)[:, 0]
+    causes += [
+        f"{light} shows the speckle with {gain:.0%} of its contrast in the reference: look at lamp and exposure"
+        for light, gain in zip(images.names, gains, strict=True)
+        if gain < _DARK and not fault
+    ]
+    if small := too_small(plan.settings.element_size, plan.speckle):
+        causes.append(small)
+    if not causes and solution.status is Status.NOT_CONVERGED:
+        causes = [f"larger elements (mesh.element_size, {plan.settings.element_size:g} px) hold such nodes"]
+        if solution.iterations >= plan.settings.solver.max_iterations:
+            causes = [f"solver.max_iterations is {plan.settings.solver.max_iterations}: allow more, or {causes[0]}"]
+    return causes
 
 
 def _renewal(plan: Plan, renewed: Sequence[tuple[int, Solution]]) -> Renewal:

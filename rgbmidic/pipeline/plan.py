@@ -6,10 +6,13 @@ reference of the solve.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Lock
+
+import numpy as np
 
 from rgbmidic.correlation import Reference
 from rgbmidic.correlation.renewal import Renewal
@@ -17,14 +20,19 @@ from rgbmidic.errors import FrameError, RegionError
 from rgbmidic.frames import FrameSeries, open_series, read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.raw_samples import check_texture, exposure_fault
+from rgbmidic.pipeline.raw_samples import HARDLY_ENOUGH, check_texture, exposure_fault, too_small
 from rgbmidic.pipeline.separation import RawState, Separation, correlated
 from rgbmidic.settings import RegionSettings, TestSettings
 from rgbmidic.weights import LightWeights, prepare_weights
 
 __all__ = ["Plan", "ReferenceUpdates", "read_region"]
 
+logger = logging.getLogger(__name__)
+
+_LOOKED_AT = 512
+"""Largest side (px) of the part of the region in which the speckle is measured: thousands of speckles, .1 s."""
 _KEPT_UPDATES = 2
 """Updated references that a process keeps: frames measured side by side follow this one or the last."""
 
@@ -72,6 +80,8 @@ class Plan:
         Images of the reference state, in grey levels.
     reference
         The reference state as the solve needs it, with the mesh.
+    speckle
+        Size of the speckle in the reference's region, px; None where it is not known.
     timings
         Whether to tell the time that each stage of a frame takes.
     updates
@@ -85,6 +95,7 @@ class Plan:
     weights: LightWeights
     images: IlluminationImages
     reference: Reference
+    speckle: float | None
     timings: bool = False
     updates: ReferenceUpdates = field(default_factory=ReferenceUpdates, repr=False, compare=False)
 
@@ -118,6 +129,9 @@ class Plan:
             mesh=mesh,
             prefilter=settings.solver.prefilter,
         )
+        speckle = _speckle(images, region)
+        if small := too_small(settings.element_size, speckle, HARDLY_ENOUGH):
+            logger.warning("%s", small)
         _check_seen(reference, first, region, ", ".join(map(series.name, settings.frames.reference)))
         return cls(
             settings=settings,
@@ -127,7 +141,20 @@ class Plan:
             weights=weights,
             images=images,
             reference=reference,
+            speckle=speckle,
         )
+
+
+def _speckle(images: IlluminationImages, region: Region) -> float | None:
+    """Size of the speckle (px), the median over the lights, in the middle of the region; None where none shows any."""
+    part = [
+        slice(max(int(np.median(inside)) - _LOOKED_AT // 2, int(inside[0])), int(inside[-1]) + 1)
+        for inside in (np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0))
+    ]
+    pictures = [values[part[0], part[1]][:_LOOKED_AT, :_LOOKED_AT] for values in images.values]
+    known = [np.where(np.isfinite(one), one, np.nanmean(one)) for one in pictures if np.isfinite(one).any()]
+    sizes = [size for one in known if (size := speckle_diameter(one.astype(np.float64))) is not None]
+    return float(np.median(sizes)) if sizes else None
 
 
 def _check_seen(reference: Reference, state: RawState, region: Region, names: str) -> None:

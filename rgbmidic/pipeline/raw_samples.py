@@ -1,4 +1,4 @@
-"""What the raw samples of a state tell of why it cannot be measured: no texture, no light, too much, wrong levels."""
+"""Why a state cannot be measured: no texture, no light, too much, wrong levels, speckle too coarse for the elements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rgbmidic.illumination.normalise import DARK, local_mean
 from rgbmidic.pipeline.separation import RawState
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["check_texture", "exposure_fault", "neighbour_correlation"]
+__all__ = ["HARDLY_ENOUGH", "check_texture", "exposure_fault", "neighbour_correlation", "too_small"]
 
 logger = logging.getLogger(__name__)
 
@@ -24,6 +24,10 @@ at a contrast of .3 times the noise, where it is .02 to .05 (tests/truth/test_te
 FAINT_TEXTURE = 0.2
 """Correlation under which the result is poor: in the same simulation displacements were wrong by .2 to .7 px (rms) at a
 contrast of .5 to .7 times the noise, where it is .08 to .23. Speckle in focus has .5 to .95."""
+HARDLY_ENOUGH, _ENOUGH = 1.3, 2.0
+"""Speckles on the side of an element. Of 150 pairs of simulated images (speckle of 2.6 to 8.4 px and +-600 DN, noise of
+8, 40 and 80 DN, .4 % strain) 13 of the 46 with fewer than 1.3 did not converge, some with most of their nodes lost, 1
+of the 36 with 1.3 to 1.85, and none of the 68 with more, which lost 2 % of the nodes at most."""
 _MEAN_WIDTH = 5.0
 """Standard deviation, in samples, of the local mean that is taken off: shading is no texture."""
 
@@ -107,3 +111,14 @@ def _fault(frame: Mosaic | ChannelFrame, inside: BoolArray) -> str | None:
             f"level {black:g}; the largest is {largest}, white_level is {white:g}"
         )
     return None
+
+
+def too_small(element_size: float, speckle: float | None, least: float = _ENOUGH) -> str:
+    """What is wrong with elements (px) that have fewer than `least` speckles (px) on a side, in words; else nothing."""
+    if speckle is None or element_size >= least * speckle:
+        return ""
+    return (
+        f"elements of {element_size:g} px are too small for speckles of {speckle:.1f} px: with fewer than {least:g} "
+        "speckles on a side nodes are lost and frames may not converge; set mesh.element_size to "
+        f"{np.ceil(_ENOUGH * speckle):.0f} or more"
+    )

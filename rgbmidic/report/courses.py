@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.report.facts import Course, NoiseFloor
-from rgbmidic.report.style import GAP, LINES, NUMBERS, draw_figure, finish_plot
+from rgbmidic.report.style import GAP, LINES, NUMBERS, draw_figure, finish_plot, time_unit
 from rgbmidic.results import QUANTITIES
 from rgbmidic.typing import FloatArray
 
@@ -38,7 +38,6 @@ def course_figure(told: Physical, course: Course) -> Figure:
                 axis.fill_between(times, low, high, color=colour, alpha=0.18, linewidth=0)
                 axis.plot(times, middle, line, color=colour, linewidth=1.2, label=name, **_marks(times))
             axis.legend(loc="best")
-            axis.ticklabel_format(axis="y", scilimits=(-2, 3))  # long numbers would reach into the axis' name
             finish_plot(axis, unit, label, whole=not told.units.timed)
 
     return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
@@ -61,7 +60,6 @@ def uncertainty_figure(told: Physical, course: Course, floor: NoiseFloor | None)
                     axis.axhline(floor.measured[name], color=colour, linestyle=line, linewidth=0.6)
             axis.set_ylim(bottom=0)
             axis.legend(loc="best")
-            axis.ticklabel_format(axis="y", scilimits=(-2, 3))  # long numbers would reach into the axis' name
             finish_plot(axis, unit, label, whole=not told.units.timed)
 
     return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
@@ -92,8 +90,7 @@ def _times(told: Physical, course: Course) -> tuple[FloatArray, str]:
     """The frames' times in a unit that suits them, and the name of the axis."""
     if not told.units.timed:
         return told.result.number[list(course.frames)].astype(np.float64), "frame"
-    reach = float(np.abs(course.times).max(initial=0))
-    factor, unit = next(((f, u) for f, u in ((1.0, "s"), (1e3, "ms"), (1e6, "µs")) if reach * f >= 1), (1e6, "µs"))
+    factor, unit = time_unit(course.times)
     return factor * course.times, f"time ({unit})"
 
 

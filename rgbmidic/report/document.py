@@ -15,7 +15,7 @@ from rgbmidic.report.facts import Course, NoiseFloor, noise_floor
 from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
 from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
-from rgbmidic.report.style import embedded
+from rgbmidic.report.style import embedded, time_unit
 from rgbmidic.results import QUANTITIES, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
@@ -56,8 +56,8 @@ def write_report(
     settings
         Of which ``[setup]``, ``[scale]`` and ``[probes]`` stand in place of those that were kept; None: those kept.
     frames
-        Indices of the frames of which maps are shown; None: three deformed ones, evenly spaced, the last one included,
-        and the one that has moved farthest.
+        Indices of the frames of which maps are shown; None: three deformed ones that did not fail, evenly spaced,
+        the last of them included, and the one that has moved farthest.
     overwrite
         Whether an existing file may be replaced.
 
@@ -97,7 +97,8 @@ class _Report:
         for frame in frames or ():
             told.result.frame(frame)  # what is wrong with one is told before the long work
         course = Course.of(told, figures.spread(deformed, _MOST))
-        shown = tuple(sorted({*figures.spread(deformed, _KEY), course.farthest})) if frames is None else tuple(frames)
+        measured = figures.spread(figures.measured_frames(told.result), _KEY)
+        shown = tuple(sorted({*measured, course.farthest})) if frames is None else tuple(frames)
         return cls(told=told, setup=setup, probes=probes, course=course, floor=noise_floor(told), shown=shown)
 
     def page(self) -> Page:
@@ -281,7 +282,9 @@ class _Report:
 
     def _when(self, frame: int) -> str:
         result, time = self.told.result, self.told.times[frame]
-        return f"frame {frame} ({result.names[frame]})" + (f" at {time:.6g} s" if self.told.units.timed else "")
+        factor, unit = time_unit(self.told.times)
+        when = f" at {factor * time:.6g} {unit}" if self.told.units.timed else ""
+        return f"frame {frame} ({result.names[frame]}){when}"
 
     @staticmethod
     def _show(page: Page, figure: Figure, caption: str) -> None:

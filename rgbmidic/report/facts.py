@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
-from rgbmidic.results import QUANTITIES, Result
+from rgbmidic.results import QUANTITIES, Result, speckle_diameter
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -21,8 +20,6 @@ _TOLD = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", 
 _QUANTILES = (0.05, 0.5, 0.95)
 _STATIC = 50
 """Static frames that a noise floor is taken from at most: it is known to 2 % then."""
-_BACKGROUND = 20.0
-"""Standard deviation (px) of the local mean over which speckle stands out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -146,33 +143,5 @@ def speckle_size(result: Result) -> float | None:
         return None
     (left, top), (right, bottom) = result.nodes.min(axis=0).astype(int), result.nodes.max(axis=0).astype(int) + 1
     parts = result.reference[:, max(top, 0) : bottom, max(left, 0) : right].astype(np.float32)
-    sizes = [size for part in parts if (size := _half_width(part)) is not None]
+    sizes = [size for part in parts if (size := speckle_diameter(part)) is not None]
     return float(np.median(sizes)) if sizes else None
-
-
-def _half_width(picture: FloatArray) -> float | None:
-    """Of the autocorrelation, averaged over all directions; None where there is no texture."""
-    texture = picture - cv2.GaussianBlur(picture, (0, 0), _BACKGROUND)
-    power = np.abs(np.fft.rfft2(texture, s=[2 * side for side in texture.shape])) ** 2
-    reach = min(int(2 * _BACKGROUND), *(side - 1 for side in texture.shape))
-    lag = np.arange(-reach, reach + 1)
-    pairs = np.multiply.outer(*(1 - np.abs(lag) / side for side in texture.shape))
-    mean, away = np.fft.irfft2(power)[np.ix_(lag, lag)] / pairs, np.hypot(lag[:, None], lag)
-    ring = away.round().astype(int).ravel()
-    product, distance = (np.bincount(ring, part.ravel()) / np.bincount(ring) for part in (mean, away))
-    if not (len(product) > 2 and product[0] > 0):
-        return None
-    product[0] = _without_noise(product, distance)
-    below = np.flatnonzero(product < 0.5 * product[0])
-    if not below.size:
-        return None
-    ends = slice(below[0], below[0] - 2 if below[0] > 1 else None, -1)
-    return float(2 * np.interp(0.5 * product[0], product[ends], distance[ends]))
-
-
-def _without_noise(product: FloatArray, distance: FloatArray) -> float:
-    """The autocorrelation at distance 0 without the peak of white noise there: a Gaussian through the next two."""
-    if not (product[1] > product[2] > 0):
-        return float(product[0])
-    fall = np.log(product[1] / product[2]) / (distance[2] ** 2 - distance[1] ** 2)
-    return float(min(product[1] * np.exp(fall * distance[1] ** 2), product[0]))

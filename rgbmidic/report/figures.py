@@ -20,10 +20,11 @@ from rgbmidic.report.style import (
     draw_figure,
     finish_picture,
     finish_plot,
+    literal,
     shade,
     show_image,
 )
-from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result
+from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result, scale_of
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ __all__ = [
     "field_figure",
     "map_figure",
     "mask_figure",
+    "measured_frames",
     "reflection_figure",
     "residual_figure",
     "share_figure",
@@ -55,6 +57,7 @@ MAPS = {
 _POSITIVE = ("uncertainty", "misfit")
 _DOUBTFUL = 3.0
 """Nodes whose uncertainty is over this many times the median do not rule the colours of their quantity."""
+_FAILED = 2
 _EQUAL = 1e-9
 _RASTER = 600
 """Points along the longer side of a map."""
@@ -73,6 +76,14 @@ def shown_frames(result: Result) -> tuple[int, ...]:
     return deformed or tuple(np.flatnonzero(finished).tolist()) or tuple(range(len(result)))
 
 
+def measured_frames(result: Result) -> tuple[int, ...]:
+    """Those of `shown_frames` in which something is measured; all where nothing is in any."""
+    shown = shown_frames(result)
+    return (
+        tuple(frame for frame, end in zip(shown, result.each("status", shown), strict=True) if end != _FAILED) or shown
+    )
+
+
 def spread(frames: Sequence[int], most: int) -> tuple[int, ...]:
     """Some of the frames, evenly spaced up to the last one."""
     return tuple(sorted({frames[int(i)] for i in np.linspace(len(frames) - 1, 0, min(most, len(frames))).round()}))
@@ -80,6 +91,8 @@ def spread(frames: Sequence[int], most: int) -> tuple[int, ...]:
 
 def map_figure(result: Result, frame: int, kind: str) -> Figure:
     """Maps of the quantities of one of `MAPS` in one frame, around the mesh; blank where not measured.
+
+    Displacements are in mm where the scale is known.
 
     Raises
     ------
@@ -89,7 +102,12 @@ def map_figure(result: Result, frame: int, kind: str) -> Figure:
         The frame is damaged.
     """
     record = result.frame(frame)
-    maps = {_label(name): (record.values[name], _scale(record, name, kind)) for name in MAPS[kind]}
+    unit, lengths = _lengths(result, record)
+    known, maps = {**record.values, **lengths}, {}
+    for name in MAPS[kind]:
+        std = known.get(f"{name}_std", np.zeros(len(record.u)))
+        label = f"{name} ({unit})" if name in lengths else name
+        maps[label] = known[name], _norm(known[name], std, positive=kind in _POSITIVE)
     return _maps(result, maps, "plasma" if kind in _POSITIVE else "viridis", _frame_title(result, frame, record))
 
 
@@ -107,7 +125,10 @@ def share_figure(result: Result, frame: int) -> Figure:
 
     record = result.frame(frame)
     shares = np.where(record.light_share.sum(axis=1, keepdims=True) > 0, record.light_share, np.nan)
-    maps = {f"share of {light}": (share, Normalize(0, 1)) for light, share in zip(result.lights, shares.T, strict=True)}
+    maps = {
+        literal(f"share of {light}"): (share, Normalize(0, 1))
+        for light, share in zip(result.lights, shares.T, strict=True)
+    }
     return _maps(result, maps, "cividis", _frame_title(result, frame, record))
 
 
@@ -149,7 +170,7 @@ def convergence_figure(result: Result) -> Figure:
         axis = axes[0]
         colours = _colour_per_frame(axis, frames)
         for frame, history, colour in zip(frames, result.each("history", frames), colours, strict=True):
-            steps, name = np.arange(1, len(history) + 1), result.names[frame]
+            steps, name = np.arange(1, len(history) + 1), literal(result.names[frame])
             axis.plot(steps, history, marker="o", markersize=2.5, linewidth=1, color=colour, label=name)
         if (tolerance := result.setting("solver", "tolerance")) is not None:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
@@ -169,7 +190,8 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
         for axis, (label, values) in zip(axes, panels.items(), strict=True):
             for light, line, series in zip(result.lights, cycle(LINES), values[frames].T, strict=False):
                 style: dict[str, Any] = {"linestyle": line, "color": LIGHT_COLOURS.get(light)}
-                axis.plot(result.number[frames], series, marker="o", markersize=2.5, linewidth=1, label=light, **style)
+                style |= {"marker": "o", "markersize": 2.5, "linewidth": 1, "label": literal(light)}
+                axis.plot(result.number[frames], series, **style)
             if np.nanmin(values, initial=0) >= 0:
                 axis.set_ylim(bottom=0)
             finish_plot(axis, "frame", label)
@@ -178,10 +200,17 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
     return draw_figure(draw, count=len(panels), aspect=0.75, beside=NUMBERS)
 
 
-def _scale(record: FrameRecord, name: str, kind: str) -> Normalize | None:
-    values = record.values[name]
-    std = record.values.get(f"{name}_std", np.zeros(len(values)))
-    return _norm(values, std, positive=kind in _POSITIVE)
+def _lengths(result: Result, record: FrameRecord) -> tuple[str, dict[str, FloatArray]]:
+    """The unit of lengths, and the displacements with their uncertainties in it: mm where the scale is known."""
+    scale, values = scale_of(result), {name: record.values[name] for name in ("u", "v", "u_std", "v_std")}
+    if scale.mm_per_pixel is None:
+        return "px", values
+    from rgbmidic.results.physical import Physical  # numba comes with it
+
+    units = Physical.untimed(result, scale).units
+    for name in ("u", "v"):
+        values[name], values[f"{name}_std"] = units.lengths(values[name], values[f"{name}_std"])
+    return units.length, values
 
 
 def _norm(values: FloatArray, std: FloatArray, *, positive: bool) -> Normalize | None:
@@ -260,7 +289,7 @@ def _shaded(
         for axis, image, part, light in zip(axes, reference, cover, result.lights, strict=True):
             show_image(axis, image)
             shade(axis, part, step)
-            axis.set_title(f"{light}: {words(part[_inside(view, step)])}")
+            axis.set_title(literal(f"{light}: {words(part[_inside(view, step)])}"))
             finish_picture(axis, x, y, first=axis is axes[0])
 
     title = f"{_frame_title(result, frame, record)}, over the reference image"
@@ -285,11 +314,6 @@ def _inside(view: View, step: int = 1) -> tuple[slice, slice]:
     return slice(*rows), slice(*columns)
 
 
-def _label(name: str) -> str:
-    unit = QUANTITIES[name].unit
-    return f"{name} ({unit})" if unit else name
-
-
 def _colour_per_frame(axis: Axes, frames: Sequence[int]) -> list[Any]:
     """A few frames get distinct colours and a legend, many a colour bar."""
     from matplotlib import colormaps
@@ -308,4 +332,4 @@ def _frame_title(result: Result, frame: int, record: FrameRecord) -> str:
     blank = np.isnan(record.u).mean()
     missing = f", {blank:.1%} of the nodes not measured" if blank else ""
     end = QUANTITIES["status"].codes[record.status]
-    return f"frame {frame}: {result.names[frame]} ({end}, {record.iterations} iterations{missing})"
+    return f"frame {frame}: {literal(result.names[frame])} ({end}, {record.iterations} iterations{missing})"

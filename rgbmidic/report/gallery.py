@@ -19,10 +19,10 @@ from rgbmidic.report.figures import (
     convergence_figure,
     map_figure,
     mask_figure,
+    measured_frames,
     reflection_figure,
     residual_figure,
     share_figure,
-    shown_frames,
     spread,
 )
 from rgbmidic.report.style import save_figure
@@ -69,7 +69,8 @@ def write_figures(
     folder
         Where the pictures go; made where it does not exist. Pictures of the same names are replaced.
     frames
-        Indices of the frames that get pictures; None: three deformed ones, evenly spaced, the last one included.
+        Indices of the frames that get pictures; None: three deformed ones that did not fail, evenly spaced, the
+        last of them included.
     processes
         How many draw, this one among them. With more than one, a script that calls this must be importable
         (``if __name__ == "__main__":``), as always with processes.
@@ -89,7 +90,7 @@ def write_figures(
     folder = Path(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    frames = spread(shown_frames(result), _FRAMES) if frames is None else frames
+    frames = spread(measured_frames(result), _FRAMES) if frames is None else frames
     for frame in frames:
         result.frame(frame)  # what is wrong with one is told before the first picture
     pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]

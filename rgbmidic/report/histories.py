@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rgbmidic.report.style import LEGEND, draw_figure, finish_plot
+from rgbmidic.report.style import LEGEND, draw_figure, finish_plot, literal, time_unit
 from rgbmidic.results import Histories, Told
 from rgbmidic.typing import FloatArray
 
@@ -33,18 +33,20 @@ def history_figure(histories: Histories) -> Figure:
         panels.setdefault((_kind(told), told.unit), []).append(told)
     timed = histories.times is not None
     over = np.asarray(histories.times if timed else histories.frames, dtype=np.float64)
+    factor, unit_of_time = time_unit(over) if timed else (1.0, "")
+    over, along = factor * over, f"time ({unit_of_time})" if timed else "frame"
 
     def draw(axes: list[Axes]) -> None:
         for axis, ((kind, unit), quantities) in zip(axes, panels.items(), strict=False):
             for told in quantities:
                 _line(axis, over, told)
             _limit(axis, quantities)
-            finish_plot(axis, "time (s)" if timed else "frame", f"{kind} ({unit})" if unit else kind, whole=not timed)
+            finish_plot(axis, along, literal(f"{kind} ({unit})" if unit else kind), whole=not timed)
             axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
         if histories.stress_strain is not None:
             strain, stress = (histories[name] for name in histories.stress_strain)
             axes[-1].plot(strain.values, stress.values, marker="o", markersize=2.5, linewidth=1)
-            finish_plot(axes[-1], strain.name, f"{stress.name} ({stress.unit})", whole=False)
+            finish_plot(axes[-1], literal(strain.name), literal(f"{stress.name} ({stress.unit})"), whole=False)
 
     count = len(panels) + (histories.stress_strain is not None)
     return draw_figure(draw, count=count, aspect=0.45, beside=LEGEND, tallest=_PANEL * count + 1)
@@ -62,7 +64,7 @@ def _kind(told: Told) -> str:
 
 def _line(axis: Axes, over: FloatArray, told: Told) -> None:
     marker = "o" if len(over) <= _MARKERS else None
-    (line,) = axis.plot(over, told.values, marker=marker, markersize=2.5, linewidth=1, label=told.name)
+    (line,) = axis.plot(over, told.values, marker=marker, markersize=2.5, linewidth=1, label=literal(told.name))
     if told.std is not None:
         low, high = told.values - 2 * told.std, told.values + 2 * told.std
         axis.fill_between(over, low, high, color=line.get_color(), alpha=0.2, linewidth=0)

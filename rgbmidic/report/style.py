@@ -34,9 +34,11 @@ __all__ = [
     "embedded",
     "finish_picture",
     "finish_plot",
+    "literal",
     "save_figure",
     "shade",
     "show_image",
+    "time_unit",
 ]
 
 STYLE: dict[Any, Any] = {
@@ -65,6 +67,10 @@ _CLIPPED, _WILD = 0.5, 0.1
 """Colours span all values but this percentage at each end, and what lies within this share of that span beyond."""
 _SHOWN = 800
 """Most pixels along a side of an image in a figure."""
+_LETTER, _BETWEEN = 0.075, 0.12
+"""Inches: width of a digit of the numbers along an axis, at the style's size of letters; room between two numbers."""
+_LONGEST = 60
+"""Letters of a name that are shown: a title has room for twice as many."""
 _SPAN = 4.0
 """Colours of a positive quantity end at its median over this and times this: else outliers turn the bulk black."""
 
@@ -105,6 +111,29 @@ def draw_figure(
         if title:
             figure.suptitle(title, fontsize=10, y=1 - 0.5 * heading / whole, va="center")
     return figure
+
+
+def literal(text: str) -> str:
+    """A name as matplotlib draws it as it is: ``$`` is no formula, a leading ``_`` hides nothing from a legend.
+
+    Letters that its font has not, East Asian ones and line breaks, appear as their escapes; a long name without its
+    middle.
+    """
+    from matplotlib.font_manager import findfont, get_font
+
+    font = get_font(findfont("DejaVu Sans"))
+    seen = [c if font.get_char_index(ord(c)) else ascii(c)[1:-1] for c in text]
+    if len(seen) > _LONGEST:
+        seen = [*seen[: _LONGEST // 2], "…", *seen[1 - _LONGEST // 2 :]]
+    shown = "".join(seen).replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown
+
+
+def time_unit(seconds: FloatArray) -> tuple[float, str]:
+    """The unit that suits times, ``"s"``, ``"ms"``, ``"µs"`` or ``"ns"``, and how many of it a second has."""
+    reach = float(np.abs(seconds[np.isfinite(seconds)]).max(initial=0))
+    units = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"), (1e9, "ns"))
+    return next((pair for pair in units if reach * pair[0] >= 1), units[0])
 
 
 def save_figure(figure: Figure, path: Path | str, *, dpi: int = 150) -> None:
@@ -187,14 +216,33 @@ def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *
         axis.set_ylabel("y (px)")
     axis.tick_params(labelleft=first)
     axis.locator_params(nbins=5)
+    _space_out(axis, 5, whole=False)
 
 
 def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
-    """Named axes, `whole` numbers along x, a light grid."""
-    from matplotlib.ticker import MaxNLocator
+    """Named axes, `whole` numbers along x, no more of them than there is room for, a light grid."""
+    from matplotlib.ticker import ScalarFormatter
 
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True) if whole else MaxNLocator(5))
+    axis.ticklabel_format(axis="x", style="plain", useOffset=False)
+    if isinstance(axis.yaxis.get_major_formatter(), ScalarFormatter):
+        axis.ticklabel_format(axis="y", scilimits=(-2, 3))  # long numbers would reach into the axis' name
+    _space_out(axis, 8, whole=whole)
     axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)
+
+
+def _space_out(axis: Axes, most: int, *, whole: bool) -> None:
+    """Set as many numbers along x as there is room for, at most `most`."""
+    from matplotlib.ticker import MaxNLocator
+
+    box, (width, height) = axis.get_position(), cast("Figure", axis.figure).get_size_inches()
+    room = box.width * width
+    if axis.get_aspect() != "auto":
+        room = min(room, box.height * height * abs(np.ptp(axis.get_xlim()) / np.ptp(axis.get_ylim())))
+    for count in range(most, 0, -1):
+        axis.xaxis.set_major_locator(MaxNLocator(count, integer=whole))
+        numbers = axis.xaxis.get_major_formatter().format_ticks(list(axis.xaxis.get_majorticklocs()))
+        if sum(len(number) * _LETTER + _BETWEEN for number in numbers) < room:
+            break

@@ -1,6 +1,7 @@
 """What is kept of a test: one record per frame, the folder that holds them, and other programs' formats."""
 
 from rgbmidic.illumination.images import REFLECTING
+from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
 from rgbmidic.results.histories import Histories, Told
@@ -42,6 +43,7 @@ __all__ = [
     "reference_frames",
     "scale_of",
     "shared_part",
+    "speckle_diameter",
     "units_of",
     "write_histories",
 ]

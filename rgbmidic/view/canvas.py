@@ -119,9 +119,14 @@ class Canvas:
         place = {"x": [w.left], "y": [w.top], "dw": [w.right - w.left], "dh": [w.bottom - w.top]}
         self._image.data = {"image": [image], **place}
 
+    def clear(self) -> None:
+        """Show no picture, nor what its colours would mean."""
+        self._image.data = {name: [] for name in self._image.data}
+        self.plot.title.text, self.bar.visible = " ", False
+
     def colour(self, ends: tuple[float, float], colours: Sequence[str], title: str) -> None:
         """What the colours mean."""
-        self.plot.title.text = title
+        self.plot.title.text, self.bar.visible = title, True
         self.colours.update(low=ends[0], high=ends[1])
         if self.colours.palette != list(colours):  # which takes as long to check as a frame to paint
             self.colours.palette = list(colours)

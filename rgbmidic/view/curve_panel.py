@@ -47,10 +47,18 @@ class CurvePanel:
         Where the curve is chosen, and where remarks go.
     hint
         What is said while there is nothing to say.
+
+    Attributes
+    ----------
+    histories
+        What was read off last.
+    reading
+        Whether they are being read anew: they are those of before until then.
     """
 
     def __init__(self, document: Document, *, chosen: str, select: Select, told: Div, hint: str) -> None:
         self.histories: Histories | None = None
+        self.reading = False
         self.colours: Mapping[str, str] = {}
         self._document, self._select, self._told, self._hint, self._chosen = document, select, told, hint, chosen
         self._reader, self._number, self._task = ThreadPoolExecutor(1), 0, Future[Histories | None]()
@@ -64,6 +72,7 @@ class CurvePanel:
         """Read marks off all frames beside the page, then call `shown`; only the last request counts."""
         self._number += 1
         self._task.cancel()
+        self.reading = bool(marks)
         if not marks:
             self._have(self._number, None, shown)
             return
@@ -75,6 +84,7 @@ class CurvePanel:
     def _have(self, number: int, task: Future[Histories | None] | None, shown: Callable[[], None]) -> None:
         if number != self._number:
             return
+        self.reading = False
         before = self._probes
         try:
             self.histories = None if task is None else task.result()
@@ -102,6 +112,7 @@ class CurvePanel:
         if self.histories is None:
             self._bands.data, self._lines.data = _columns([], "xs ys colour"), _columns([], "xs ys colour name")
             self.plot.legend.visible = False
+            self.plot.xaxis.axis_label = self.plot.yaxis.axis_label = None
             return
         own = curves.groups(self.histories).get(self._select.value, [])
         x, axis = curves.over(self.histories)
@@ -117,10 +128,10 @@ class CurvePanel:
         self.plot.legend.visible = True
 
     def point(self, frame: int) -> None:
-        """Point at a frame."""
-        x = curves.over(self.histories)[0] if self.histories is not None else ()
-        at = 0 if self.histories is None else int(np.searchsorted(self.histories.frames, frame))
-        self.now.location = float(x[at]) if at < len(x) else None
+        """Point at a frame, where the curves hold it."""
+        self.now.location = None
+        if self.histories is not None and len(at := np.flatnonzero(self.histories.frames == frame)):
+            self.now.location = float(curves.over(self.histories)[0][at[0]])
 
     def frame(self, x: float) -> int:
         """The frame at a place of the axis."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic.report.style import time_unit
 from rgbmidic.results import Histories, Result, Told, probes_of
 from rgbmidic.results.history_table import history_csv
 from rgbmidic.results.probing import read_histories
@@ -47,10 +48,11 @@ def groups(histories: Histories) -> dict[str, list[Told]]:
 
 
 def over(histories: Histories) -> tuple[FloatArray, str]:
-    """What the curves go over, and its name: seconds, or frames where no time is known."""
+    """What the curves go over, and its name: the time, or frames where none is known."""
     if histories.times is None:
         return histories.frames.astype(np.float64), "frame"
-    return histories.times, "time (s)"
+    factor, unit = time_unit(histories.times)
+    return factor * histories.times, f"time ({unit})"
 
 
 def band(x: FloatArray, told: Told) -> tuple[list[FloatArray], list[FloatArray]]:

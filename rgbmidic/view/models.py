@@ -31,10 +31,10 @@ _DARK = """
 .bk-input, .bk-btn { border-color: #4b545e !important; }
 .bk-btn.bk-active { background-color: #2f6fb0 !important; }
 :host, .bk-input, .bk-btn { font-size: 13px; }
-.bk-btn { padding: 5px 7px; }
+.bk-btn { padding: 5px 5px; }
 .noUi-target { background: #24292f; border-color: #4b545e; box-shadow: none; }
 """
-_LIGHT = ":host { color: #1b1f24; } :host, .bk-input, .bk-btn { font-size: 13px; } .bk-btn { padding: 5px 7px; }"
+_LIGHT = ":host { color: #1b1f24; } :host, .bk-input, .bk-btn { font-size: 13px; } .bk-btn { padding: 5px 5px; }"
 _SHORT = 150
 """Smallest number of ms between two frames that are played: what eyes follow, and 6 to 7 a second."""
 
@@ -135,8 +135,6 @@ def controls(frames: int, *, dark: bool) -> Controls:
     """The controls, with nothing chosen yet."""
     sheets = [sheet(dark=dark)]
     wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
-    half: dict[str, Any] = {"stylesheets": sheets, "width": 112}
-    third: dict[str, Any] = {"stylesheets": sheets, "width": 72}
     last = max(frames - 1, 1)
     return Controls(
         head=Div(**wide),
@@ -149,17 +147,17 @@ def controls(frames: int, *, dark: bool) -> Controls:
             options=[("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")],
             **wide,
         ),
-        low=NumericInput(title="lowest", name="low", mode="float", **half),
-        high=NumericInput(title="highest", name="high", mode="float", **half),
+        low=NumericInput(title="lowest", name="low", mode="float", **wide),
+        high=NumericInput(title="highest", name="high", mode="float", **wide),
         symmetric=Checkbox(label="symmetric about 0", name="symmetric", stylesheets=sheets),
         directions=Checkbox(label="principal directions", name="directions", stylesheets=sheets),
         words=Div(name="words", **wide),
         under=Div(name="under", **wide),
         mode=RadioButtonGroup(labels=["Move", "Point", "Gauge", "Line", "Strain"], active=0, name="mode", **wide),
         curve=Select(title="Curve", name="curve", **wide),
-        clear=Button(label="Clear", **third),
-        csv=Button(label="Save CSV", **third),
-        png=Button(label="Save PNG", **third),
+        clear=Button(label="Clear", **wide),
+        csv=Button(label="Save CSV", **wide),
+        png=Button(label="Save PNG", **wide),
         told=Div(name="told", **wide),
         theme=theme_button(dark=dark, **wide),
         frame=Slider(title="Frame", name="frame", start=0, end=last, step=1, value=0, disabled=frames < 2, **wide),

@@ -26,8 +26,8 @@ from rgbmidic.view.frames import Pictures
 from rgbmidic.view.marks import MarkLayer
 from rgbmidic.view.models import Asked, controls, wire
 from rgbmidic.view.picture import AROUND, paint, palette, palette_name
-from rgbmidic.view.timeline import Course, TimeLine
-from rgbmidic.view.words import frame_words, guarded, pointed_words, warning
+from rgbmidic.view.timeline import Course, TimeLine, places
+from rgbmidic.view.words import frame_words, guarded, pointed_words, warning, watched
 
 __all__ = ["ResultPage"]
 
@@ -58,8 +58,10 @@ class ResultPage:
         self.document, self.result, self.look = document, result, look
         self.fields, self.pictures, self.course = Fields.of(result), Pictures(result=result), course
         self.values: Values | None = None
-        self._key = ("", -1, False)
-        self._test_range = lru_cache(8)(lambda name, count: self.fields.range_of_test(name))
+        self._pointer: tuple[float, float] | None = None
+        self._key = ("", -1, -1)
+        self._test_range = lru_cache(8)(lambda name, changes: self.fields.range_of_test(name))
+        self._changes = self._size = 0
         self.asked, self.dark = Asked(name="state", asked=look.frame, shown=look.frame), look.theme == "dark"
         self.parts = p = controls(len(result), dark=self.dark)
         self.canvas = Canvas(document, list(KINDS), look.window or Canvas.around(result.nodes), self._redraw)
@@ -73,12 +75,12 @@ class ResultPage:
     @property
     def roots(self) -> dict[str, Any]:
         """The parts of the page by the names that its template gives their places."""
-        p = self.parts
+        p, wide = self.parts, partial(row, sizing_mode="stretch_width")
         side = column(
-            p.words, p.field, p.over, p.opacity, p.range, row(p.low, p.high), p.symmetric, p.directions,
-            p.mode, p.curve, row(p.clear, p.csv, p.png), p.told, p.theme, sizing_mode="stretch_width",
+            p.words, p.field, p.over, p.opacity, p.range, wide(p.low, p.high), p.symmetric, p.directions,
+            p.mode, p.curve, wide(p.clear, p.csv, p.png), p.told, p.theme, sizing_mode="stretch_width",
         )  # fmt: skip
-        player = row(p.play, p.step, p.frame, sizing_mode="stretch_width")
+        player = wide(p.play, p.step, p.frame)
         drawn = {"plot": self.canvas.plot, "course": self.timeline.plot, "curves": self.curves.plot}
         return {"head": p.head, "under": p.under, "side": side, "player": player, **drawn}
 
@@ -121,7 +123,12 @@ class ResultPage:
         if self.look.marks:
             self._read_curves()
         for act, every in ((self._tick, _TICK), (self._grow, _IDLE), (self._tell_course, _IDLE)):
-            self.document.add_periodic_callback(partial(guarded, act, self.complain), every)
+            self.document.add_periodic_callback(partial(self._regularly, act), every)
+
+    def _regularly(self, act: Callable[[], None]) -> None:
+        """Do something, unless the browser has gone and nobody looks."""
+        if watched(self.document):
+            guarded(act, self.complain)
 
     def complain(self, text: str) -> None:
         """Tell what went wrong; the page goes on."""
@@ -140,15 +147,27 @@ class ResultPage:
         self.look = replace(self.look, **changes)
         self.document.hold("combine")
         try:
-            guarded(self._draw, self.complain)
+            guarded(self._draw, self._blank)
         finally:
             self.document.unhold()
+
+    def _blank(self, text: str) -> None:
+        """Show nothing of what cannot be drawn, least of all what was drawn before it."""
+        self.values, self._key = None, ("", -1, -1)
+        self.canvas.clear()
+        self.directions.hide()
+        self._read_out()
+        self.curves.point(self.look.frame)
+        self.asked.query = self.look.query()
+        self.complain(text)
 
     def _draw(self) -> None:
         look, field = self.look, self.fields.all[self.look.field]
         values = self.values = self._read()
         picture, remark = self.pictures.frame(look.frame) if look.over == "deformed" else (self.pictures.reference, "")
         ends, colours = self._ends(values), palette(palette_name(field.kind, symmetric=self._symmetric))
+        if look.range == "hand" and (self.parts.low.value, self.parts.high.value) != (look.low, look.high):
+            remark = f"The colours go from {look.low:g} to {look.high:g}: the lowest number must be below the highest."
         over = (self._nodes(values), self.result.elements, values.values)
         around = AROUND[self.dark]
         image = paint(
@@ -171,6 +190,7 @@ class ResultPage:
             self.directions.show(over[0], self.fields.read("direction", look.frame).values)
         else:
             self.directions.hide()
+        self._read_out()
         self.curves.point(look.frame)
         self.asked.query, self.asked.shown = look.query(), self.asked.asked
 
@@ -181,7 +201,7 @@ class ResultPage:
 
     def _read(self) -> Values:
         """The field in the frame; read anew where another one is asked for, or the frame was measured since."""
-        key = (self.look.field, self.look.frame, bool(self.result.finished[self.look.frame]))
+        key = (self.look.field, self.look.frame, self._changes)
         if self.values is None or key != self._key:
             read = self.fields.read(self.look.field, self.look.frame)
             self._key = key
@@ -200,7 +220,7 @@ class ResultPage:
         if field.ends is not None:
             return field.ends
         if look.range == "test":
-            low, high = self._test_range(look.field, int(self.result.finished.sum()))
+            low, high = self._test_range(look.field, self._changes)
         else:
             low, high = robust_range(values) or (0.0, 1.0)
         return (-max(abs(low), abs(high)), max(abs(low), abs(high))) if self._symmetric else (low, high)
@@ -210,11 +230,18 @@ class ResultPage:
         return values.moved if self.look.over == "deformed" else self.result.nodes
 
     def _hover(self, event: Any) -> None:
-        """The value under the pointer."""
-        if self.values is not None and event.x is not None and event.y is not None:
+        """The pointer is at another place."""
+        if event.x is not None and event.y is not None:
+            self._pointer = event.x, event.y
+            self._read_out()
+
+    def _read_out(self) -> None:
+        """The value where the pointer is, of the field and the frame that are shown."""
+        words = ""
+        if self.values is not None and self._pointer is not None:
             field, nodes = self.fields.all[self.look.field], self._nodes(self.values)
-            words = pointed_words(field, self.values, nodes, self.result.elements, event.x, event.y)
-            self.parts.under.text = words
+            words = pointed_words(field, self.values, nodes, self.result.elements, *self._pointer)
+        self.parts.under.text = words
 
     def _marked(self) -> None:
         """Marks were set, moved or removed."""
@@ -231,7 +258,9 @@ class ResultPage:
         self.curves.read(self.result, self.look.marks, gauge, lambda: self.curves.point(self.look.frame))
 
     def _save(self) -> None:
-        if self.curves.histories is None:
+        if self.curves.reading:
+            self.parts.told.text = "The curves are still being read: save them once they are drawn."
+        elif self.curves.histories is None:
             self.parts.told.text = "There is no curve yet: set a mark on the field first."
         else:
             self.asked.csv = as_csv(self.curves.histories)
@@ -246,9 +275,8 @@ class ResultPage:
         self.course.advance(self.result)
 
     def _tell_course(self) -> None:
-        if self.timeline.known != self.course.known:
-            self.timeline.draw(self.course)
-            self.parts.head.text = self._title()
+        self.timeline.draw(self.course)
+        self.parts.head.text = self._title()
 
     def _title(self) -> str:
         return (
@@ -256,16 +284,18 @@ class ResultPage:
         )
 
     def _grow(self) -> None:
-        """Take in what a run has added; who looks at the last frame goes on with it."""
-        if self.result.finished.all():
+        """Take in what a run has added or measured again; who looks at the last frame goes on with it."""
+        size = sum(file.stat().st_size for file in self.result.path.glob("solution/*"))
+        if size == self._size:
             return
-        new = self.result.refresh()
+        self._size, new = size, self.result.refresh()
+        if np.array_equal(places(new), places(self.result)):
+            return
         before, after = np.flatnonzero(self.result.finished), np.flatnonzero(new.finished)
-        if len(after) == len(before):
-            return
-        self.result, self.fields = new, replace(self.fields, result=new)
+        self.result, self.fields, self._changes = new, replace(self.fields, result=new), self._changes + 1
         self._read_curves()
-        if not len(before) or self.look.frame == before[-1]:
+        follows = not len(before) or self.look.frame == before[-1]
+        if follows and self.parts.frame.value != after[-1]:
             self.parts.frame.value = int(after[-1])
         else:
             self.show()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import html
 import logging
 import secrets
@@ -40,7 +42,20 @@ __all__ = ["serve", "start"]
 _HOST = "127.0.0.1"
 _FORGOTTEN = 15_000
 """Ms after which what a closed page held is let go."""
+_BREATH = 0.05
+"""Seconds that belong to others after each such page: as many as a visitor needs for an answer."""
 _THEMES = {"dark": "dark_minimal"}
+
+
+class _Site(Application):  # type: ignore[misc]  # see pyproject.toml
+    """What builds the pages of an address; others are served between two that are let go.
+
+    Bokeh lets go of all pages that were left in a row, and collects garbage twice for each: .1 to .3 s a time.
+    """
+
+    async def on_session_destroyed(self, session_context: Any) -> None:
+        await super().on_session_destroyed(session_context)
+        await asyncio.sleep(_BREATH)
 
 
 class _Application(BokehTornado):  # type: ignore[misc]  # see pyproject.toml
@@ -74,6 +89,8 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
     for library in ("bokeh", "tornado"):  # what they say of a strange request is for programmers
         logging.getLogger(library).setLevel(logging.CRITICAL)
     server, address = start(path, port=port)
+    gc.collect()
+    gc.freeze()  # what is there now stays: two thirds of what each collection would go through
     tell(address)
     if browser:
         server.io_loop.add_callback(webbrowser.open, address)
@@ -94,7 +111,7 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
             f"port {port} of {_HOST} cannot be used ({error.strerror or error}): state another --port, or none"
         ) from None
     application = _Application(
-        {route: Application(FunctionHandler(page)) for route, page in pages.items()},
+        {route: _Site(FunctionHandler(page)) for route, page in pages.items()},
         prefix=f"/{token}",
         sign_sessions=True,
         secret_key=secrets.token_bytes(32),
@@ -114,7 +131,7 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
 
 def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
     """What is served: a result, or a test that is set up and the result of its run; bad input is told at once."""
-    courses: dict[tuple[Path, int], Course] = {}
+    courses: dict[tuple[Path, str], Course] = {}
     if (path / PROVENANCE).exists():
         Result.open(path, partial=True, check=False)
         return {"/": partial(_told, partial(_fill, path, courses))}
@@ -152,14 +169,14 @@ def _query(document: Document) -> dict[str, list[bytes]]:
     return {} if context is None or context.request is None else context.request.arguments
 
 
-def _fill(path: Path, courses: dict[tuple[Path, int], Course], document: Document) -> None:
+def _fill(path: Path, courses: dict[tuple[Path, str], Course], document: Document) -> None:
     """The page of a result as it is now, looked at as the address says."""
     result = Result.open(path, partial=True, check=False)
     there = np.flatnonzero(result.finished)
     last = int(there[-1]) if len(there) else 0
     names = list(Fields.of(result).all)
     look = Look.from_query(_query(document), frames=len(result), names=names, frame=last)
-    course = courses.setdefault((path, len(result)), Course(len(result)))
+    course = courses.setdefault((path, result.provenance["created"]), Course(len(result)))
     page = ResultPage(document, result, look, course)
     _place(document, page.roots, f"rgbmidic: {result.path.name}", look.theme)
 

@@ -30,7 +30,7 @@ from rgbmidic.view.setup_controls import setup_controls
 from rgbmidic.view.setup_frames import RAW, Footage, inspected, pictures, side_by_side
 from rgbmidic.view.sketch import Sketch
 from rgbmidic.view.tiles import Tiles
-from rgbmidic.view.words import guarded, warning
+from rgbmidic.view.words import guarded, warning, watched
 
 __all__ = ["SetupPage"]
 
@@ -68,6 +68,7 @@ class SetupPage:
         self.footage = Footage.of(draft)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
+        self._inspected = self._number = 0
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.asked = Asked(name="state", asked=reference, shown=reference)
         self.parts = setup_controls(draft, len(self.footage.series) - 1, out, dark=dark)
@@ -104,7 +105,7 @@ class SetupPage:
         p.mode.js_on_change("active", CustomJS(args={"tools": tools[:4], "other": p.hole}, code=_OTHER))
         p.hole.js_on_change("active", CustomJS(args={"tools": tools[4:], "other": p.mode}, code=_OTHER))
         self.document.on_event(DocumentReady, lambda event: self._ready())
-        self.document.add_periodic_callback(self._tick, _TICK)
+        self.document.add_periodic_callback(lambda: self._tick() if watched(self.document) else None, _TICK)
         self.document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
 
     def _ready(self) -> None:
@@ -140,11 +141,23 @@ class SetupPage:
             over = paint(window, full.astype(np.uint8) * 255, None, ends, colours, opacity=0, around=0)
             image = np.where((over & 0xFF) > 64, _GLARE, image)
         self.canvas.show(image)
-        self.canvas.colour(ends, colours, f"{chosen} (px)" if field else chosen)
+        title = f"{chosen} (px)" if field else chosen
+        if chosen != RAW and index != self._inspected:  # what was inspected stays while other frames are looked at
+            title += f", of frame {self._inspected}: {self.footage.series.name(self._inspected)}"
+        self.canvas.colour(ends, colours, title)
         self.canvas.bar.visible = field is not None
+
+    def _forget(self) -> None:
+        """Drop what was inspected, or is being: it was of another region, element size or calibration."""
+        self._number += 1
+        if self.inspection is not None:
+            self.inspection, self.pictures = None, {}
+            self.tiles.plot.visible = False
+            self.parts.picture.value, self.parts.picture.options = RAW, [RAW]
 
     def _remesh(self) -> None:
         """Draw the mesh that the region gets."""
+        self._forget()
         self._edges.data = {"xs": [], "ys": []}
         self._guarded(self._make_mesh)
 
@@ -171,11 +184,14 @@ class SetupPage:
         self.parts.told.text = "inspecting …"
         index, size = int(self.parts.frame.value), float(self.parts.size.value)
         task = self._reader.submit(lambda: inspected(self.footage, index, self._region(content), size))
-        have = partial(self._guarded, partial(self._have, task, index))
+        have = partial(self._guarded, partial(self._have, task, index, self._number))
         task.add_done_callback(lambda _: self.document.add_next_tick_callback(have))
 
-    def _have(self, task: Future[Inspection], index: int) -> None:
-        found = self.inspection = task.result()
+    def _have(self, task: Future[Inspection], index: int, number: int) -> None:
+        if number != self._number:
+            return
+        found, self._inspected = task.result(), index
+        self.inspection = found
         self.pictures = pictures(found, self.footage.shape)
         self.tiles.show(side_by_side(found, self.pictures, self.footage.raw(index)[0]))
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
@@ -205,7 +221,10 @@ class SetupPage:
     def _reopen(self) -> None:
         """Take what the page says, once it can be read."""
         draft = self._changed()
+        other = draft.section("calibration") != self.draft.section("calibration")
         self.draft, self.footage = draft, Footage.of(draft)
+        if other:
+            self._remesh()
         self.show()
 
     def _write(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,8 @@ class SetupControls:
     @property
     def side(self) -> Any:
         """The column left of the frame."""
-        buttons, numbers = row(self.undo, self.next, self.clear), row(self.reference, self.first, self.last)
+        wide = partial(row, sizing_mode="stretch_width")
+        buttons, numbers = wide(self.undo, self.next, self.clear), wide(self.reference, self.first, self.last)
         parts = (self.words, self.picture, self.glare, self.mode, self.hole, buttons, self.size, numbers)
         return column(*parts, self.calibration, self.inspect, self.theme, sizing_mode="stretch_width")
 
@@ -65,8 +67,7 @@ def setup_controls(draft: Draft, last: int, out: Path, *, dark: bool) -> SetupCo
     """The controls as a draft of frames 0 to `last` says, whose result goes to `out`."""
     sheets, frames = [sheet(dark=dark)], draft.frames
     wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
-    third: dict[str, Any] = {"stylesheets": sheets, "width": 74}
-    number: dict[str, Any] = {"low": 0, "high": last, "step": 1, **third}
+    number: dict[str, Any] = {"low": 0, "high": last, "step": 1, **wide}
     reference, end, most = frames.reference[0], last if frames.last is None else frames.last, max(last, 1)
     size = draft.section("mesh").get("element_size", ELEMENT_SIZE)
     calibration = str(draft.section("calibration").get("file", ""))
@@ -77,9 +78,9 @@ def setup_controls(draft: Draft, last: int, out: Path, *, dark: bool) -> SetupCo
         glare=Checkbox(label="mark saturated samples", active=True, stylesheets=sheets),
         mode=RadioButtonGroup(labels=["Move", "Rectangle", "Polygon", "Circle"], active=0, name="mode", **wide),
         hole=RadioButtonGroup(labels=["Hole", "Round hole"], active=None, name="hole", **wide),
-        undo=Button(label="Undo", **third),
-        next=Button(label="Next hole", **third),
-        clear=Button(label="Clear", **third),
+        undo=Button(label="Undo", **wide),
+        next=Button(label="Next hole", **wide),
+        clear=Button(label="Clear", **wide),
         size=Spinner(title="Element size (px)", name="size", low=4, value=size, step=1, **wide),
         reference=Spinner(title="Reference", name="reference", value=reference, **number),
         first=Spinner(title="First", name="first", value=frames.first, **number),

@@ -12,7 +12,7 @@ from rgbmidic.results import Result
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.canvas import small
 
-__all__ = ["NOW", "Course", "TimeLine"]
+__all__ = ["NOW", "Course", "TimeLine", "places"]
 
 _AT_ONCE = 100
 """Frames that are looked at before the page is served again: 10 ms."""
@@ -22,6 +22,11 @@ _DAMAGED = 3
 _FAULTS = {1: "#e69f00", 2: "#d1495b", _DAMAGED: "#d1495b"}
 NOW = {"dimension": "height", "level": "overlay", "line_color": "#8e5bd0", "line_width": 2}
 """How the frame in view is marked: over all else, which is not painted again when it moves."""
+
+
+def places(result: Result) -> npt.NDArray[np.int64]:
+    """Where the records of the frames lie, shape (T, 2): a frame that is measured again has another place."""
+    return np.stack([result.table.shard, result.table.start], axis=1)
 
 
 class Course:
@@ -34,11 +39,15 @@ class Course:
         End of each frame, 3 where it is damaged; -1 where it was not looked at, or is not measured yet.
     share : ndarray, shape (T,)
         Part of the nodes that it measures; NaN where not known.
+    changes : int
+        Times that `advance` found something new.
     """
 
     def __init__(self, frames: int) -> None:
         self.status: npt.NDArray[np.int8] = np.full(frames, _NOT_YET, dtype=np.int8)
         self.share: FloatArray = np.full(frames, np.nan)
+        self.changes = 0
+        self._places = np.zeros((frames, 2), dtype=np.int64)
 
     @property
     def known(self) -> int:
@@ -46,8 +55,13 @@ class Course:
         return int((self.status != _NOT_YET).sum())
 
     def advance(self, result: Result) -> None:
-        """Look at some frames more."""
+        """Look at some frames more, and again at those that were measured again."""
+        now = places(result)
+        stale = (self.status != _NOT_YET) & (now != self._places).any(axis=1)
+        self.status[stale], self.share[stale] = _NOT_YET, np.nan
         frames = np.flatnonzero(result.finished & (self.status == _NOT_YET))[:_AT_ONCE]
+        self._places[frames] = now[frames]
+        self.changes += bool(stale.any() or len(frames))
         for frame in frames.tolist():
             try:
                 values = next(result.table.each(["status", "node_status"], [frame]))
@@ -80,13 +94,14 @@ class TimeLine:
     ----------
     plot, now
         The plot, and the mark of the frame in view on it.
-    known
-        Frames that are drawn.
     """
 
     def __init__(self, frames: int, now: int) -> None:
-        self.known = 0
-        self._shares, self._faults = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "colour": []})
+        self._drawn = -1
+        self._shares, self._faults = (
+            ColumnDataSource({"x": [], "y": []}),
+            ColumnDataSource({"x": [], "colour": []}, name="faults"),
+        )
         self.plot = figure(
             sizing_mode="stretch_both",
             x_range=Range1d(-0.5, max(frames - 0.5, 0.5)),
@@ -104,8 +119,10 @@ class TimeLine:
         self.plot.add_layout(self.now)
 
     def draw(self, course: Course) -> None:
-        """Draw what is known."""
-        self.known, known = course.known, np.flatnonzero(np.isfinite(course.share))
+        """Draw what is known, unless it is drawn."""
+        if course.changes == self._drawn:
+            return
+        self._drawn, known = course.changes, np.flatnonzero(np.isfinite(course.share))
         self._shares.data = {"x": known, "y": 100 * course.share[known]}
         bad = [(frame, colour) for code, colour in _FAULTS.items() for frame in np.flatnonzero(course.status == code)]
         self._faults.data = {"x": [int(frame) for frame, _ in bad], "colour": [colour for _, colour in bad]}

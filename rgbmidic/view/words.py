@@ -8,14 +8,16 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
+from bokeh.document import Document
 
 from rgbmidic.errors import RgbmidicError
+from rgbmidic.report.style import time_unit
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Result
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.fields import Field, Values
 from rgbmidic.view.picture import element_at
 
-__all__ = ["frame_words", "guarded", "pointed_words", "warning"]
+__all__ = ["frame_words", "guarded", "pointed_words", "warning", "watched"]
 
 logger = logging.getLogger(__name__)
 
@@ -38,13 +40,21 @@ def guarded(act: Callable[[], None], complain: Callable[[str], None]) -> None:
         complain(f"{type(error).__name__}: {error}")
 
 
+def watched(document: Document) -> bool:
+    """Whether a browser shows the page: one that was left lives on for a while, and does nothing more."""
+    session = document.session_context.session if document.session_context else None
+    return session is None or session.connection_count > 0
+
+
 def frame_words(result: Result, place: int, field: Field, values: Values, remark: str) -> str:
     """What is in view, as HTML: the frame, how it ended, the field and what there is to remark."""
     read = next(result.table.each(["status", "reason", "iterations", "node_status", "time_ns"], [place]))
     missing = float(np.mean(read["node_status"] != 0))
     measured = bool(result.finished[place])
     end = QUANTITIES["status"].codes[read["status"]] if measured else "not measured yet"
-    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {read['time_ns'] * 1e-9:.6g} s"
+    seconds = read["time_ns"] * 1e-9
+    factor, unit = time_unit(np.array([seconds]))
+    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {factor * seconds:.6g} {unit}"
     lost = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
     lines = [f"Frame {place} of {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{lost}"]
     if read["reason"] and measured:

@@ -97,6 +97,11 @@ def test_what_the_frame_tells_is_shown_and_bad_input_is_told(test_file):
         assert 0 < low < high < 0.1
         page.do("model('picture').value = 'light: light'")
         page.until("model('plot').title.text === 'light: light'")
+        page.do("model('frame').value = 2")
+        page.until("model('plot').title.text === 'light: light, of frame 0: frame_0.tif'")
+        page.do("model('size').value = 15")
+        page.until("model('plot').title.text === 'raw frame' && !model('told').text.includes('median uncertainty')")
+        assert page.run("model('picture').options") == ["raw frame"]
         for name, value, words in (
             ("calibration", "none.json", "none.json"),
             ("file", "TEST.txt", "must end in .toml"),

@@ -14,9 +14,10 @@ from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.results.probing import read_histories
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.view.fields import Fields, robust_range
+from rgbmidic.view.picture import element_at
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
-RIGHT, LEFT = "\ue014", "\ue012"
+RIGHT, LEFT, HOME = "\ue014", "\ue012", "\ue011"
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +79,69 @@ def test_the_value_under_the_pointer_is_that_of_the_array(driver, address, resul
     assert np.hypot(x - result.nodes[node, 0], y - result.nodes[node, 1]) < 0.5
     assert u == pytest.approx(0.002 * 5 * (x - 60), abs=1e-3)
     assert std == pytest.approx(0.01)
+
+
+def test_the_value_stays_that_of_what_is_shown(driver, address, result):
+    """A point is clicked; then keys, another field, the frame beneath, playing: the number is always that in view."""
+    page = Page(driver, f"{address}?frame=5&field=u")
+    shown(page, 5)
+    page.pointer(("move", 90, 50))
+    page.until("model('under').text.includes('u = ')")
+    page.do("model('mode').active = 1")
+    page.pointer(("click", 90, 50))
+    fields = Fields.of(result)
+
+    def check(frame, name):
+        page.until(f"model('state').shown === {frame} && model('plot').title.text.startsWith({name + ' '!r})")
+        text = page.run("model('under').text")
+        x, y, value = (float(n) for n in re.findall(r"-?[\d.]+(?:e-?\d+)?", text)[:3])
+        values = fields.read(name, frame)
+        corners, weights = element_at(result.nodes, result.elements, x, y)
+        assert f"{name} = " in text
+        assert value == pytest.approx(weights @ values.values[corners], rel=0.02, abs=1e-5)
+
+    check(5, "u")
+    page.keys(HOME)
+    check(0, "u")
+    page.keys(RIGHT, RIGHT)
+    check(2, "u")
+    page.do("model('quantity').value = 'v'")
+    check(2, "v")
+    page.do("model('quantity').value = 'magnitude'")
+    check(2, "magnitude")
+    page.do("model('frame').value = 4")
+    check(4, "magnitude")
+    page.do("model('step').value = 2; model('play').active = true")
+    page.until("model('state').shown === 6")
+    page.do("model('play').active = false; model('step').value = 1")
+    check(page.run("model('state').shown"), "magnitude")
+    page.keys(HOME, RIGHT, RIGHT, RIGHT)
+    shown(page, 3)
+    assert "not measured" in page.run("model('under').text")
+
+
+CUT = """(() => {
+  const cut = [], side = document.querySelector(".side"), edge = side.getBoundingClientRect().left + side.clientWidth;
+  const walk = (root) => root.querySelectorAll("*").forEach((one) => {
+    const box = one.getBoundingClientRect(), control = ["BUTTON", "INPUT", "SELECT"].includes(one.tagName);
+    if (control && (box.right > edge + 1 || one.scrollWidth > one.clientWidth + 1)) cut.push(one.textContent);
+    if (one.shadowRoot) walk(one.shadowRoot);
+  });
+  walk(side);
+  return [cut, document.documentElement.scrollWidth - innerWidth];
+})()"""
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 720), (1920, 1080)])
+def test_no_control_is_cut_off(driver, address, size, theme):
+    driver.set_window_size(*size)
+    page = Page(driver, f"{address}?theme={theme}&range=hand&low=-1&high=1")
+    page.until("model('low').visible")
+    cut, beyond = page.run(CUT)
+    assert cut == []
+    assert beyond <= 0
+    driver.set_window_size(1280, 940)
 
 
 def test_curves_of_a_gauge_that_is_set_and_dragged_are_those_of_history(driver, address, result):

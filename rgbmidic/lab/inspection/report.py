@@ -13,7 +13,7 @@ from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.lab.output import check_folder, write_document
-from rgbmidic.report.style import STYLE, colour_range, finish_picture, save_figure
+from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, save_figure
 from rgbmidic.typing import AnyArray, BoolArray
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def inspection_figure(inspection: Inspection) -> Figure:
         _draw_std(figure, figure.add_subplot(grid[-1, columns - 1]), figure.add_subplot(grid[-1, -1]), inspection)
         _write_summary(figure.add_subplot(grid[0, 1] if columns == 2 else grid[-1, 1]), inspection)
         rows_px, columns_px = inspection.frame_shape
-        figure.suptitle(f"{inspection.name}, {columns_px} x {rows_px} px", fontsize=10)
+        figure.suptitle(f"{literal(inspection.name)}, {columns_px} x {rows_px} px", fontsize=10)
     return figure
 
 
@@ -166,7 +166,7 @@ def _draw_light(axis: Axes, inspection: Inspection, light: int) -> None:
     axis.imshow(
         image, extent=_extent(inspection), cmap="gray", vmin=low, vmax=max(high, low + 1e-6), interpolation="auto"
     )
-    axis.set_title(f"light {facts.name}" if len(inspection.lights) > 1 else "image")
+    axis.set_title(f"light {literal(facts.name)}" if len(inspection.lights) > 1 else "image")
     _frame_axis(axis, inspection, first=light == 0)
 
 
@@ -175,7 +175,7 @@ def _draw_index(axis: Axes, inspection: Inspection, light: int) -> Any:
     facts = inspection.lights[light]
     index = _reduced(inspection.reflection_index[light])
     picture = axis.imshow(index, extent=_extent(inspection), cmap="inferno", vmin=0, vmax=1, interpolation="auto")
-    axis.set_title(f"{facts.name} reflects on {facts.reflecting:.0%}")
+    axis.set_title(f"{literal(facts.name)} reflects on {facts.reflecting:.0%}")
     _frame_axis(axis, inspection, first=light == 0)
     return picture
 
@@ -245,7 +245,7 @@ def _write_summary(axis: Axes, inspection: Inspection) -> None:
     codes = list(dict.fromkeys(finding.code for finding in inspection.findings))
     lines += ["", "warnings: " + (", ".join(codes) if codes else "none")]
     text = "\n".join(fill(line, 36, subsequent_indent="  ") if line.strip() == line else line for line in lines)
-    axis.text(0.02, 0.98, text, transform=axis.transAxes, va="top", fontsize=8, linespacing=1.5)
+    axis.text(0.02, 0.98, text, transform=axis.transAxes, va="top", fontsize=8, linespacing=1.5, parse_math=False)
 
 
 def _spread_out(mask: BoolArray) -> BoolArray:

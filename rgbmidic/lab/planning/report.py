@@ -12,7 +12,7 @@ from rgbmidic._version import __version__
 from rgbmidic.lab.output import check_folder, write_document
 from rgbmidic.lab.planning.lamps import Proposal
 from rgbmidic.lab.planning.plan import Outlook, Plan
-from rgbmidic.report.style import LIGHT_COLOURS, STYLE, save_figure
+from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal, save_figure
 from rgbmidic.scene.light import Light
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS, Zones
@@ -206,7 +206,7 @@ def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
         for column, (title, (one, outlook)) in enumerate(panels.items()):
             _draw_zones(axes[0, column], one, outlook)
             turned = f": {outlook.state.angle_deg:g}°" if outlook.state.angle_deg else ""
-            axes[0, column].set_title(f"{title}{turned}")
+            axes[0, column].set_title(literal(f"{title}{turned}"))
             shown = _draw_std(axes[1, column], one, outlook, top)
         figure.colorbar(shown, ax=list(axes[1]), label="u_std (px)", extend="max", aspect=20, pad=0.02)
         figure.legend(*_legend(plan.scene), loc="outside upper center", ncols=len(plan.scene.lights) + 2)
@@ -273,4 +273,4 @@ def _legend(scene: Scene) -> tuple[list[Any], list[str]]:
 
     lines = [Line2D([], [], color=colour) for colour in _colours(scene)]
     lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
-    return lines, [*(light.name for light in scene.lights), "at rest", "field"]
+    return lines, [*(literal(light.name) for light in scene.lights), "at rest", "field"]

@@ -160,3 +160,59 @@ def test_a_good_frame_has_no_fault_and_each_light_is_told():
     good, dark = grey_frame(0, (0.0, 0.0)), channels(np.full(SHAPE, 70.0))
     assert exposure_fault((good,), INSIDE) is None
     assert exposure_fault((good, dark), INSIDE).startswith("light 2: 100% of the samples in the region are dark")
+
+
+def too_fine_a_mesh(folder, sigma, size):
+    """Frames of speckle of 5.7 px, contrast 500 DN and noise of `sigma`, with elements of `size`."""
+    for index in range(2):
+        write_tiff(folder / f"{index}.tif", grey_frame(1, (0.6 * index, 0.2 * index), noise_seed=index, sigma=sigma))
+    (folder / "TEST.toml").write_text(toml(GREY) + f"[mesh]\nelement_size = {size}\n", encoding="utf-8")
+    return read_test(folder / "TEST.toml")
+
+
+@pytest.mark.parametrize("sigma", [120.0, 160.0])
+def test_a_frame_that_does_not_converge_says_that_its_elements_are_too_small(tmp_path, sigma, caplog):
+    with caplog.at_level(logging.WARNING):
+        result = measure(too_fine_a_mesh(tmp_path, sigma, 5), tmp_path / "out")
+    cause = "elements of 5 px are too small for speckles of 5.[5-9] px: .* set mesh.element_size to 12 or more"
+    assert result.status[1] != Status.CONVERGED
+    assert re.search(cause, result.reasons[1])
+    assert "no start found" not in result.reasons[1]
+    start, frame, *more = (record.message for record in caplog.records)
+    assert re.match(cause, start)
+    assert re.search(cause, frame)
+    assert not more
+
+
+def test_elements_that_hold_enough_speckles_are_not_told(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        result = measure(too_fine_a_mesh(tmp_path, 120.0, 12), tmp_path / "out")
+    assert result.status[1] == Status.CONVERGED
+    assert result.reasons == ("", "")
+    assert not caplog.records
+
+
+def test_the_reason_names_the_node_that_still_moves(tmp_path):
+    """In px of the whole frame, of which the region is a corner."""
+    for index in range(2):
+        write_tiff(tmp_path / f"{index}.tif", grey_frame(1, (0.6 * index, 0.0), noise_seed=index, shape=(800, 900)))
+    text = f"[frames]\n{GREY}[region]\nrectangle = [790, 690, 850, 750]\n[solver]\nmax_iterations = 1\n"
+    (tmp_path / "TEST.toml").write_text(text, encoding="utf-8")
+    result = measure(read_test(tmp_path / "TEST.toml"), tmp_path / "out")
+    assert result.status[1] == Status.NOT_CONVERGED
+    x, y, motion = map(float, re.search(r"x (\d+), y (\d+): by ([\d.]+) px", result.reasons[1]).groups())
+    assert np.hypot(*(result.nodes - [x, y]).T).min() < 1
+    assert motion == pytest.approx(next(result.each("history", [1]))[-1], rel=0.01)
+    assert "solver.max_iterations is 1: allow more" in result.reasons[1]
+
+
+def test_a_light_that_fails_is_told_as_the_cause(tmp_path):
+    for index, light in enumerate((1.0, 0.06)):
+        frame = grey_frame(1, (0.3, 0.0), noise_seed=index, sigma=0.0)
+        dim = 64 + light * (frame.values - 64.0) + 400 * index  # stray light keeps it from being dark
+        noisy = dim + np.random.default_rng(index).normal(scale=60.0, size=dim.shape)
+        write_tiff(tmp_path / f"{index}.tif", replace(frame, values=np.rint(noisy).clip(0, 4095).astype(np.uint16)))
+    (tmp_path / "TEST.toml").write_text(toml(GREY), encoding="utf-8")
+    result = measure(read_test(tmp_path / "TEST.toml"), tmp_path / "out")
+    assert result.status[1] != Status.CONVERGED
+    assert re.search("light shows the speckle with 1?[0-9]% of its contrast", result.reasons[1])

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from results import LIGHTS, MESH, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
+from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import figures, gallery, remove_figures, save_figure, style, write_figures
-from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import AnyArray
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 X, Y = MESH.nodes.T
+SETTINGS = {"frames": {"path": "x.cine", "kind": "monochrome"}, "region": {"rectangle": [0, 0, 9, 9]}}
 EVERY_FRAME = {"displacement", "uncertainty", "strain", "misfit", "shares"}
 
 
@@ -140,6 +145,104 @@ def test_the_reference_is_left_out_of_what_happens_over_the_frames(tmp_path: Pat
             assert line.get_xdata().tolist() == [0, 2, 4, 5]
     lines = figures.convergence_figure(result).axes[0].lines
     assert [line.get_label() for line in lines] == [*(f"frame {i}" for i in (0, 2, 4, 5)), "tolerance"]
+
+
+@pytest.mark.usefixtures("unsaved")
+def test_pictures_are_of_frames_that_were_measured(tmp_path: Path) -> None:
+    """The last frames failed: the last picture is of the last one before them."""
+    records = [FrameRecord.of(nodes=NODES, lights=len(LIGHTS), status=0, u=X, v=Y) for _ in range(8)]
+    records += [FrameRecord.failed("the fragment has left", nodes=NODES, lights=len(LIGHTS)) for _ in range(2)]
+    result = make_result(tmp_path / "out", frames=10, record=records.__getitem__)
+    drawn = {int(file.stem[-6:]) for file in write_figures(result, tmp_path / "figures") if file.stem[-1].isdigit()}
+    assert drawn == {1, 4, 7}
+    none = make_result(tmp_path / "none", frames=4, record=lambda index: records[-1])
+    assert figures.measured_frames(none) == figures.shown_frames(none)
+
+
+def test_displacements_are_in_mm_where_the_scale_is_known(tmp_path: Path) -> None:
+    scale = {"mm_per_pixel": 0.05, "mm_per_pixel_std": 0.001}
+    settings = TestSettings.from_mapping({**SETTINGS, "scale": scale})
+    record = FrameRecord.of(nodes=NODES, lights=len(LIGHTS), u=X, v=Y, u_std=X / 100, v_std=Y / 100, exx=X)
+    result = make_result(tmp_path / "out", frames=1, record=lambda index: record, settings=settings)
+    u, v, *_ = figures.map_figure(result, 0, "displacement").axes
+    assert (u.get_title(), v.get_title()) == ("u (mm)", "v (mm)")
+    assert np.ptp(u.images[-1].get_array()) == pytest.approx(0.05 * np.ptp(X), rel=0.01)
+    std = figures.map_figure(result, 0, "uncertainty").axes[0].images[-1].get_array()
+    assert std.max() == pytest.approx(np.hypot(0.05 * 0.01, 0.001) * X.max(), rel=0.01)
+    assert figures.map_figure(result, 0, "strain").axes[0].get_title() == "exx"
+
+
+NASTY = ("a$x^2$_1", "_hidden", "r$ed", "x\\alpha_{2}", "кадр", "写真", "no\udcffutf8", "two\nlines", "n" * 200)
+
+
+@pytest.mark.filterwarnings("error")  # of letters without a picture
+def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
+    origin = Origin(nodes=MESH.nodes, elements=MESH.elements, names=NASTY[:8], lights=NASTY[:3])
+    still = {"u": 0 * X, "v": 0 * X, "light_share": np.full((NODES, 3), 0.3), "history": [1.0, 0.1]}
+    store = ResultStore.create(tmp_path / "out", origin)
+    for index in range(8):
+        store.write_frame(index, FrameRecord.of(nodes=NODES, lights=3, status=0, residual=np.ones(3), **still))
+    store.finish()
+    result = Result.open(tmp_path / "out")
+    for figure, names in (
+        (figures.convergence_figure(result), NASTY[1:5]),
+        (figures.residual_figure(result), NASTY[:3]),
+        (figures.share_figure(result, 0), NASTY[:3]),
+    ):
+        figure.savefig(io.BytesIO(), format="png", dpi=30)
+        texts = [text for text in figure.findobj(match=Text) if "mathdefault" not in text.get_text()]
+        drawn = [text._preprocess_math(text.get_text()) for text in texts]
+        assert not any(formula for _, formula in drawn)
+        assert all(any(name in text for text, _ in drawn) for name in names)
+
+
+def test_letters_without_a_picture_and_long_names_are_told_otherwise() -> None:
+    assert style.literal("写真") == "\\u5199\\u771f"
+    assert style.literal("no\udcffutf8") == "no\\udcffutf8"
+    assert style.literal("two\nlines") == "two\\nlines"
+    assert len(style.literal("n" * 200)) == 60
+
+
+@pytest.mark.parametrize(
+    ("reach", "unit"), [(3e-7, "ns"), (4e-5, "µs"), (0.02, "ms"), (1.0, "s"), (700.0, "s"), (0, "s")]
+)
+def test_times_are_told_in_the_unit_that_suits_them(reach: float, unit: str) -> None:
+    times = np.array([-reach / 2, np.nan, reach])
+    factor, name = style.time_unit(times)
+    assert name == unit
+    assert np.nanmax(factor * times) == pytest.approx(reach * {"s": 1, "ms": 1e3, "µs": 1e6, "ns": 1e9}[unit])
+
+
+@pytest.mark.parametrize("numbers", [range(4), range(10**8, 10**8 + 300), range(0, 10**7, 10**5)], ids=str)
+def test_numbers_along_an_axis_do_not_touch(tmp_path: Path, numbers: range) -> None:
+    def record(index: int) -> FrameRecord:
+        known = {"node_status": np.zeros(NODES), "light_share": np.full((NODES, 3), 1 / 3)}
+        return FrameRecord.of(nodes=NODES, lights=3, residual=np.ones(3), number=numbers[index], **known)
+
+    result = make_result(tmp_path / "out", frames=len(numbers), record=record)
+    assert all(number.is_integer() for number in _numbers(figures.residual_figure(result)))
+
+
+def test_numbers_under_a_narrow_map_do_not_touch(tmp_path: Path) -> None:
+    tall = Tri3Mesh.from_region(Region.from_rectangle((4010, 5, 4110, 1175), (1200, 4200)), 20)
+    origin = make_origin(1, nodes=tall.nodes, elements=tall.elements)
+    with ResultStore.create(tmp_path / "out", origin) as store:
+        store.write_frame(0, FrameRecord.of(nodes=len(tall.nodes), lights=len(LIGHTS), exx=tall.nodes[:, 0]))
+    _numbers(figures.map_figure(Result.open(tmp_path / "out"), 0, "strain"))
+
+
+def _numbers(figure: Any) -> list[float]:
+    """The numbers along x of all panels, which must be two or more with room between them."""
+    figure.canvas.draw()
+    found = []
+    for axis in (axis for axis in figure.axes if axis.get_xlabel()):
+        (left, right), labels = axis.get_xlim(), axis.get_xticklabels()
+        shown = [label for label in labels if left <= label.get_position()[0] <= right and label.get_text()]
+        boxes = [label.get_window_extent() for label in shown]
+        assert len(boxes) >= 2
+        assert all(box.x1 + 3 < other.x0 for box, other in pairwise(boxes))
+        found += [float(label.get_text()) for label in shown]
+    return found
 
 
 @pytest.mark.usefixtures("unsaved")

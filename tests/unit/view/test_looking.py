@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import random
+from dataclasses import replace
+from types import SimpleNamespace
 from urllib.parse import parse_qs
 
 import numpy as np
 import pytest
+from bokeh.document import Document
+from bokeh.events import MouseMove
+from bokeh.models import Div, Select
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, NODES, make_origin, make_result, random_record, smooth_record
@@ -15,9 +21,12 @@ from rgbmidic.results.history_table import write_histories
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.view import curves
 from rgbmidic.view.address import KINDS, Look, Mark
+from rgbmidic.view.curve_panel import CurvePanel
 from rgbmidic.view.fields import Fields, Values, robust_range
+from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import Window, element_at, paint, palette, palette_name
-from rgbmidic.view.timeline import Course
+from rgbmidic.view.timeline import Course, TimeLine
+from rgbmidic.view.words import frame_words, pointed_words, watched
 
 NAMES = ("u", "v", "e1")
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
@@ -195,3 +204,160 @@ def test_the_time_line_tells_failed_frames_and_lost_nodes(tmp_path):
     np.testing.assert_allclose(course.share[:3], [(r.node_status == 0).mean() for r in records])
     assert course.words(3) == "3 of 4 frames measured, 1 not converged, 1 failed"
     store.release()
+
+
+def test_a_frame_that_is_measured_again_or_taken_back_is_looked_at_again(tmp_path):
+    store = ResultStore.create(tmp_path / "result", make_origin(3))
+    for index in range(3):
+        store.write_frame(index, FrameRecord.failed("no start", nodes=NODES, lights=3))
+    course, line = Course(3), TimeLine(3, 0)
+    course.advance(Result.open(store.path, partial=True))
+    line.draw(course)
+    store.write_frame(1, smooth_record(1))
+    course.advance(Result.open(store.path, partial=True))
+    line.draw(course)
+    assert course.words(3) == "3 of 3 frames measured, 2 failed"
+    assert line.plot.select_one({"name": "faults"}).data["x"] == [0, 2]
+    store.release()
+
+
+def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
+    store = ResultStore.create(tmp_path / "result", make_origin(5))
+    for index in (0, 1, 4):
+        store.write_frame(index, smooth_record(index))
+    panel = CurvePanel(Document(), chosen="", select=Select(), told=Div(), hint="")
+    panel.histories = curves.read(Result.open(store.path, partial=True), [Mark("point", 50, 40)], 60.0)
+    shown = []
+    for frame in range(5):
+        panel.point(frame)
+        shown.append(panel.now.location)
+    assert shown == [0, 1, None, None, 4]
+    store.release()
+
+
+def test_curves_go_over_the_time_in_the_unit_that_suits_it(tmp_path):
+    result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
+    histories = curves.read(result, [Mark("point", 50, 40)], 60.0)
+    x, name = curves.over(histories)
+    assert name == "time (µs)"
+    np.testing.assert_allclose(x, [0, 20, 40, 60])
+    words = frame_words(result, 3, Fields.of(result).all["u"], Fields.of(result).read("u", 3), "")
+    assert "frame 3, 60 µs" in words
+
+
+def timed(index, step):
+    """A record with its time in ns."""
+    record = smooth_record(index)
+    return replace(record, values={**record.values, "time_ns": index * step})
+
+
+class Walk:
+    """A page without a browser, whose visitor does this and that while the result grows."""
+
+    def __init__(self, folder):
+        self.store = ResultStore.create(folder / "result", make_origin(8))
+        self.store.write_frame(0, smooth_record(1))
+        self.page = ResultPage(Document(), self.opened, Look(), Course(8))
+        self.page.show()
+
+    @property
+    def opened(self):
+        return Result.open(self.store.path, partial=True)
+
+    def do(self, what, choose):
+        page, parts = self.page, self.page.parts
+        if what == "point":
+            x, y = choose.uniform(0, 120), choose.uniform(0, 80)
+            page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=x, y=y))
+        elif what == "frame":
+            page.asked.asked = choose.randrange(8)
+        elif what == "field":
+            parts.field.value = choose.choice([name for name, _ in parts.field.options])
+        elif what == "over":
+            parts.over.active = choose.randrange(2)
+        elif what == "range":
+            parts.range.value = choose.choice(["frame", "test"])
+        else:
+            self.store.write_frame(choose.randrange(8), smooth_record(choose.randrange(1, 9)))
+            page._grow()
+            page.asked.asked = parts.frame.value if parts.frame.value != page.look.frame else page.asked.asked
+
+    def check(self):
+        """All that is shown is of the frame and the field in view, as the result holds them now."""
+        page, look, result = self.page, self.page.look, self.opened
+        fields = Fields.of(result)
+        field, values = fields.all[look.field], fields.read(look.field, look.frame)
+        nodes = values.moved if look.over == "deformed" else result.nodes
+        pointer = page._pointer
+        told = "" if pointer is None else pointed_words(field, values, nodes, result.elements, *pointer)
+        assert page.parts.under.text == told
+        remark = page.pictures.frame(look.frame)[1] if look.over == "deformed" else ""
+        assert page.parts.words.text == frame_words(result, look.frame, field, values, remark)
+        assert page.canvas.plot.title.text == field.label
+        if field.ends is None:
+            whole = fields.range_of_test(look.field)
+            ends = whole if look.range == "test" else robust_range(values) or (0.0, 1.0)
+            assert (page.canvas.colours.low, page.canvas.colours.high) == ends
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_told_is_always_that_of_what_is_shown(tmp_path, seed):
+    choose, walk = random.Random(seed), Walk(tmp_path)
+    walk.check()
+    for step in range(40):
+        walk.do(
+            "point" if step == 0 else choose.choice(["point", "frame", "frame", "field", "over", "range", "grow"]),
+            choose,
+        )
+        walk.check()
+    walk.store.release()
+
+
+def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
+    made = make_result(tmp_path / "result", frames=3, record=smooth_record)
+    page = ResultPage(Document(), made, Look(frame=0), Course(3))
+    page.show()
+    page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=50, y=40))
+    file = next((made.path / "solution").glob("*.frames"))
+    content = bytearray(file.read_bytes())
+    content[int(made.table.start[1]) + 3] ^= 255
+    file.write_bytes(content)
+    page.asked.asked = 1
+    assert "damaged in frame 1" in page.parts.words.text
+    assert page.parts.under.text == ""
+    assert not len(page.canvas._image.data["image"])
+    assert not page.canvas.bar.visible
+    page.asked.asked = 2
+    assert page.parts.words.text.startswith("Frame 2 of 2")
+    assert "u = " in page.parts.under.text
+    assert page.canvas.bar.visible
+
+
+def test_curves_that_are_being_read_are_not_saved(tmp_path):
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), Look(), Course(2))
+    page.curves.histories = curves.read(page.result, [Mark("point", 50, 40)], 60.0)
+    page.curves.reading = True
+    page._save()
+    assert page.asked.csv == ""
+    assert "still being read" in page.parts.told.text
+    page.curves.reading = False
+    page._save()
+    assert page.asked.csv.startswith("frame,")
+
+
+def test_a_range_by_hand_that_makes_no_sense_is_told(tmp_path):
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), Look(), Course(2))
+    page.parts.range.value = "hand"
+    page.parts.low.value = 5.0
+    assert "The colours go from -1 to 1" in page.parts.words.text
+    page.parts.high.value = 9.0
+    assert "The colours go" not in page.parts.words.text
+    assert (page.canvas.colours.low, page.canvas.colours.high) == (5, 9)
+
+
+def test_a_page_whose_browser_has_gone_is_not_watched():
+    def document(connections):
+        session = None if connections is None else SimpleNamespace(connection_count=connections)
+        return SimpleNamespace(session_context=SimpleNamespace(session=session))
+
+    assert [watched(document(connections)) for connections in (None, 0, 1)] == [True, False, True]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import random
 import re
@@ -13,11 +14,13 @@ from urllib.parse import quote, urlsplit
 
 import pytest
 from results import make_result
+from tornado.httpclient import AsyncHTTPClient
 from viewer import serving
 
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.view.address import Look
+from rgbmidic.view.server import start
 
 REQUESTS = 300
 """Enough for every kind of request below to come a few times; 20,000 were sent once before this was merged."""
@@ -146,3 +149,23 @@ def test_nothing_but_the_viewer_loads_what_the_viewer_needs():
     )
     told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert told.stdout == "set()\n"
+
+
+def test_others_are_served_while_pages_that_were_left_are_let_go(tmp_path):
+    """Each is let go by itself: whoever waits has an answer after one of them, not after all."""
+    left = []
+
+    async def leave() -> None:
+        server, address = start(make_result(tmp_path / "result").path)
+        for _ in range(5):
+            await AsyncHTTPClient().fetch(address)
+        for session in server.get_sessions():
+            session.request_expiration()
+        letting_go = asyncio.ensure_future(server._tornado._cleanup_sessions())
+        while not letting_go.done():
+            await asyncio.sleep(0)
+            left.append(len(server.get_sessions()))
+        server.stop()
+
+    asyncio.run(leave())
+    assert sorted(set(left)) == [0, 1, 2, 3, 4]
