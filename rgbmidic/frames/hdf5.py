@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError
+from rgbmidic.errors import FrameError, RgbmidicError, legible
 from rgbmidic.frames.layout import MAXIMUM_FRAMES, check_count, cut_short
 from rgbmidic.frames.npy import StackShape
 from rgbmidic.frames.recording import Integers, Recording, even_times
@@ -56,7 +56,7 @@ class Hdf5File(Movie):
 
     def name(self, index: int) -> str:
         """What to call a frame in messages and results: file, dataset where one is named, and the frame's index."""
-        return f"{self.path.name}{self.dataset and ':'}{self.dataset} frame {index}"
+        return f"{legible(self.path.name)}{self.dataset and ':'}{self.dataset} frame {index}"
 
     def _recording(self) -> Recording:
         return self._header().recording

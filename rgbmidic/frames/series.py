@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 
-from rgbmidic.errors import FrameError
+from rgbmidic.errors import FrameError, disk_reason, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.formats import FRAME_ENDINGS, Camera, advice, open_source
 from rgbmidic.frames.hdf5 import split_dataset
@@ -121,14 +121,18 @@ class FrameSeries:
 
     def inputs(self, index: int) -> dict[str, str]:
         """Path and fingerprint of every file that state `index` comes from."""
-        return {str(source.path): source.fingerprint for source, _ in self._locate(index)}
+        return {legible(source.path): source.fingerprint for source, _ in self._locate(index)}
 
     def fingerprint(self) -> str:
-        """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order."""
+        """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order; a file that
+        cannot be read, which fails its own frame only, counts with its name."""
         digest = hashlib.sha256()
         for source in (source for sources in self.lights for source in sources):
-            content = file_fingerprint(source.path) if source.path.is_file() else "missing"
-            digest.update(f"{source.path.name}\0{content}\n".encode())
+            try:
+                content = file_fingerprint(source.path)
+            except FrameError:
+                content = "missing"
+            digest.update(f"{legible(source.path.name)}\0{content}\n".encode())
         return digest.hexdigest()
 
     def _locate(self, index: int) -> Iterator[tuple[FrameSource, int]]:
@@ -294,12 +298,15 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     """
     text, dataset = split_dataset(pattern)
     place = Path(base) / text
-    if place.is_dir():
-        found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-        files = [file for file in found if file.suffix.lower() in FRAME_ENDINGS]
-    else:
-        found = files = _matching(Path(text), Path(base))
-    files = [file for file in files if file.is_file() or not file.exists()]  # a link to nothing is told when it is read
+    try:
+        if place.is_dir():
+            found = sorted(file for file in place.iterdir() if file.name[0] != ".")
+            files = [file for file in found if file.suffix.lower() in FRAME_ENDINGS]
+        else:
+            found = files = _matching(Path(text), Path(base))
+        files = [file for file in files if not file.is_dir()]  # what else is no file is told when it is read
+    except OSError as error:
+        raise FrameError(f"the frames {pattern} cannot be looked for: {disk_reason(error)}") from None
     if not files:
         what = "a folder without frames" if place.is_dir() else "no file matches"
         other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")

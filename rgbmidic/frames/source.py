@@ -11,11 +11,11 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
-from rgbmidic.errors import FrameError
+from rgbmidic.errors import FrameError, disk_reason, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.stored import StoredFrame, damaged, raw_frame
-from rgbmidic.settings import FrameSettings
+from rgbmidic.settings import FrameSettings, regular
 
 __all__ = ["FrameSource", "Movie", "file_fingerprint", "file_hash", "remembered"]
 
@@ -66,7 +66,7 @@ class FrameSource(ABC):
 
     def name(self, index: int) -> str:
         """What to call a frame in messages and results: the file's name."""
-        return self.path.name
+        return legible(self.path.name)
 
     def read(self, index: int) -> Mosaic | ChannelFrame:
         """Read frame `index`.
@@ -120,7 +120,7 @@ class Movie(FrameSource):
 
     def name(self, index: int) -> str:
         """What to call a frame in messages and results: the file's name and the frame's index."""
-        return f"{self.path.name} frame {index}"
+        return f"{legible(self.path.name)} frame {index}"
 
     @abstractmethod
     def _recording(self) -> Recording: ...
@@ -129,16 +129,16 @@ class Movie(FrameSource):
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
     """Something to read is there, and what the disk refuses becomes a FrameError."""
-    if path.is_symlink() and not path.exists():
-        raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
-    if not path.is_file():
-        raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
     try:
+        if path.is_symlink() and not path.exists():
+            raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
+        if not regular(path).is_file():
+            raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
         if path.stat().st_size == 0:
             raise damaged(path, "it is empty")
         yield
     except OSError as error:
-        raise FrameError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
 
 
 def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
@@ -182,18 +182,18 @@ def _digest(path: Path | str, function: Callable[[Path], str]) -> str:
     try:
         return function(Path(path))
     except OSError as error:
-        raise FrameError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
 
 
 @remembered
 def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @remembered
 def _sampled(path: Path) -> str:
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         size = file.seek(0, 2)
         digest = hashlib.sha256(str(size).encode())
         for number in range(_SAMPLES):

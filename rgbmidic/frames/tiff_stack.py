@@ -22,6 +22,7 @@ from rgbmidic.frames.stored import StoredFrame, damaged
 from rgbmidic.frames.tiff import checked_page, page_frame
 from rgbmidic.frames.tiff_pages import HEADERS as _HEADERS
 from rgbmidic.frames.tiff_pages import is_stored_as_is, tiff_page
+from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ class _Stack:
 
 @remembered
 def _stack(path: Path) -> _Stack:
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         pages = _Pages.begin(file, path)
         offsets, ends_early = pages.offsets(path)
         content = pages.content(offsets[0]) or b""

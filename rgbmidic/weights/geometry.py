@@ -18,7 +18,7 @@ from rgbmidic.scene.reflection import angle_weights, surface_from_heights
 from rgbmidic.scene.scene import Scene, State
 from rgbmidic.scene.scenefile import read_scene
 from rgbmidic.scene.zones import Zones, predict_zones, zones_on_surface
-from rgbmidic.settings import TestSettings
+from rgbmidic.settings import TestSettings, regular
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["GeometryWeights"]
@@ -174,7 +174,7 @@ def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
     """Points and normals on the grid, from a height map on disk."""
     camera = scene.camera
     try:
-        heights = np.load(path, allow_pickle=False)
+        heights = np.load(regular(path), allow_pickle=False)
     except FileNotFoundError:
         raise ConfigurationError(f"weights.height_map not found: {path}") from None
     except (OSError, ValueError) as error:
