@@ -66,11 +66,14 @@ class Hdf5File(Movie):
         return rows, columns
 
     def _stored(self, index: int) -> StoredFrame:
-        header = self._header()
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        header, part = self._header(), slice(rows.start, rows.stop)
         with _opened(self.path) as file:
             dataset = file[header.name]
             _check_written(dataset, index, header.stack, self.path)
-            values = np.asarray(dataset[index] if dataset.ndim > len(header.stack.shape) else dataset[()])
+            values = np.asarray(dataset[index, part] if dataset.ndim > len(header.stack.shape) else dataset[part])
         return StoredFrame.plain(values.astype(values.dtype.newbyteorder("="), copy=False), self.path)
 
     def _header(self) -> _Header:

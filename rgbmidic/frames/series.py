@@ -14,7 +14,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from rgbmidic.errors import FrameError, disk_reason, legible
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.frames.formats import FRAME_ENDINGS, Camera, advice, open_source
 from rgbmidic.frames.hdf5 import split_dataset
 from rgbmidic.frames.recording import Recording
@@ -97,8 +97,8 @@ class FrameSeries:
             except FrameError:
                 continue
 
-    def read(self, index: int) -> tuple[Mosaic | ChannelFrame, ...]:
-        """Read state `index`: one frame per light fired in succession, else a single one.
+    def read(self, index: int, window: Window | None = None) -> tuple[Mosaic | ChannelFrame, ...]:
+        """Read state `index` or a part of it: one frame per light fired in succession, else a single one.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class FrameSeries:
         IndexError
             There is no such state.
         """
-        return tuple(source.read(inner) for source, inner in self._locate(index))
+        return tuple(source.read(inner, window) for source, inner in self._locate(index))
 
     def name(self, index: int) -> str:
         """Name of state `index`; of several lights in succession joined by " + "."""

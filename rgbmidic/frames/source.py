@@ -6,13 +6,13 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, wraps
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
 from rgbmidic.errors import FrameError, disk_reason, legible
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.stored import StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings, regular
@@ -68,8 +68,8 @@ class FrameSource(ABC):
         """What to call a frame in messages and results: the file's name."""
         return legible(self.path.name)
 
-    def read(self, index: int) -> Mosaic | ChannelFrame:
-        """Read frame `index`.
+    def read(self, index: int, window: Window | None = None) -> Mosaic | ChannelFrame:
+        """Read frame `index`, or a part of it.
 
         Raises
         ------
@@ -78,14 +78,26 @@ class FrameSource(ABC):
         IndexError
             There is no such frame.
         """
-        return raw_frame(self.told(index), self.stated, self.path)
+        shape = None if window is None else window.frame
+        return raw_frame(self.told(index, window), self.stated, self.path, shape)
 
-    def told(self, index: int) -> StoredFrame:
-        """The samples of frame `index` with what the file alone tells of them; raises as `read` does."""
+    def told(self, index: int, window: Window | None = None) -> StoredFrame:
+        """The samples of frame `index`, or a part of it, with what the file alone tells; raises as `read` does."""
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
         with _on_disk(self.path):
-            return self._stored(index)
+            if window is None or window.is_whole:
+                return self._stored(index)
+            if (shape := self._shape()) != window.frame:
+                told = "{} rows of {} pixels, the frames of the test {} of {}".format(*shape, *window.frame)
+                raise FrameError(f"{self.path} has {told}")
+            stored = self._rows(index, window.rows)
+        return replace(stored, values=stored.values[:, window.columns.start : window.columns.stop])
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        """Some rows of a frame, the first of which is a whole multiple of 4: where a format lets only these be read."""
+        stored = self._stored(index)
+        return replace(stored, values=stored.values[rows.start : rows.stop])
 
     @abstractmethod
     def _shape(self) -> tuple[int, int]: ...

@@ -105,15 +105,17 @@ def check_size(path: Path, *, needed: int, stored: int) -> None:
         raise FrameError(f"{path} announces {told}: no frame of a camera can be compressed so much")
 
 
-def raw_frame(stored: StoredFrame, stated: FrameSettings, path: Path) -> Mosaic | ChannelFrame:
-    """The checked frame from what the file tells and what the user states.
+def raw_frame(
+    stored: StoredFrame, stated: FrameSettings, path: Path, shape: tuple[int, int] | None = None
+) -> Mosaic | ChannelFrame:
+    """The checked frame from what the file tells and what the user states; `shape` of the frame where this is a part.
 
     Raises
     ------
     FrameError
         Both say something and do not agree, or something needed is said by neither.
     """
-    _agreed("shape", stated.shape, stored.values.shape[:2], path)
+    _agreed("shape", stated.shape, shape or stored.values.shape[:2], path)
     _agreed("dtype", stated.dtype and np.dtype(stated.dtype).newbyteorder("=").name, stored.values.dtype.name, path)
     stored = _grey_saved_as_colour(stored, stated.kind)
     kind: FrameKind = _agreed("kind", stated.kind, stored.kind, path) or "bayer"
