@@ -74,12 +74,12 @@ def solve(
     Raises
     ------
     InputError
-        The two states have different numbers or sizes of images, or `initial` does not fit the mesh.
+        The two states have different numbers of images, or `initial` does not fit the mesh.
     """
-    if deformed.weights.shape != reference.images.shape:
+    if len(deformed.weights) != len(reference.images):
         raise InputError(
-            f"reference and deformed images must have one shape; given are {reference.images.shape} and "
-            f"{deformed.weights.shape}"
+            f"reference and deformed state must have as many images; given are {len(reference.images)} and "
+            f"{len(deformed.weights)}"
         )
     if initial.shape != reference.mesh.nodes.shape or not np.isfinite(initial).all():
         raise InputError(f"the initial displacement must be finite with shape {reference.mesh.nodes.shape}")

@@ -119,9 +119,14 @@ class FrameSeries:
         times = source.recording.times_ns
         return None if times is None else int(times[inner])
 
-    def inputs(self, index: int) -> dict[str, str]:
-        """Path and fingerprint of every file that state `index` comes from."""
-        return {legible(source.path): source.fingerprint for source, _ in self._locate(index)}
+    def inputs(self, index: int, window: Window | None = None) -> dict[str, str]:
+        """Path and fingerprint of every file that state `index` comes from; where a `window` of it is read, that of
+        the sampled content (`file_fingerprint`), so that the file is not read whole for it."""
+        in_part = window is not None and not window.is_whole
+        sources = (source for source, _ in self._locate(index))
+        return {
+            legible(source.path): file_fingerprint(source.path) if in_part else source.fingerprint for source in sources
+        }
 
     def fingerprint(self) -> str:
         """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order; a file that

@@ -78,7 +78,7 @@ class FrameSource(ABC):
         IndexError
             There is no such frame.
         """
-        shape = None if window is None else window.frame
+        shape = None if window is None or window.is_whole else window.frame
         return raw_frame(self.told(index, window), self.stated, self.path, shape)
 
     def told(self, index: int, window: Window | None = None) -> StoredFrame:

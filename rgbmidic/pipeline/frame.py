@@ -81,29 +81,33 @@ def failed_frame(plan: Plan, index: int, reason: str) -> FrameRecord:
 def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str, Any]:
     """What `FrameRecord.from_solution` is given."""
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
+    if index in settings.frames.reference:
+        start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
+    window = plan.window_of(start.displacement, renewal.displacement)
+    here = plan.window.part_of(window)
     with stage("reading"):
-        state = plan.series.read(index)
+        state = plan.series.read(index, window)
     with stage("separation"):
-        images = plan.separation(state)
-    if images.values.shape != reference.images.shape:
+        images = plan.separation(state, window)
+    if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
         weights, ready = plan.weights.deformed(images, index), correlated(images, settings.illumination)
-        deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter)
-    if index in settings.frames.reference:
-        start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
+        deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter, origin=window.origin)
     statistics = settings.weights.method == "statistics"
     solution = renewal.track(deformed, start, settings.solver, statistics=statistics)
     if solution.status is Status.FAILED:
-        if fault := exposure_fault(state, plan.region.mask):
+        there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
+        if fault := exposure_fault(there, plan.region.mask):
             solution = replace(solution, reason=f"{fault} ({solution.reason})")
         logger.warning("frame %d (%s) cannot be measured: %s", index, name, solution.reason)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
-    brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
+    moved = solution.displacement - reference.offset(deformed)
+    brightness = brightness_change(plan.images.values, images.values, reference, moved)
     _tell_dark(name, images.names, brightness)
     match, best, renewals = _compared(plan, index, start, renewal, deformed, solution)
-    step = -(-max(images.shape) // _THUMBNAIL)
-    reflection = images.reflection_index(step)
+    step = -(-max(plan.window.shape) // _THUMBNAIL)
+    reflection = images.reflection_index(step, here)
     return {
         "solution": kept,
         "number": plan.series.numbers[index],
@@ -112,9 +116,9 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
         "match": match,
         "best_match": best,
         "renewals": renewals,
-        "weights_thumbnail": _in_bytes(weights[:, ::step, ::step]),
+        "weights_thumbnail": _in_bytes(weights[:, *here][:, ::step, ::step]),
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
-        "inputs": plan.series.inputs(index),
+        "inputs": plan.series.inputs(index, window),
     }
 
 
@@ -131,9 +135,11 @@ def _renewal(plan: Plan, renewed: Sequence[tuple[int, Solution]]) -> Renewal:
             return renewal
     renewal = Renewal.none(plan.reference)
     for index, solution in renewed:
-        images = plan.separation(plan.series.read(index))
+        window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
+        images = plan.separation(plan.series.read(index, window), window)
         weights = plan.weights.deformed(images, index)
-        renewal = renewal.renewed(solution, correlated(images, plan.settings.illumination), weights)
+        ready = correlated(images, plan.settings.illumination)
+        renewal = renewal.renewed(solution, ready, weights, window.origin)
     _known.append((plan, indices, renewal))
     return renewal
 

@@ -179,5 +179,28 @@ class Result:
 
     @cached_property
     def reference(self) -> npt.NDArray[np.uint8] | None:
-        """Reference image of each light as a picture, shape (k, H, W); None where none was kept."""
+        """Reference image of each light as a picture, shape (k, H, W); None where none was kept.
+
+        Of a frame of which only a part is read it shows that part, which begins at `reference_origin`.
+        """
         return read_reference(self.path, self.table.layout.sizes)
+
+    @property
+    def reference_origin(self) -> tuple[int, int]:
+        """Column and row of the frame at which `reference` begins."""
+        return self._noted_pair("reference_origin") or (0, 0)
+
+    @property
+    def frame_shape(self) -> tuple[int, int] | None:
+        """Rows and columns of the frames; None where neither the provenance nor a reference image tells them."""
+        if (noted := self._noted_pair("frame_shape")) is not None or self.reference is None:
+            return noted
+        return self.reference.shape[1], self.reference.shape[2]
+
+    def _noted_pair(self, name: str) -> tuple[int, int] | None:
+        """Two whole numbers of the provenance; None where it does not have them."""
+        if (found := self.provenance.get(name)) is None:
+            return None
+        if not (isinstance(found, list) and [type(number) for number in found] == [int, int]):
+            raise ResultError(f"{self.path} is damaged: {name} in its provenance is {found!r}, not two whole numbers")
+        return found[0], found[1]
