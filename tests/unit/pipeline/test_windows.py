@@ -100,8 +100,8 @@ def test_a_search_finds_as_far_as_in_whole_frames(tmp_path: Path, settings: Sett
 
 def test_renewed_references_have_windows_of_their_own(tmp_path: Path, settings: Settings, both: Any) -> None:
     paints = Texture.random(3), Texture.random(4)
-    for index in range(8):
-        motion, changed = Affine(shift=(40.3 * index, -45.2 * index)), 0.08 * index
+    for index in range(6):
+        motion, changed = Affine(shift=(60.3 * index, -65.2 * index)), 0.1 * index
         image = sum(
             part * paint.image(SHAPE, motion) for part, paint in zip((1 - changed, changed), paints, strict=True)
         )
@@ -226,4 +226,4 @@ def test_memory_follows_the_region_and_not_the_frame(tmp_path: Path, settings: S
 
     large, window = (2000, 2000), Window.around(np.array([[900, 900], [999, 999]]), 128 + 96, (2000, 2000))
     corners = [900 - window.origin[0], 900 - window.origin[1], 999 - window.origin[0], 999 - window.origin[1]]
-    assert peak(large, (900, 900, 999, 999)) < 1.3 * peak(window.shape, tuple(corners)) + np.prod(large)
+    assert peak(large, (900, 900, 999, 999)) < 1.3 * peak(window.shape, tuple(corners))
