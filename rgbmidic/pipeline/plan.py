@@ -25,6 +25,12 @@ from rgbmidic.weights import LightWeights, prepare_weights
 
 __all__ = ["Plan", "read_region"]
 
+_REACH = 96.0
+"""px around what is looked at that the separation's local statistics use: three standard deviations of their windows
+with all that is between (`rgbmidic.lab.inspection.view.MARGIN`)."""
+_WORTH = 0.5
+"""Share of the frame from which all of it is read: what a window saves would be less than half."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
@@ -118,13 +124,6 @@ class Plan:
         nodes = self.reference.mesh.nodes + self.window.origin
         places = [nodes, *(nodes + moved for moved in displacements if moved is not None)]
         return _window(np.concatenate(places), search_reach(nodes), self.settings, self.window.frame)
-
-
-_REACH = 96.0
-"""px around what is looked at that the separation's local statistics use: three standard deviations of their windows
-with all that is between (`rgbmidic.lab.inspection.view.MARGIN`)."""
-_WORTH = 0.5
-"""Share of the frame from which all of it is read: what a window saves would be less than half."""
 
 
 def _region_and_window(settings: TestSettings, frame: tuple[int, int]) -> tuple[Region, Window]:
