@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import logging
 import re
 import sys
@@ -9,7 +11,7 @@ import traceback
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from rgbmidic.errors import InputError, RgbmidicError
+from rgbmidic.errors import InputError, RgbmidicError, disk_reason
 
 if TYPE_CHECKING:
     import typer
@@ -24,6 +26,8 @@ def main(app: typer.Typer) -> None:
     from rich.console import Console
     from rich.logging import RichHandler
 
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names that are no text, as standard error prints them
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)
     loggers = [logging.getLogger(name) for name in ("rgbmidic", "rgbmidic_calibration")]
@@ -53,6 +57,8 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
             return fail(str(error), BAD_INPUT)
         if (usage := getattr(error, "format_message", None)) is not None:  # typer's own, whichever click it brings
             return fail(usage() or str(error), BAD_INPUT)
+        if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+            return fail(disk_reason(error), FAILURE)
         return fail(f"{type(error).__name__}: {error} (run again with --debug for the details)", FAILURE)
 
 

@@ -3,6 +3,9 @@
 Every message says what is wrong, what is allowed and what was given, and names the file or key it is about.
 """
 
+import errno
+import os
+
 __all__ = [
     "CalibrationError",
     "ConfigurationError",
@@ -11,11 +14,28 @@ __all__ = [
     "RegionError",
     "ResultError",
     "RgbmidicError",
+    "disk_reason",
+    "legible",
 ]
+
+
+def legible(name: str | os.PathLike[str]) -> str:
+    """A file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\\xff``."""
+    return os.fspath(name).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def disk_reason(error: OSError) -> str:
+    """Why a file cannot be opened, read or written, in a few words."""
+    if error.errno not in (errno.EMFILE, errno.ENFILE):
+        return error.strerror or str(error)
+    return f"{error.strerror}: this process may open no more (ulimit -n shows the limit and raises it)"
 
 
 class RgbmidicError(Exception):
     """Base of all errors that rgbmidic raises on purpose."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(legible(message))
 
 
 class InputError(RgbmidicError, ValueError):

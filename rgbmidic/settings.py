@@ -39,6 +39,7 @@ __all__ = [
     "read_section",
     "read_test",
     "read_toml",
+    "regular",
 ]
 
 _Section = TypeVar("_Section")
@@ -516,6 +517,21 @@ def _from(base: Path, value: Any, hint: Any) -> Any:
     return base / value if Path in (hint, *get_args(hint)) and isinstance(value, str | PurePath) else value
 
 
+def regular(path: Path) -> Path:
+    """The path itself, unless a pipe, a socket or a device is there: to open one may wait, and to read it never end.
+
+    Every file that is read is opened as this gives it. One that is missing is left for the opening to report.
+
+    Raises
+    ------
+    OSError
+        It is not a regular file.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError("it is not a regular file but a pipe, a socket or a device")
+    return path
+
+
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """The sections of a TOML file.
 
@@ -525,7 +541,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
         The file, `what` in words, is missing or not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(regular(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise ConfigurationError(f"{what} not found: {path}") from None
     except (OSError, ValueError) as error:  # text that is no UTF-8 or no TOML, a number of too many digits

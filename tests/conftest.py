@@ -1,8 +1,10 @@
-"""What all tests share: the folder of real data, where this machine has it."""
+"""What all tests share: the folder of real data, where this machine has it, and an end to what hangs."""
 
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,20 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no shared data at {folder}; set RGBMIDIC_SHARED_DATA to its folder")
     return folder
+
+
+@pytest.fixture
+def alarm() -> Iterator[None]:
+    """What waits for ever fails after 20 s."""
+
+    def stop(*_: object) -> None:
+        raise TimeoutError("it hangs")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

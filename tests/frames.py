@@ -75,7 +75,7 @@ def write_monochrome_dng(path: Path, values: npt.NDArray[np.uint16], *, linear_r
     ]
     if linear_rgb:
         values = np.repeat(values[..., None], 3, axis=2)
-        tifffile.imwrite(path, values, photometric=34892, extratags=tags, metadata=None)
+        tifffile.imwrite(path, values, photometric=34892, planarconfig="contig", extratags=tags, metadata=None)
         return
     tifffile.imwrite(path, values, photometric="minisblack", extratags=tags, metadata=None)
     with tifffile.TiffFile(path, mode="r+") as tiff:  # tifffile writes a linear raw of one channel only in this way

@@ -19,6 +19,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.spectra import Led, Sensitivities
 from rgbmidic.report.style import literal
+from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -192,7 +193,7 @@ def _read_table(text: str, endings: Sequence[str] = ("",)) -> tuple[FloatArray, 
     """Wavelengths and the columns that a text FILE.csv#NAME means, shape (columns, n)."""
     file, _, column = text.partition("#")
     try:
-        with Path(file).open(newline="", encoding="utf-8") as stream:
+        with regular(Path(file)).open(newline="", encoding="utf-8") as stream:
             rows = [row for row in csv.reader(stream) if row]
         head = [] if _is_number(rows[0][0]) else [cell.strip() for cell in rows.pop(0)]
         table = np.array(rows, dtype=np.float64).T

@@ -19,7 +19,10 @@ _MANY = 400
 
 
 def brightness_change(
-    first: FloatImage, second: FloatImage, reference: Reference, displacement: FloatArray
+    first: FloatImage,
+    second: FloatImage,
+    reference: Reference,
+    displacement: FloatArray,
 ) -> FloatArray:
     """Gain and offset of every light, ``second = gain first + offset``, as the median over the elements.
 
@@ -29,11 +32,12 @@ def brightness_change(
     Parameters
     ----------
     first, second : ndarray, shape (k, H, W)
-        Images of the two states in grey levels, before any normalisation; NaN where unknown.
+        Images of the two states in grey levels, before any normalisation, of one size or not; NaN where unknown.
     reference
         Mesh and pixels of the reference state.
     displacement : ndarray, shape (N, 2)
-        Of the nodes in px; elements with a node that is NaN are left out.
+        Of the nodes in px, from their place in the first images to that in the second; elements with a node that is NaN
+        are left out.
 
     Returns
     -------
@@ -48,13 +52,13 @@ def brightness_change(
     slots = pixels.offsets[chosen, None] + np.arange(_ENOUGH) * size[:, None] // _ENOUGH
     columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[chosen, :1]
     rows = pixels.local_y[slots].astype(np.int64) + pixels.origin[chosen, 1:]
-    height, width = first.shape[1:]
+    height, width = second.shape[1:]
     across, down = columns + step[:, :1], rows + step[:, 1:]
     inside = (down >= 0) & (down < height) & (across >= 0) & (across < width)
     there = np.clip(down, 0, height - 1) * width + np.clip(across, 0, width - 1)
     f, g = (
         np.take(images.reshape(len(images), -1), at, axis=1)
-        for images, at in ((first, rows * width + columns), (second, there))
+        for images, at in ((first, rows * first.shape[2] + columns), (second, there))
     )
     return np.array([_gain_and_offset(*pair, inside) for pair in zip(f, g, strict=True)])
 

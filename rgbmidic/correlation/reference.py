@@ -42,10 +42,13 @@ class Deformed:
         0 where a pixel is excluded or must not be interpolated.
     partial : ndarray, shape (k, h + 1, w + 1), int32
         Number of blocks of `BLOCK` px, above and to the left, with a weight other than 1.
+    origin : tuple of int
+        Column and row of the frame at which the images begin.
     """
 
     coefficients: FloatImage
     weights: FloatImage
+    origin: tuple[int, int] = (0, 0)
     partial: npt.NDArray[np.int32] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -57,10 +60,20 @@ class Deformed:
         return spline_values(self.coefficients)
 
     @classmethod
-    def prepare(cls, images: FloatImage, weights: FloatImage | None = None, *, prefilter: str = "none") -> Deformed:
-        """Fill, filter and prefilter images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]."""
+    def prepare(
+        cls,
+        images: FloatImage,
+        weights: FloatImage | None = None,
+        *,
+        prefilter: str = "none",
+        origin: tuple[int, int] = (0, 0),
+    ) -> Deformed:
+        """Fill, filter and prefilter images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]; they begin
+        at column and row `origin` of the frame."""
         return cls(
-            coefficients=spline_coefficients(images, prefilter), weights=_usable_weights(images, weights, prefilter)
+            coefficients=spline_coefficients(images, prefilter),
+            weights=_usable_weights(images, weights, prefilter),
+            origin=origin,
         )
 
 
@@ -85,6 +98,8 @@ class Reference:
     texture : ndarray, shape (2, P), float32
         Gradient of the lights' common texture: the sum of theirs.
     prefilter : str
+    origin : tuple of int
+        Column and row of the frame at which the images begin; mesh and pixels count from there.
     """
 
     mesh: Tri3Mesh
@@ -102,6 +117,7 @@ class Reference:
     pixel_weights: FloatImage
     texture: FloatImage
     prefilter: str
+    origin: tuple[int, int] = (0, 0)
 
     @classmethod
     def prepare(
@@ -112,8 +128,10 @@ class Reference:
         *,
         mesh: Tri3Mesh,
         prefilter: str = "none",
+        origin: tuple[int, int] = (0, 0),
     ) -> Reference:
-        """Prepare reference images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1].
+        """Prepare reference images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]; they begin at column
+        and row `origin` of the frame, region and mesh count from there.
 
         Raises
         ------
@@ -147,7 +165,12 @@ class Reference:
             pixel_weights=weighted,
             texture=gradient.sum(axis=1),
             prefilter=prefilter,
+            origin=origin,
         )
+
+    def offset(self, deformed: Deformed) -> FloatArray:
+        """Column and row of these images (2,) at which those of a deformed state begin."""
+        return np.subtract(deformed.origin, self.origin).astype(np.float64)
 
     def blocks(self, weight: FloatImage, gradient_x: FloatImage, gradient_y: FloatImage) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""
@@ -182,17 +205,16 @@ class Reference:
             values,
             self.pixel_weights[light],
         )
-        bring_back(*images, *self._geometry(), displacement, difference, weight, moments)
+        motion = displacement - self.offset(deformed)
+        bring_back(*images, *self._geometry(), motion, difference, weight, moments)
 
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
     ) -> FloatArray:
         """A light's right-hand side (2 N,) for reference grey levels `values` (P,)."""
         parts = np.empty((len(self.mesh.elements), 3, 2))
-        gradient = self.gradient_x[light], self.gradient_y[light]
-        element_right_side(
-            deformed.coefficients[light], values, *gradient, weight, *self._geometry(), displacement, parts
-        )
+        gradient, motion = (self.gradient_x[light], self.gradient_y[light]), displacement - self.offset(deformed)
+        element_right_side(deformed.coefficients[light], values, *gradient, weight, *self._geometry(), motion, parts)
         return self.assembly.vector(parts)
 
     def projected(self, light: int, weight: FloatImage, difference: FloatImage) -> FloatArray:

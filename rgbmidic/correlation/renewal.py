@@ -142,9 +142,15 @@ class Renewal:
         known = np.isfinite(match)
         return bool(known.any() and (match[known] < _POOR * best).mean() > _POOR_SHARE)
 
-    def renewed(self, solution: Solution, images: FloatImage, weights: FloatImage | None = None) -> Renewal:
+    def renewed(
+        self,
+        solution: Solution,
+        images: FloatImage,
+        weights: FloatImage | None = None,
+        origin: tuple[int, int] | None = None,
+    ) -> Renewal:
         """The reference of a frame with a `solution` on the first one and images and weights (k, H, W) as
-        `Reference.prepare` takes them.
+        `Reference.prepare` takes them; they begin at column and row `origin`, by default where those of the first do.
 
         All that it holds follows from these and `self`, uncertainty and strain in single precision: a solution read
         back from a result gives the same bits.
@@ -158,13 +164,14 @@ class Renewal:
         if not measured[mesh.elements].all(axis=1).any():
             raise InputError("a frame in which no element is measured cannot be a reference")
         displacement = solution.displacement[mesh.nearest(measured)[1]]
-        moved = Tri3Mesh(nodes=mesh.nodes + displacement, elements=mesh.elements)
-        prefilter = self.first.prefilter
+        origin, prefilter = self.first.origin if origin is None else origin, self.first.prefilter
+        motion = displacement - np.subtract(origin, self.first.origin)
+        moved = Tri3Mesh(nodes=mesh.nodes + motion, elements=mesh.elements)
         region = _region(self.first, moved, measured, images.shape[1:])
-        reference = Reference.prepare(images, region, weights, mesh=moved, prefilter=prefilter)
+        reference = Reference.prepare(images, region, weights, mesh=moved, prefilter=prefilter, origin=origin)
         step = displacement - self.displacement
         gaps = np.where(measured[:, None], step, np.nan)
-        deformed = Deformed.prepare(images, weights, prefilter=prefilter)
+        deformed = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
         scores = _scores(self.reference, deformed, gaps, solution.rigid - self.rigid)
         turn = np.eye(2) + self.reference.mesh.element_gradient(step)
         return Renewal(

@@ -75,12 +75,12 @@ def solve(
     Raises
     ------
     InputError
-        The two states have different numbers or sizes of images, or `initial` does not fit the mesh.
+        The two states have different numbers of images, or `initial` does not fit the mesh.
     """
-    if deformed.weights.shape != reference.images.shape:
+    if len(deformed.weights) != len(reference.images):
         raise InputError(
-            f"reference and deformed images must have one shape; given are {reference.images.shape} and "
-            f"{deformed.weights.shape}"
+            f"reference and deformed state must have as many images; given are {len(reference.images)} and "
+            f"{len(deformed.weights)}"
         )
     if initial.shape != reference.mesh.nodes.shape or not np.isfinite(initial).all():
         raise InputError(f"the initial displacement must be finite with shape {reference.mesh.nodes.shape}")
@@ -241,7 +241,7 @@ def _judged(
 def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str:
     """Where the last iteration still moved which of the `measured` nodes (N,)."""
     motion, tolerance = np.where(measured, estimate.increments[-1], 0.0), problem.options.tolerance
-    x, y = problem.reference.mesh.nodes[motion.argmax()]
+    x, y = problem.reference.mesh.nodes[motion.argmax()] + problem.reference.origin
     return (
         f"iteration {len(estimate.increments)}, the last, still moved {int((motion > tolerance).sum())} of "
         f"{int(measured.sum())} nodes by more than the tolerance of {tolerance:g} px, most the one at x {x:.0f}, "

@@ -8,7 +8,7 @@ around the nodes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,7 +20,7 @@ from rgbmidic.correlation.residual import Residual
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
-__all__ = ["FoundStart", "confidence", "find_start", "find_starts"]
+__all__ = ["FoundStart", "confidence", "find_start", "find_starts", "search_reach"]
 
 _SURE = 0.95
 """Confidence from which finer pictures are not looked at: at .9, speckles of 3 px may be off by 1.2 px (measured)."""
@@ -76,6 +76,12 @@ def confidence(reference: Reference, deformed: Deformed, displacement: FloatArra
     return float(agrees.sum() / max(int(np.isfinite(around).sum()), 0.1 * seen.sum(), 1))
 
 
+def search_reach(nodes: FloatArray) -> float:
+    """Distance (px) from where nodes (N, 2) may be up to which a search looks for them: the longer side of the region,
+    at least `_REACH`."""
+    return max(float(np.ptp(nodes, axis=0).max()), _REACH)
+
+
 def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
     """The surest start of `find_starts`; rest where there is none."""
     rest = FoundStart(displacement=np.zeros_like(reference.mesh.nodes), confidence=0.0)
@@ -87,21 +93,21 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
 
     They are looked for within the region's longer side, but at least 128 px, of rest and of `last` (N, 2).
     """
-    nodes, shape = reference.mesh.nodes, reference.images.shape[1:]
+    nodes, offset = reference.mesh.nodes, reference.offset(deformed)
     rest = np.zeros_like(nodes)
     if last is None and (sure := confidence(reference, deformed, rest, _STILL)) >= _SURE:
         yield FoundStart(displacement=rest, confidence=sure)
         return
     side = float(np.ptp(nodes, axis=0).max())
-    here = Box.around(nodes, _CONTEXT, shape)
+    here = Box.around(nodes, _CONTEXT, reference.images.shape[1:])
     known = nodes if last is None else np.concatenate([nodes, nodes + last])
-    there = Box.around(known, max(side, _REACH), shape)
+    there = Box.around(known - offset, search_reach(nodes), deformed.weights.shape[1:])
     most = int(min(_KEYPOINTS * there.area / here.area, _MOST))
     best, images = 0.0, deformed.images
     for reduction in _REDUCTIONS if side <= _SMALL else _REDUCTIONS[:-1]:
         f = Keypoints.find(reference.images, reference.weights, here, reduction, _KEYPOINTS)
         g = Keypoints.find(images, deformed.weights, there, reduction, most)
-        points, motion = pairs(f, g, 2.0 * reduction)
+        points, motion = pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
         if not len(points):
             continue
         displacement = _followed(points, motion, reference.mesh, float(reduction))

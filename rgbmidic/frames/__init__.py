@@ -1,6 +1,6 @@
 """Raw frames and where they come from: readers, the series of a test's frames, writers."""
 
-from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels, shift_cfa
+from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, Window, cfa_channels, shift_cfa
 from rgbmidic.frames.formats import open_source, read_frame
 from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.series import FrameSeries, list_frames, open_series
@@ -15,6 +15,7 @@ __all__ = [
     "Mosaic",
     "Movie",
     "Recording",
+    "Window",
     "cfa_channels",
     "file_fingerprint",
     "file_hash",

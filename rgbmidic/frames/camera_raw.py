@@ -19,6 +19,7 @@ from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import StoredFrame, check_size, damaged
 from rgbmidic.frames.tiff_pages import RawStructure
+from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def has_camera_header(path: Path) -> bool:
     LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture.
     """
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             head = file.read(12)
     except OSError:  # told by whoever reads the file
         return False

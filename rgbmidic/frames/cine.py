@@ -54,8 +54,13 @@ class CineFile(Movie):
         return _header(self.path).shape
 
     def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
         header = _header(self.path)
-        values = _samples(header, self._bytes(header, index))
+        height = header.shape[0]
+        stored = range(height - rows.stop, height - rows.start) if header.bottom_up else rows
+        values = _samples(header, *self._lines(header, index, stored))
         if header.coded:
             values = _LINEAR[values]
         return StoredFrame(
@@ -66,8 +71,8 @@ class CineFile(Movie):
             white_level=float(header.white_level),
         )
 
-    def _bytes(self, header: CineHeader, index: int) -> npt.NDArray[np.uint8]:
-        """A frame's samples as they are stored (lines, bytes in a line), behind its annotation."""
+    def _lines(self, header: CineHeader, index: int, rows: range) -> tuple[npt.NDArray[np.uint8], range]:
+        """The lines (n, bytes) that some rows of a frame are stored in, behind its annotation, and the rows in them."""
         start = int(header.pointers[index])
         with self.path.open("rb") as file:
             if start < header.first_byte or start + 8 > header.size:
@@ -82,7 +87,11 @@ class CineFile(Movie):
                 raise damaged(self.path, f"frame {index} has not the size that its header announces")
             if start + annotation + lines[0] * lines[1] > header.size:
                 raise self._ends(header, index)
-            return np.fromfile(file, dtype=np.uint8, count=lines[0] * lines[1]).reshape(lines)
+            if lines[0] == 1:  # all samples in a row
+                return np.fromfile(file, dtype=np.uint8, count=lines[1]).reshape(lines), rows
+            file.seek(rows.start * lines[1], 1)
+            part = np.fromfile(file, dtype=np.uint8, count=len(rows) * lines[1])
+            return part.reshape(len(rows), lines[1]), range(len(rows))
 
     def _ends(self, header: CineHeader, index: int) -> FrameError:
         last = min(header.last_whole, index - 1)
@@ -102,12 +111,16 @@ def _header(path: Path) -> CineHeader:
     return replace(header, black_level=black, white_level=int(_LINEAR[header.white_level]))
 
 
-def _samples(header: CineHeader, lines: npt.NDArray[np.uint8]) -> AnyArray:
-    """Samples (H, W), uint8 or uint16, from the lines that they are stored in."""
+def _samples(header: CineHeader, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
+    """Samples (n, W), uint8 or uint16, of some of the rows in the lines that they are stored in."""
+    columns = header.shape[1]
     if header.bits in (8, 16):
-        return lines.view("u1" if header.bits == 8 else "<u2")[:, : header.shape[1]].reshape(header.shape)
-    unpacked = _unpack(lines, header.bits)
-    return unpacked[:, : header.shape[0] * header.shape[1] // len(lines)].reshape(header.shape)
+        samples: AnyArray = lines.view("u1" if header.bits == 8 else "<u2")
+    else:
+        samples = _unpack(lines, header.bits)
+    if len(lines) == 1 and header.shape[0] > 1:
+        return samples[0, rows.start * columns : rows.stop * columns].reshape(len(rows), columns)
+    return samples[:, :columns]
 
 
 def _unpack(lines: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint16]:

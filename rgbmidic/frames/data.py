@@ -11,7 +11,65 @@ from rgbmidic.errors import InputError
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.typing import FloatArray
 
-__all__ = ["BAYER_PATTERNS", "ChannelFrame", "Mosaic", "cfa_channels", "sampled_channels", "shift_cfa"]
+__all__ = ["BAYER_PATTERNS", "ChannelFrame", "Mosaic", "Window", "cfa_channels", "sampled_channels", "shift_cfa"]
+
+_GRID = 32
+"""Windows begin and, within the frame, end at whole multiples of this (px): a mosaic's pattern, packed samples of
+10 bit (4 rows) and the blocks of the separation (at most 16 px) then lie as in the whole frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """The part of a frame that is read and worked on.
+
+    Attributes
+    ----------
+    origin
+        Its first column and row.
+    shape
+        Its rows and columns.
+    frame
+        Rows and columns of the frame.
+    """
+
+    origin: tuple[int, int]
+    shape: tuple[int, int]
+    frame: tuple[int, int]
+
+    @classmethod
+    def whole(cls, frame: tuple[int, int]) -> Window:
+        """All of a frame."""
+        return cls(origin=(0, 0), shape=frame, frame=frame)
+
+    @classmethod
+    def around(cls, points: FloatArray, margin: float, frame: tuple[int, int]) -> Window:
+        """What lies within `margin` px of points (N, 2) in x and y, and little more."""
+        size = np.array(frame[::-1])
+        low = np.clip(np.floor(points.min(axis=0) - margin), 0, size - 1).astype(int) // _GRID * _GRID
+        last = np.clip(np.ceil(points.max(axis=0) + margin), low, size - 1).astype(int)
+        high = np.minimum((last // _GRID + 1) * _GRID, size)
+        (left, top), (columns, rows) = low.tolist(), (high - low).tolist()
+        return cls(origin=(left, top), shape=(rows, columns), frame=frame)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is all of the frame."""
+        return self.shape == self.frame
+
+    @property
+    def rows(self) -> range:
+        """Its rows in the frame."""
+        return range(self.origin[1], self.origin[1] + self.shape[0])
+
+    @property
+    def columns(self) -> range:
+        """Its columns in the frame."""
+        return range(self.origin[0], self.origin[0] + self.shape[1])
+
+    def part_of(self, other: Window) -> tuple[slice, slice]:
+        """Where it lies, rows and columns, in a window that holds all of it."""
+        (left, top), (x, y), (rows, columns) = self.origin, other.origin, self.shape
+        return slice(top - y, top - y + rows), slice(left - x, left - x + columns)
 
 
 def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:

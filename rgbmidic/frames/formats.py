@@ -158,7 +158,8 @@ class _UnknownFile(FrameSource):
     def _shape(self) -> NoReturn:
         if text := advice(self.path):
             raise FrameError(f"{self.path} is {text}")
-        allowed = ", ".join(known.name for known in FORMATS)
+        with self.path.open("rb"):  # one that cannot be opened is told as that
+            allowed = ", ".join(known.name for known in FORMATS)
         raise FrameError(f"{self.path} is not a frame that rgbmidic reads; allowed are {allowed}")
 
     def _stored(self, index: int) -> NoReturn:

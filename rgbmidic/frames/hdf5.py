@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError
+from rgbmidic.errors import FrameError, RgbmidicError, legible
 from rgbmidic.frames.layout import MAXIMUM_FRAMES, check_count, cut_short
 from rgbmidic.frames.npy import StackShape
 from rgbmidic.frames.recording import Integers, Recording, even_times
@@ -56,7 +56,7 @@ class Hdf5File(Movie):
 
     def name(self, index: int) -> str:
         """What to call a frame in messages and results: file, dataset where one is named, and the frame's index."""
-        return f"{self.path.name}{self.dataset and ':'}{self.dataset} frame {index}"
+        return f"{legible(self.path.name)}{self.dataset and ':'}{self.dataset} frame {index}"
 
     def _recording(self) -> Recording:
         return self._header().recording
@@ -66,11 +66,14 @@ class Hdf5File(Movie):
         return rows, columns
 
     def _stored(self, index: int) -> StoredFrame:
-        header = self._header()
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        header, part = self._header(), slice(rows.start, rows.stop)
         with _opened(self.path) as file:
             dataset = file[header.name]
             _check_written(dataset, index, header.stack, self.path)
-            values = np.asarray(dataset[index] if dataset.ndim > len(header.stack.shape) else dataset[()])
+            values = np.asarray(dataset[index, part] if dataset.ndim > len(header.stack.shape) else dataset[part])
         return StoredFrame.plain(values.astype(values.dtype.newbyteorder("="), copy=False), self.path)
 
     def _header(self) -> _Header:

@@ -31,6 +31,9 @@ class HeaderlessFile(FrameSource):
         return self.stated.shape
 
     def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
         shape, dtype = self._shape(), np.dtype("<u2" if self.stated.dtype == "uint16" else self.stated.dtype)
         channels = 3 if self.stated.kind == "rgb" else 1
         needed, size = math.prod(shape) * channels * dtype.itemsize, self.path.stat().st_size
@@ -39,4 +42,6 @@ class HeaderlessFile(FrameSource):
                 f"{self.path} has {size} bytes; {shape[0]} rows of {shape[1]} {self.stated.dtype} samples with "
                 f"{channels} channel(s) need {needed}"
             )
-        return StoredFrame.plain(np.fromfile(self.path, dtype=dtype).reshape(*shape, channels), self.path)
+        row = shape[1] * channels
+        values = np.fromfile(self.path, dtype=dtype, count=len(rows) * row, offset=rows.start * row * dtype.itemsize)
+        return StoredFrame.plain(values.reshape(len(rows), shape[1], channels), self.path)

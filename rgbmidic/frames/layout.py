@@ -58,8 +58,8 @@ class Layout:
         """Number of frames that are all in a file of so many bytes."""
         return min(max((file_size - self.start - self.size) // self.stride + 1, 0), self.count)
 
-    def read(self, path: Path, index: int) -> bytes:
-        """The bytes of frame `index`.
+    def read(self, path: Path, index: int, rows: range, of: int) -> bytes:
+        """The bytes of some `rows` of frame `index`, which has `of` rows of one length.
 
         Raises
         ------
@@ -67,11 +67,12 @@ class Layout:
             The file ends before.
         """
         with path.open("rb") as file:
-            file.seek(self.start + index * self.stride)
-            data = file.read(self.size)
-            if len(data) < self.size:
-                raise cut_short(path, whole=self.whole(file.seek(0, 2)), count=self.count)
-        return data
+            begin, size = self.start + index * self.stride, file.seek(0, 2)
+            if size < begin + self.size:
+                raise cut_short(path, whole=self.whole(size), count=self.count)
+            first, last = (self.size * row // of for row in (rows.start, rows.stop))
+            file.seek(begin + first)
+            return file.read(last - first)
 
 
 def check_count(path: Path, count: int) -> None:

@@ -71,8 +71,11 @@ class MrawFile(Movie):
         return self._header().shape
 
     def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
         header = self._header()
-        values = header.samples(header.layout.read(self.path, index))
+        values = header.samples(header.layout.read(self.path, index, rows, header.shape[0]))
         return StoredFrame(values=values, bits=header.bits)
 
     def _header(self) -> _Header:
@@ -104,7 +107,7 @@ class _Header:
             values: AnyArray = np.frombuffer(data, dtype=f"<u{self.stored_bits // 8}")
         else:
             values = unpack_bits(data, self.stored_bits)
-        return (values >> self.shift).reshape(self.shape)
+        return (values >> self.shift).reshape(-1, self.shape[1])
 
 
 @remembered

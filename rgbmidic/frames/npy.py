@@ -56,8 +56,12 @@ class NpyFile(Movie):
         return rows, columns
 
     def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
         header = _header(self.path)
-        values = np.frombuffer(header.layout.read(self.path, index), dtype=header.dtype).reshape(header.shape)
+        data = header.layout.read(self.path, index, rows, header.shape[0])
+        values = np.frombuffer(data, dtype=header.dtype).reshape(len(rows), *header.shape[1:])
         return StoredFrame.plain(values.astype(header.dtype.newbyteorder("="), copy=False), self.path)
 
 

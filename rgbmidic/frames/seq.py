@@ -55,9 +55,13 @@ class SeqFile(Movie):
         return _header(self.path).shape
 
     def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
         header = _header(self.path)
-        data = header.layout.read(self.path, (index + header.oldest) % header.layout.count)
-        values = np.frombuffer(data, dtype=header.dtype).reshape(header.shape) >> header.shift
+        place = (index + header.oldest) % header.layout.count
+        data = header.layout.read(self.path, place, rows, header.shape[0])
+        values = np.frombuffer(data, dtype=header.dtype).reshape(len(rows), -1) >> header.shift
         return StoredFrame(values=values, kind="bayer" if header.cfa else None, cfa=header.cfa, bits=header.bits)
 
 

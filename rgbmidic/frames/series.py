@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 
-from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.errors import FrameError, disk_reason, legible
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.frames.formats import FRAME_ENDINGS, advice, open_source
 from rgbmidic.frames.hdf5 import split_dataset
 from rgbmidic.frames.recording import Recording
@@ -99,8 +99,8 @@ class FrameSeries:
             except FrameError:
                 continue
 
-    def read(self, index: int) -> tuple[Mosaic | ChannelFrame, ...]:
-        """Read state `index`: one frame per light fired in succession, else a single one.
+    def read(self, index: int, window: Window | None = None) -> tuple[Mosaic | ChannelFrame, ...]:
+        """Read state `index` or a part of it: one frame per light fired in succession, else a single one.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class FrameSeries:
         IndexError
             There is no such state.
         """
-        return tuple(source.read(inner) for source, inner in self._locate(index))
+        return tuple(source.read(inner, window) for source, inner in self._locate(index))
 
     def gone(self) -> str:
         """The lights of which no file exists any more: first file and number of files; empty where there is none."""
@@ -127,16 +127,25 @@ class FrameSeries:
         times = source.recording.times_ns
         return None if times is None else int(times[inner])
 
-    def inputs(self, index: int) -> dict[str, str]:
-        """Path and fingerprint of every file that state `index` comes from."""
-        return {str(source.path): source.fingerprint for source, _ in self._locate(index)}
+    def inputs(self, index: int, window: Window | None = None) -> dict[str, str]:
+        """Path and fingerprint of every file that state `index` comes from; where a `window` of it is read, that of
+        the sampled content (`file_fingerprint`), so that the file is not read whole for it."""
+        in_part = window is not None and not window.is_whole
+        sources = (source for source, _ in self._locate(index))
+        return {
+            legible(source.path): file_fingerprint(source.path) if in_part else source.fingerprint for source in sources
+        }
 
     def fingerprint(self) -> str:
-        """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order."""
+        """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order; a file that
+        cannot be read, which fails its own frame only, counts with its name."""
         digest = hashlib.sha256()
         for source in (source for sources in self.lights for source in sources):
-            content = file_fingerprint(source.path) if source.path.is_file() else "missing"
-            digest.update(f"{source.path.name}\0{content}\n".encode())
+            try:
+                content = file_fingerprint(source.path)
+            except FrameError:
+                content = "missing"
+            digest.update(f"{legible(source.path.name)}\0{content}\n".encode())
         return digest.hexdigest()
 
     def _locate(self, index: int) -> Iterator[tuple[FrameSource, int]]:
@@ -302,12 +311,15 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     """
     text, dataset = split_dataset(pattern)
     place = Path(base) / text
-    if place.is_dir():
-        found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-        files = [file for file in found if file.suffix.lower() in FRAME_ENDINGS]
-    else:
-        found = files = _matching(Path(text), Path(base))
-    files = [file for file in files if file.is_file() or not file.exists()]  # a link to nothing is told when it is read
+    try:
+        if place.is_dir():
+            found = sorted(file for file in place.iterdir() if file.name[0] != ".")
+            files = [file for file in found if file.suffix.lower() in FRAME_ENDINGS]
+        else:
+            found = files = _matching(Path(text), Path(base))
+        files = [file for file in files if not file.is_dir()]  # what else is no file is told when it is read
+    except OSError as error:
+        raise FrameError(f"the frames {pattern} cannot be looked for: {disk_reason(error)}") from None
     if not files:
         what = "a folder without frames" if place.is_dir() else "no file matches"
         other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")

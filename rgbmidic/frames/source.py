@@ -6,16 +6,16 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, wraps
 from pathlib import Path
 from typing import TypeVar
 
-from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.errors import FrameError, disk_reason, legible
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
-from rgbmidic.settings import FrameSettings
+from rgbmidic.settings import FrameSettings, regular
 
 __all__ = ["FrameSource", "Movie", "file_fingerprint", "file_hash", "remembered"]
 
@@ -66,10 +66,10 @@ class FrameSource(ABC):
 
     def name(self, index: int) -> str:
         """What to call a frame in messages and results: the file's name."""
-        return self.path.name
+        return legible(self.path.name)
 
-    def read(self, index: int) -> Mosaic | ChannelFrame:
-        """Read frame `index`.
+    def read(self, index: int, window: Window | None = None) -> Mosaic | ChannelFrame:
+        """Read frame `index`, or a part of it.
 
         Raises
         ------
@@ -79,14 +79,26 @@ class FrameSource(ABC):
         IndexError
             There is no such frame.
         """
-        return raw_frame(self.told(index), self.stated, self.path, self.camera)
+        shape = None if window is None or window.is_whole else window.frame
+        return raw_frame(self.told(index, window), self.stated, self.path, self.camera, shape)
 
-    def told(self, index: int) -> StoredFrame:
-        """The samples of frame `index` with what the file alone tells of them; raises as `read` does."""
+    def told(self, index: int, window: Window | None = None) -> StoredFrame:
+        """The samples of frame `index`, or a part of it, with what the file alone tells; raises as `read` does."""
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
         with _on_disk(self.path):
-            return self._stored(index)
+            if window is None or window.is_whole:
+                return self._stored(index)
+            if (shape := self._shape()) != window.frame:
+                told = "{} rows of {} pixels, the frames of the test {} of {}".format(*shape, *window.frame)
+                raise FrameError(f"{self.path} has {told}")
+            stored = self._rows(index, window.rows)
+        return replace(stored, values=stored.values[:, window.columns.start : window.columns.stop])
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        """Some rows of a frame, the first of which is a whole multiple of 4: where a format lets only these be read."""
+        stored = self._stored(index)
+        return replace(stored, values=stored.values[rows.start : rows.stop])
 
     @abstractmethod
     def _shape(self) -> tuple[int, int]: ...
@@ -121,7 +133,7 @@ class Movie(FrameSource):
 
     def name(self, index: int) -> str:
         """What to call a frame in messages and results: the file's name and the frame's index."""
-        return f"{self.path.name} frame {index}"
+        return f"{legible(self.path.name)} frame {index}"
 
     @abstractmethod
     def _recording(self) -> Recording: ...
@@ -130,16 +142,16 @@ class Movie(FrameSource):
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
     """Something to read is there, and what the disk refuses becomes a FrameError."""
-    if path.is_symlink() and not path.exists():
-        raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
-    if not path.is_file():
-        raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
     try:
+        if path.is_symlink() and not path.exists():
+            raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
+        if not regular(path).is_file():
+            raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
         if path.stat().st_size == 0:
             raise damaged(path, "it is empty")
         yield
     except OSError as error:
-        raise FrameError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
 
 
 def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
@@ -183,18 +195,18 @@ def _digest(path: Path | str, function: Callable[[Path], str]) -> str:
     try:
         return function(Path(path))
     except OSError as error:
-        raise FrameError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
 
 
 @remembered
 def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @remembered
 def _sampled(path: Path) -> str:
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         size = file.seek(0, 2)
         digest = hashlib.sha256(str(size).encode())
         for number in range(_SAMPLES):

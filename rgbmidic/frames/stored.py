@@ -137,19 +137,24 @@ def check_size(path: Path, *, needed: int, stored: int) -> None:
 
 
 def raw_frame(
-    stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None = None
+    stored: StoredFrame,
+    stated: FrameSettings,
+    path: Path,
+    camera: Camera | None = None,
+    shape: tuple[int, int] | None = None,
 ) -> Mosaic | ChannelFrame:
     """The checked frame from what the file tells, what the user states and what a calibration knows.
 
     Every frame passes here, and nowhere else do the three meet: docs/test-file.md has the table. Each fills in what
-    those before it leave open.
+    those before it leave open. `shape` is that of the frame where this is a part of it.
 
     Raises
     ------
     FrameError
         Two of them say something and do not agree, or something needed is said by none.
     """
-    _agreed("shape", [(None, stated.shape), (path, stored.values.shape[:2])])
+    shape = shape or (stored.values.shape[0], stored.values.shape[1])
+    _agreed("shape", [(None, stated.shape), (path, shape)])
     _agreed("dtype", [(None, _native(stated.dtype)), (path, stored.values.dtype.name)])
     known = camera.kinds if camera else ()
     stored = _grey_saved_as_colour(stored, stated.kind or (known[0] if len(known) == 1 else None))
@@ -163,7 +168,7 @@ def raw_frame(
     if kind != "bayer" and stated.cfa is not None:
         told = f"{path} is read as {kind}, which has no colour filter array"
         raise FrameError(f"cfa is stated as {stated.cfa}, but {told}")
-    cfa = _pattern(stored, stated, path, camera) if kind == "bayer" else None
+    cfa = _pattern(stored, stated, path, camera, shape) if kind == "bayer" else None
     white = _white_level(stored, stated, path, camera)
     black = _black_level(stored, stated, path, camera)
     try:
@@ -238,10 +243,12 @@ def _black_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera:
     return np.full((1, 1), level) if told is None else told
 
 
-def _pattern(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> str:
-    """Bayer pattern of a mosaic; a camera's holds where the frames begin in its own."""
+def _pattern(
+    stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None, shape: tuple[int, int]
+) -> str:
+    """Bayer pattern of a mosaic of `shape`; a camera's holds where the frames begin in its own."""
     known, who, origin = camera.cfa if camera else None, camera.name if camera else "", stated.crop_origin
-    placed = origin is not None or camera is None or camera.shape in (None, stored.values.shape)
+    placed = origin is not None or camera is None or camera.shape in (None, shape)
     if known is not None and origin is not None:
         known, who = shift_cfa(known, origin[1], origin[0]), f"{who}, at frames.crop_origin = {list(origin)},"
     hint = "" if placed else "; if the camera cropped the frames, state frames.crop_origin = [x, y]"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import lzma
+import math
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     from tifffile import TiffPage
 
-__all__ = ["TiffFile", "checked_page", "page_frame"]
+__all__ = ["TiffFile", "checked_page", "page_frame", "page_rows"]
 
 _UNCOMPRESSED = 1
 _BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
@@ -46,6 +47,26 @@ class TiffFile(FrameSource):
             if page.compression in _BY_OPENCV:
                 return page_frame(page, self.path, _by_opencv(page, self.path))
             return page_frame(page, self.path)
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        with tiff_pages(self.path) as pages:
+            page = _single_page(pages, self.path)
+            if (samples := page_rows(page, self.path, rows)) is not None:
+                return page_frame(page, self.path, samples)
+        return FrameSource._rows(self, index, rows)
+
+
+def page_rows(page: TiffPage, path: Path, rows: range) -> AnyArray | None:
+    """Samples of some rows of a checked page; None where it must be unpacked as a whole."""
+    in_planes = page.planarconfig == 2 and page.samplesperpixel > 1
+    if not is_stored_as_is(page) or not page.is_contiguous or in_planes:
+        return None
+    shape = len(rows), page.imagewidth, page.samplesperpixel
+    dtype = np.dtype(page.dtype)
+    start = page.dataoffsets[0] + rows.start * math.prod(shape[1:]) * dtype.itemsize
+    stored = dtype.newbyteorder(page.parent.byteorder)
+    samples = np.fromfile(path, dtype=stored, count=math.prod(shape), offset=start)
+    return samples.astype(dtype, copy=False).reshape(shape)
 
 
 def page_frame(page: TiffPage, path: Path, samples: AnyArray | None = None) -> StoredFrame:
@@ -84,6 +105,8 @@ def checked_page(page: TiffPage, path: Path) -> None:
     if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
         kind = page.dtype or f"{page.bitspersample}-bit"
         raise FrameError(f"{path} has {kind} samples; allowed are unsigned 8 or 16 bit")
+    if not (page.imagelength and page.imagewidth):  # an entry that is damaged counts as 0
+        raise damaged(path, f"its header announces {page.imagelength} rows of {page.imagewidth} pixels")
     size = path.stat().st_size
     if reason := missing_data(page, size):
         raise damaged(path, reason)

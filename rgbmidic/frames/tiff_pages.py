@@ -18,6 +18,7 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.stored import damaged
+from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def tiff_page(path: Path, offset: int) -> Iterator[TiffPage]:
 def _opened(path: Path) -> Iterator[TiffFile]:
     import tifffile
 
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         if file.read(4) not in HEADERS:  # tifffile tries some camera raws that begin as a TIFF file does
             raise damaged(path, "it is not a TIFF file")
     try:
@@ -97,7 +98,7 @@ def _opened(path: Path) -> Iterator[TiffFile]:
 def is_dng(path: Path) -> bool:
     """Whether the tags of the first image say DNG, whatever the file's name says; False for what cannot be read."""
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             head = file.read(8)
             order = _BYTE_ORDERS.get(head[:4], "little")
             file.seek(int.from_bytes(head[4:], order))

@@ -6,7 +6,7 @@ The list of pages is followed by own code, once: a hundred thousand pages take t
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
@@ -19,9 +19,10 @@ from rgbmidic.frames.layout import Layout, check_count
 from rgbmidic.frames.recording import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import StoredFrame, damaged
-from rgbmidic.frames.tiff import checked_page, page_frame
+from rgbmidic.frames.tiff import checked_page, page_frame, page_rows
 from rgbmidic.frames.tiff_pages import HEADERS as _HEADERS
 from rgbmidic.frames.tiff_pages import is_stored_as_is, tiff_page
+from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -61,6 +62,9 @@ class TiffStack(Movie):
         return _stack(self.path).shape
 
     def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
         stack = _stack(self.path)
         if index >= len(stack.offsets) > 1:
             raise FrameError(
@@ -74,8 +78,13 @@ class TiffStack(Movie):
                     page.imagelength, page.imagewidth, *stack.shape
                 )
                 raise FrameError(f"{self.path}: frame {index} has {told}")
-            samples = _behind(page, self.path, index, stack.recording.count) if behind_one_page else None
-            return page_frame(page, self.path, samples)
+            samples = (
+                _behind(page, self.path, index, stack.recording.count, rows)
+                if behind_one_page
+                else page_rows(page, self.path, rows)
+            )
+            stored = page_frame(page, self.path, samples)
+            return stored if samples is not None else replace(stored, values=stored.values[rows.start : rows.stop])
 
 
 def is_tiff_stack(path: Path) -> bool:
@@ -86,14 +95,15 @@ def is_tiff_stack(path: Path) -> bool:
         return False
 
 
-def _behind(page: TiffPage, path: Path, index: int, count: int) -> AnyArray:
-    """Samples of a frame of which only the first has a page, as ImageJ stores more than 4 GB."""
+def _behind(page: TiffPage, path: Path, index: int, count: int, rows: range) -> AnyArray:
+    """Samples of some rows of a frame of which only the first has a page, as ImageJ stores more than 4 GB."""
     if not is_stored_as_is(page) or not page.is_contiguous:
         raise FrameError(f"{path} announces {count} frames but has one page, whose samples are compressed or in pieces")
     layout = Layout.checked(path, count=count, start=page.dataoffsets[0], size=page.nbytes)
     dtype = np.dtype(page.dtype)
-    stored = np.frombuffer(layout.read(path, index), dtype=dtype.newbyteorder(page.parent.byteorder))
-    return stored.astype(dtype, copy=False).reshape(page.shape)
+    data = layout.read(path, index, rows, page.imagelength)
+    stored = np.frombuffer(data, dtype=dtype.newbyteorder(page.parent.byteorder))
+    return stored.astype(dtype, copy=False).reshape(len(rows), *page.shape[1:])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +117,7 @@ class _Stack:
 
 @remembered
 def _stack(path: Path) -> _Stack:
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         pages = _Pages.begin(file, path)
         offsets, ends_early = pages.offsets(path)
         content = pages.content(offsets[0]) or b""

@@ -12,6 +12,7 @@ from typing import Any
 
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
 from rgbmidic.illumination.registration import Registration
+from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
 __all__ = [
@@ -31,7 +32,7 @@ _LARGEST = 1e30
 
 def read_json(path: Path) -> Any:
     """The document of a JSON file; OSError, ValueError or RecursionError where there is none."""
-    text = path.read_text(encoding="utf-8")
+    text = regular(path).read_text(encoding="utf-8")
     return json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole_number)
 
 

@@ -38,6 +38,8 @@ class IlluminationImages:
     texture : TextureModel or None
         The speckle's autocorrelation as the separation took it: hand it on to the other frames of a test; None where
         the separation does not use it.
+    origin : tuple of int
+        Column and row of the frame at which the images begin.
     """
 
     values: FloatImage
@@ -46,6 +48,7 @@ class IlluminationImages:
     full_scale: float
     reflection: FloatArray | None = None
     texture: TextureModel | None = None
+    origin: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         values = np.ascontiguousarray(self.values, dtype=np.float32)
@@ -81,15 +84,21 @@ class IlluminationImages:
             full_scale=frames[0].full_scale,
         )
 
-    def reflection_index(self, step: int = 1) -> FloatImage | None:
-        """Share of a light that is not diffuse, from a single frame, (k, H, W) at every `step`-th pixel.
+    def reflection_index(self, step: int = 1, within: tuple[slice, slice] | None = None) -> FloatImage | None:
+        """Share of a light that is not diffuse, from a single frame, (k, H, W) at every `step`-th pixel, of all or
+        of the rows and columns `within`, which begin at whole multiples of 8.
 
         0 where its contrast is that of the light with the most contrast there, towards 1 in its reflection; None where
         the separation does not tell.
         """
         from rgbmidic.illumination.colour_factors import BLOCK, enlarged  # reading a result takes no kernels
 
-        return None if self.reflection is None else enlarged(self.reflection, BLOCK, self.shape, step)
+        if self.reflection is None:
+            return None
+        rows, columns = within or (slice(0, self.shape[0]), slice(0, self.shape[1]))
+        grid = self.reflection[:, rows.start // BLOCK : -(-rows.stop // BLOCK)]
+        shape = rows.stop - rows.start, columns.stop - columns.start
+        return enlarged(grid[..., columns.start // BLOCK : -(-columns.stop // BLOCK)], BLOCK, shape, step)
 
     @property
     def shape(self) -> tuple[int, int]:

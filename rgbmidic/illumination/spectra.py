@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
 __all__ = ["Led", "Sensitivities", "spectral_response"]
@@ -108,13 +109,13 @@ def spectral_response(sensitivities: Sensitivities, lights: tuple[Led, ...]) -> 
 
 
 def _read_json(path: Path) -> list[list[float]]:
-    document: Any = json.loads(path.read_text(encoding="utf-8"))
+    document: Any = json.loads(regular(path).read_text(encoding="utf-8"))
     spectra = document["spectral_data"]["data"]["main"]
     return [[float(wavelength), *values] for wavelength, values in sorted(spectra.items(), key=lambda i: float(i[0]))]
 
 
 def _read_csv(path: Path) -> list[list[float]]:
-    with path.open(newline="", encoding="utf-8") as stream:
+    with regular(path).open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.reader(stream) if row]
     start = 0 if rows[0][0].replace(".", "", 1).isdigit() else 1
     return [[float(value) for value in row[:4]] for row in rows[start:]]

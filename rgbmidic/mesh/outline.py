@@ -35,9 +35,11 @@ _SLIVER = 0.04
 
 
 def outline_mesh(
-    mask: BoolArray, size: float, cracks: Sequence[npt.ArrayLike]
+    mask: BoolArray, size: float, cracks: Sequence[npt.ArrayLike], origin: tuple[int, int] = (0, 0)
 ) -> tuple[FloatArray, npt.NDArray[np.int32]]:
     """Nodes (N, 2) and elements (E, 3) of about `size` px for the region `mask` (H, W), split along `cracks`.
+
+    The mask may be a part of a frame that begins at column and row `origin`: the nodes then lie as in all of it.
 
     Raises
     ------
@@ -48,7 +50,7 @@ def outline_mesh(
     outline = _outline_points(outlines, size)
     padded = np.pad(mask, 1).astype(np.uint8)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    inner = _lattice_points(mask.shape, size)
+    inner = _lattice_points(mask.shape, size, origin)
     inner = inner[depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > 0.6 * size]
     sharp = sharp_corners(outlines)
     paths = crack_paths(cracks, mask, edge, sharp, size)
@@ -94,12 +96,13 @@ def _triangulated(
     )
 
 
-def _lattice_points(shape: tuple[int, int], size: float) -> FloatArray:
-    """Points of a triangular lattice with pitch `size` over an image of `shape`."""
-    rise = size * np.sqrt(3) / 2
-    rows = np.arange(rise / 2, shape[0] - 1, rise)
-    x = np.arange(0, shape[1] - 1 - size / 2, size)
-    points = [np.stack([x + (i % 2) * size / 2, np.full_like(x, y)], 1) for i, y in enumerate(rows)]
+def _lattice_points(shape: tuple[int, int], size: float, origin: tuple[int, int]) -> FloatArray:
+    """Points of a triangular lattice with pitch `size` over a frame, in its part of `shape` that begins at `origin`."""
+    rise, (left, top) = size * np.sqrt(3) / 2, origin
+    rows = np.arange(rise / 2, top + shape[0] - 1, rise)
+    x = np.arange(0, left + shape[1] - 1 - size / 2, size)
+    x = x[x >= left] - left
+    points = [np.stack([x + (i % 2) * size / 2, np.full_like(x, y - top)], 1) for i, y in enumerate(rows) if y >= top]
     return np.concatenate(points) if points else np.empty((0, 2))
 
 

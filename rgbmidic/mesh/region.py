@@ -27,10 +27,13 @@ class Region:
     mask : ndarray, shape (H, W), bool
     rectangle : tuple (x0, y0, x1, y1) in px, or None
         Set where the region is a rectangle with sides along the axes; the pixels whose centres lie on it belong to it.
+    origin : tuple of int
+        Column and row at which the mask begins in the frame.
     """
 
     mask: BoolArray
     rectangle: tuple[float, float, float, float] | None = None
+    origin: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         mask = np.ascontiguousarray(self.mask, dtype=bool)
@@ -108,6 +111,15 @@ class Region:
             return self
         inside = [_filled(np.asarray(corners, dtype=np.float64), self.mask.shape) for corners in holes]
         return Region(mask=self.mask & ~np.logical_or.reduce(inside))
+
+    def part(self, rows: slice, columns: slice) -> Region:
+        """The same region on a part of the image that holds it."""
+        corners = None
+        if self.rectangle is not None:
+            (x0, y0, x1, y1), x, y = self.rectangle, columns.start, rows.start
+            corners = x0 - x, y0 - y, x1 - x, y1 - y
+        origin = self.origin[0] + columns.start, self.origin[1] + rows.start
+        return Region(mask=self.mask[rows, columns].copy(), rectangle=corners, origin=origin)
 
     @classmethod
     def from_mask(cls, mask: npt.ArrayLike, shape: tuple[int, int] | None = None) -> Region:

@@ -19,7 +19,7 @@ from rgbmidic.correlation import Deformed, Solution, Start, Status, fill
 from rgbmidic.correlation.light_levels import brightness_change
 from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.errors import FrameError, RgbmidicError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.raw_samples import exposure_fault, too_small
@@ -87,8 +87,10 @@ class _UnreadError(FrameError):
     """A frame that cannot be read, at least now."""
 
 
-def read_state(plan: Plan, index: int) -> tuple[tuple[Mosaic | ChannelFrame, ...], dict[str, str]]:
-    """The raw frames of a state, and path and fingerprint of their files.
+def read_state(
+    plan: Plan, index: int, window: Window | None = None
+) -> tuple[tuple[Mosaic | ChannelFrame, ...], dict[str, str]]:
+    """The raw frames of a state, or the part of them in a `window`, and path and fingerprint of their files.
 
     Raises
     ------
@@ -96,7 +98,7 @@ def read_state(plan: Plan, index: int) -> tuple[tuple[Mosaic | ChannelFrame, ...
         They cannot be read.
     """
     try:
-        return plan.series.read(index), plan.series.inputs(index)
+        return plan.series.read(index, window), plan.series.inputs(index, window)
     except (FrameError, OSError) as error:
         raise _UnreadError(str(error)) from error
 
@@ -104,30 +106,34 @@ def read_state(plan: Plan, index: int) -> tuple[tuple[Mosaic | ChannelFrame, ...
 def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str, Any]:
     """What `FrameRecord.from_solution` is given."""
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
+    if index in settings.frames.reference:
+        start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
+    window = plan.window_of(start.displacement, renewal.displacement)
+    here = plan.window.part_of(window)
     with stage("reading"):
-        state, inputs = read_state(plan, index)
+        state, inputs = read_state(plan, index, window)
     with stage("separation"):
-        images = plan.separation(state)
-    if images.values.shape != reference.images.shape:
+        images = plan.separation(state, window)
+    if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
         weights, ready = plan.weights.deformed(images, index), correlated(images, settings.illumination)
-        deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter)
-    if index in settings.frames.reference:
-        start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
+        deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter, origin=window.origin)
     statistics = settings.weights.method == "statistics"
     solution = renewal.track(deformed, start, settings.solver, statistics=statistics)
     if solution.status is not Status.CONVERGED:
-        causes = _causes(plan, state, images, solution)
+        there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
+        causes = _causes(plan, there, images, reference.offset(deformed), solution)
         solution = replace(solution, reason="; ".join([solution.reason, *causes]))
         end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
         logger.warning("frame %d (%s) %s: %s", index, name, end, solution.reason)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
-    brightness = brightness_change(plan.images.values, images.values, reference, solution.displacement)
+    moved = solution.displacement - reference.offset(deformed)
+    brightness = brightness_change(plan.images.values, images.values, reference, moved)
     _tell_dark(name, images.names, brightness)
     match, best, renewals = _compared(plan, index, start, renewal, deformed, solution)
-    step = -(-max(images.shape) // _THUMBNAIL)
-    reflection = images.reflection_index(step)
+    step = -(-max(plan.window.shape) // _THUMBNAIL)
+    reflection = images.reflection_index(step, here)
     return {
         "solution": kept,
         "number": plan.series.numbers[index],
@@ -136,16 +142,21 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
         "match": match,
         "best_match": best,
         "renewals": renewals,
-        "weights_thumbnail": _in_bytes(weights[:, ::step, ::step]),
+        "weights_thumbnail": _in_bytes(weights[:, *here][:, ::step, ::step]),
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": inputs,
     }
 
 
-def _causes(plan: Plan, state: RawState, images: IlluminationImages, solution: Solution) -> list[str]:
-    """What may be why a frame did not converge or cannot be measured, and what to change."""
+def _causes(
+    plan: Plan, state: RawState, images: IlluminationImages, offset: FloatArray, solution: Solution
+) -> list[str]:
+    """What may be why a frame did not converge or cannot be measured, and what to change.
+
+    `state` is cut to the reference's window, which begins at `offset` (x, y) in the `images`' own.
+    """
     causes = [fault] if (fault := exposure_fault(state, plan.region.mask)) else []
-    there = np.where(np.isfinite(solution.displacement), solution.displacement, 0)
+    there = np.where(np.isfinite(solution.displacement), solution.displacement, 0) - offset
     gains = brightness_change(plan.images.values, images.values, plan.reference, there)[:, 0]
     causes += [
         f"{light} shows the speckle with {gain:.0%} of its contrast in the reference: look at lamp and exposure"
@@ -167,9 +178,11 @@ def _renewal(plan: Plan, renewed: Sequence[tuple[int, Solution]]) -> Renewal:
     def make() -> Renewal:
         renewal = Renewal.none(plan.reference)
         for index, solution in renewed:
-            images = plan.separation(read_state(plan, index)[0])
+            window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
+            images = plan.separation(read_state(plan, index, window)[0], window)
             weights = plan.weights.deformed(images, index)
-            renewal = renewal.renewed(solution, correlated(images, plan.settings.illumination), weights)
+            ready = correlated(images, plan.settings.illumination)
+            renewal = renewal.renewed(solution, ready, weights, window.origin)
         return renewal
 
     return plan.updates.get(tuple(index for index, _ in renewed), make)

@@ -16,8 +16,9 @@ import numpy as np
 
 from rgbmidic.correlation import Reference
 from rgbmidic.correlation.renewal import Renewal
+from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import FrameError, RegionError
-from rgbmidic.frames import FrameSeries, open_series, read_frame
+from rgbmidic.frames import FrameSeries, Window, open_series, read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.texture import speckle_diameter
@@ -25,6 +26,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.raw_samples import HARDLY_ENOUGH, check_texture, exposure_fault, too_small
 from rgbmidic.pipeline.separation import RawState, Separation, correlated
 from rgbmidic.settings import RegionSettings, TestSettings
+from rgbmidic.typing import FloatArray
 from rgbmidic.weights import LightWeights, prepare_weights
 
 __all__ = ["Plan", "ReferenceUpdates", "read_region"]
@@ -60,6 +62,13 @@ class ReferenceUpdates:
             return self._kept[-1][1]
 
 
+_REACH = 96.0
+"""px around what is looked at that the separation's local statistics use: three standard deviations of their windows
+with all that is between (`rgbmidic.lab.inspection.view.MARGIN`)."""
+_WORTH = 0.5
+"""Share of the frame from which all of it is read: what a window saves would be less than half."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """What all frames of a test share; it can be pickled, so that any process can measure any frame.
@@ -82,6 +91,8 @@ class Plan:
         The reference state as the solve needs it, with the mesh.
     speckle
         Size of the speckle in the reference's region, px; None where it is not known.
+    window
+        Part of the reference frames that is read; all positions (region, mesh, images) count from where it begins.
     timings
         Whether to tell the time that each stage of a frame takes.
     updates
@@ -96,6 +107,7 @@ class Plan:
     images: IlluminationImages
     reference: Reference
     speckle: float | None
+    window: Window
     timings: bool = False
     updates: ReferenceUpdates = field(default_factory=ReferenceUpdates, repr=False, compare=False)
 
@@ -111,16 +123,21 @@ class Plan:
         calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
         start, *others = settings.frames.reference
         series = open_series(settings.frames, settings.base, calibration)
-        first = series.read(start)
+        region, window = _region_and_window(settings, series.shape)
+        first = series.read(start, window)
         if calibration is not None:
-            height, width = first[0].values.shape[-2:]
-            calibration = calibration.cropped(settings.frames.crop_origin, (height, width))
+            calibration = calibration.cropped(settings.frames.crop_origin, window.frame)
         separation = Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        images, separation = separation.reference(first, map(series.read, others))
-        region = read_region(settings.region, images.shape)
-        mesh = Tri3Mesh.from_region(region, settings.element_size, settings.cracks)
+        images, separation = separation.reference(first, (series.read(index, window) for index in others), window)
+        cracks = [np.subtract(path, window.origin) for path in settings.cracks]
+        mesh = Tri3Mesh.from_region(region, settings.element_size, cracks)
         weights = prepare_weights(
-            settings, images, region, frames=len(series), images_of=lambda index: separation(series.read(index))
+            settings,
+            images,
+            region,
+            shape=window.frame,
+            frames=len(series),
+            images_of=lambda index: separation(series.read(index, window), window),
         )
         reference = Reference.prepare(
             correlated(images, settings.illumination),
@@ -128,6 +145,7 @@ class Plan:
             weights.reference(images),
             mesh=mesh,
             prefilter=settings.solver.prefilter,
+            origin=window.origin,
         )
         speckle = _speckle(images, region)
         if small := too_small(settings.element_size, speckle, HARDLY_ENOUGH):
@@ -142,7 +160,34 @@ class Plan:
             images=images,
             reference=reference,
             speckle=speckle,
+            window=window,
         )
+
+    def window_of(self, *displacements: FloatArray | None) -> Window:
+        """The part of a frame that is read where its displacement is looked for at rest and at nodal `displacements`
+        (N, 2): what a search looks at, and what the separation of that depends on. It holds the reference's."""
+        if self.window.is_whole:
+            return self.window
+        nodes = self.reference.mesh.nodes + self.window.origin
+        places = [nodes, *(nodes + moved for moved in displacements if moved is not None)]
+        return _window(np.concatenate(places), search_reach(nodes), self.settings, self.window.frame)
+
+
+def _region_and_window(settings: TestSettings, frame: tuple[int, int]) -> tuple[Region, Window]:
+    """The region, counted from where the window begins, and the part of the reference frames that is read."""
+    region = read_region(settings.region, frame)
+    spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (0, 1)]
+    corners = np.array([[span[0], span[-1]] for span in spans], dtype=np.float64).T
+    window = _window(corners, search_reach(corners), settings, frame)
+    if np.prod(window.shape) > _WORTH * np.prod(frame):
+        return region, Window.whole(frame)
+    return region.part(*window.part_of(Window.whole(frame))), window
+
+
+def _window(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
+    """What lies within `reach` of points (N, 2), and what its images depend on."""
+    widths = settings.illumination.normalise, settings.weights.blur
+    return Window.around(points, reach + max(_REACH, 3 * max(widths)), frame)
 
 
 def _speckle(images: IlluminationImages, region: Region) -> float | None:

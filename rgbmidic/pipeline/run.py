@@ -172,7 +172,7 @@ def _store(plan: Plan, out: Path, part: range | None, *, overwrite: bool, resume
     series = plan.series
     recording = series.recording
     origin = Origin(
-        nodes=plan.reference.mesh.nodes,
+        nodes=plan.reference.mesh.nodes + plan.window.origin,
         elements=plan.reference.mesh.elements,
         names=[series.name(index) for index in series.chosen],
         lights=plan.images.names,
@@ -185,6 +185,8 @@ def _store(plan: Plan, out: Path, part: range | None, *, overwrite: bool, resume
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
             "lost_frames": series.lost,
+            "frame_shape": list(plan.window.frame),
+            "reference_origin": list(plan.window.origin),
         },
     )
     if part is not None:

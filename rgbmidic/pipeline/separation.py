@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rgbmidic.errors import ConfigurationError, FrameError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.images import IlluminationImages
@@ -44,14 +44,24 @@ class Separation:
     demosaic: str = "auto"
     texture: TextureModel | None = None
 
-    def __call__(self, frames: RawState) -> IlluminationImages:
+    def __call__(self, frames: RawState, window: Window | None = None) -> IlluminationImages:
         """Illumination images of one state from its frame, or its frames if lights fired in succession.
+
+        Parameters
+        ----------
+        frames
+            What the camera recorded, or the same `window` of all of it.
+        window
+            None: the whole frames.
 
         Raises
         ------
         ConfigurationError
             Colour frames without a calibrated crosstalk, or settings that contradict the calibration.
         """
+        if window is not None and not window.is_whole:
+            known = self.calibration and self.calibration.cropped(window.origin, window.shape)
+            return replace(replace(self, calibration=known)(frames), origin=window.origin)
         known = self.calibration or Calibration()
         linear = [linearise(frame, known.noise) for frame in frames]
         if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
@@ -65,7 +75,9 @@ class Separation:
             images = unmix(only, self._crosstalk())
         return images if known.registration is None else align(images, known.registration)
 
-    def reference(self, first: RawState, others: Iterable[RawState] = ()) -> tuple[IlluminationImages, Separation]:
+    def reference(
+        self, first: RawState, others: Iterable[RawState] = (), window: Window | None = None
+    ) -> tuple[IlluminationImages, Separation]:
         """Mean image of each light over the states of the reference, and the separation that knows the first's texture.
 
         A pixel is valid where it is valid in all of them. The others are taken one by one.
@@ -77,10 +89,10 @@ class Separation:
         ConfigurationError
             As above.
         """
-        mean = self(first)
+        mean = self(first, window)
         learnt = replace(self, texture=mean.texture)
         total, valid, count = mean.values.astype(np.float64), mean.valid, 1
-        for images in map(learnt, others):
+        for images in (learnt(state, window) for state in others):
             if images.values.shape != total.shape:
                 raise FrameError(f"the reference frames have different shapes: {total.shape}, {images.values.shape}")
             total, valid, count = total + images.values, valid & images.valid, count + 1

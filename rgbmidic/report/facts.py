@@ -141,7 +141,8 @@ def speckle_size(result: Result) -> float | None:
     """
     if result.reference is None:
         return None
-    (left, top), (right, bottom) = result.nodes.min(axis=0).astype(int), result.nodes.max(axis=0).astype(int) + 1
+    nodes = result.nodes - result.reference_origin
+    (left, top), (right, bottom) = nodes.min(axis=0).astype(int), nodes.max(axis=0).astype(int) + 1
     parts = result.reference[:, max(top, 0) : bottom, max(left, 0) : right].astype(np.float32)
     sizes = [size for part in parts if (size := speckle_diameter(part)) is not None]
     return float(np.median(sizes)) if sizes else None

@@ -232,7 +232,7 @@ def _maps(
     def draw(axes: list[Axes]) -> None:
         for axis, (label, (values, norm)) in zip(axes, maps.items(), strict=True):
             if reference is not None:
-                show_image(axis, reference)
+                show_image(axis, reference, result.reference_origin)
             if norm is not None and np.isfinite(values).any():
                 _show_field(axis, result, values, norm, colour_map)
             else:
@@ -281,15 +281,15 @@ def _shaded(
     `words` tells of what is shown of it. None where no reference was kept."""
     if (reference := result.reference) is None:
         return None
-    step = -(-reference.shape[1] // cover.shape[1])
+    step, origin = -(-reference.shape[1] // cover.shape[1]), result.reference_origin
     moved = result.nodes + np.stack([record.u, record.v], axis=1)
     x, y = view = _view(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
 
     def draw(axes: list[Axes]) -> None:
         for axis, image, part, light in zip(axes, reference, cover, result.lights, strict=True):
-            show_image(axis, image)
-            shade(axis, part, step)
-            axis.set_title(literal(f"{light}: {words(part[_inside(view, step)])}"))
+            show_image(axis, image, origin)
+            shade(axis, part, step, origin)
+            axis.set_title(literal(f"{light}: {words(part[_inside(view, origin, step)])}"))
             finish_picture(axis, x, y, first=axis is axes[0])
 
     title = f"{_frame_title(result, frame, record)}, over the reference image"
@@ -302,15 +302,17 @@ def _view(result: Result, points: FloatArray) -> View:
     margin = _MARGIN * (high - low).max()
     low, high = low - margin, high + margin
     if result.reference is not None:
-        size = np.array(result.reference.shape[:0:-1])
-        low, high = np.clip(low, -0.5, size - 0.5), np.clip(high, -0.5, size - 0.5)
+        first, size = np.array(result.reference_origin), np.array(result.reference.shape[:0:-1])
+        low, high = (np.clip(end, first - 0.5, first + size - 0.5) for end in (low, high))
     return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
-def _inside(view: View, step: int = 1) -> tuple[slice, slice]:
-    """Rows and columns of a picture, reduced by `step`, that a view shows."""
-    (left, right), (top, bottom) = view
-    columns, rows = ((int((a + 0.5) // step), math.ceil((b + 0.5) / step)) for a, b in ((left, right), (top, bottom)))
+def _inside(view: View, origin: tuple[int, int], step: int) -> tuple[slice, slice]:
+    """Rows and columns that a view shows of a picture which begins at `origin` and is reduced by `step`."""
+    columns, rows = (
+        (int((a - first + 0.5) // step), math.ceil((b - first + 0.5) / step))
+        for (a, b), first in zip(view, origin, strict=True)
+    )
     return slice(*rows), slice(*columns)
 
 

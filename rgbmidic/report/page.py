@@ -7,6 +7,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from rgbmidic.errors import legible
+
 __all__ = ["Page"]
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -67,7 +69,7 @@ class Page:
     def html(self) -> str:
         """The page as HTML."""
         title, body = html.escape(self.title), "\n".join(self._html)
-        return (
+        return legible(
             f'<!doctype html><html lang="en"><meta charset="utf-8">'
             f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>'
             f"<style>{_STYLE}</style>{body}</html>\n"
@@ -76,7 +78,7 @@ class Page:
     def write(self, folder: Path) -> tuple[Path, Path]:
         """Write both pages; gives their paths."""
         markdown, page = folder / "report.md", folder / "report.html"
-        markdown.write_text("\n\n".join(self._markdown) + "\n", encoding="utf-8")
+        markdown.write_text(legible("\n\n".join(self._markdown) + "\n"), encoding="utf-8")
         page.write_text(self.html, encoding="utf-8")
         return markdown, page
 

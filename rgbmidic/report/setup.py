@@ -33,10 +33,10 @@ def hardware_rows(told: Physical, setup: SetupSettings) -> Rows:
     for entry in fields(setup):
         if entry.name not in ("pattern", "notes"):
             yield _NAMES.get(entry.name, entry.name), getattr(setup, entry.name) or _missing(f"setup.{entry.name}")
-    result, reference = told.result, told.result.reference
+    result, shape = told.result, told.result.frame_shape
     yield "lights", ", ".join(result.lights)
-    if reference is not None:
-        rows, columns = reference.shape[1:]
+    if shape is not None:
+        rows, columns = shape
         scale = told.units.mm_per_pixel
         field = "" if scale is None else f"; field of view {columns * scale:.4g} x {rows * scale:.4g} mm"
         yield "image", f"{columns} x {rows} px{field}"

@@ -175,15 +175,21 @@ def colour_scale(known: FloatArray, *, positive: bool = False) -> Normalize:
     return LogNorm(*np.exp(np.clip(colour_range(logarithms), middle - reach, middle + reach)))
 
 
-def show_image(axis: Axes, image: AnyArray) -> None:
-    """An image in grey, reduced to what a page shows, with the extreme percent at either end clipped."""
+def show_image(axis: Axes, image: AnyArray, origin: tuple[int, int] = (0, 0)) -> None:
+    """An image in grey, reduced to what a page shows, with the extreme percent at either end clipped; its first pixel
+    is at column and row `origin`."""
     step = -(-max(image.shape) // _SHOWN)
     rows, columns = (size // step for size in image.shape)
     reduced = image[: rows * step, : columns * step].reshape(rows, step, columns, step).mean(axis=(1, 3))
     finite = reduced[np.isfinite(reduced)]
     low, high = np.percentile(finite, [1, 99]) if finite.size else (0, 1)
-    extent = (-0.5, columns * step - 0.5, rows * step - 0.5, -0.5)
+    extent = _extent(origin, columns * step, rows * step)
     axis.imshow(reduced, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), extent=extent, interpolation="antialiased")
+
+
+def _extent(origin: tuple[int, int], columns: int, rows: int) -> tuple[float, float, float, float]:
+    left, top = origin[0] - 0.5, origin[1] - 0.5
+    return left, left + columns, top + rows, top
 
 
 def add_colour_bar(axis: Axes, shown: ScalarMappable, **options: Any) -> Colorbar:
@@ -195,15 +201,16 @@ def add_colour_bar(axis: Axes, shown: ScalarMappable, **options: Any) -> Colorba
     return bar
 
 
-def shade(axis: Axes, cover: FloatImage, step: int = 1) -> None:
-    """Cover an image by a picture from 0 (clear) to 1, of which one pixel is `step` pixels of the image."""
+def shade(axis: Axes, cover: FloatImage, step: int = 1, origin: tuple[int, int] = (0, 0)) -> None:
+    """Cover an image that begins at `origin` by a picture from 0 (clear) to 1, of which one pixel is `step` pixels of
+    the image."""
     from matplotlib.colors import to_rgb
 
     colours = np.empty((*cover.shape, 4), dtype=np.float32)
     colours[..., :3] = to_rgb("#e8590c")
     colours[..., 3] = 0.65 * np.clip(cover, 0, 1)
-    rows, columns = (step * size - 0.5 for size in cover.shape)
-    axis.imshow(colours, extent=(-0.5, columns, rows, -0.5), interpolation="nearest")
+    rows, columns = (step * size for size in cover.shape)
+    axis.imshow(colours, extent=_extent(origin, columns, rows), interpolation="nearest")
 
 
 def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *, first: bool) -> None:

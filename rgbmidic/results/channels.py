@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
 __all__ = ["Channels"]
@@ -54,7 +55,7 @@ class Channels:
         """
         path = Path(path)
         try:
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
+            lines = regular(path).read_text(encoding="utf-8-sig").splitlines()
         except OSError as error:
             raise InputError(f"the channels {path} cannot be read: {error.strerror or error}") from None
         except ValueError:

@@ -15,7 +15,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from rgbmidic.errors import ResultError
+from rgbmidic.errors import ResultError, disk_reason
+from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
 __all__ = [
@@ -44,7 +45,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, AnyArray]:
         The file is missing or damaged, or holds more than its size on disk.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(regular(path)) as archive:
             return {name: _read_array(archive, name) for name in names}
     except FileNotFoundError:
         raise ResultError(f"{path} is missing: the result is incomplete") from None
@@ -93,7 +94,7 @@ def read_json(path: Path) -> Any:
         It is damaged.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(regular(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise
     except (OSError, ValueError, RecursionError) as error:
@@ -155,4 +156,4 @@ def writing(path: Path | str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
+        raise ResultError(f"{path} cannot be written: {disk_reason(error)}") from None

@@ -194,5 +194,22 @@ class Result:
 
     @cached_property
     def reference(self) -> npt.NDArray[np.uint8] | None:
-        """Reference image of each light as a picture, shape (k, H, W); None where none was kept."""
+        """Reference image of each light as a picture, shape (k, H, W); None where none was kept.
+
+        Of a frame of which only a part is read it shows that part, which begins at `reference_origin`.
+        """
         return read_reference(self.path, self.table.layout.sizes, fingerprint(self.provenance))
+
+    @property
+    def reference_origin(self) -> tuple[int, int]:
+        """Column and row of the frame at which `reference` begins."""
+        x, y = self.provenance.get("reference_origin") or (0, 0)
+        return x, y
+
+    @property
+    def frame_shape(self) -> tuple[int, int] | None:
+        """Rows and columns of the frames; None where neither the provenance nor a reference image tells them."""
+        noted = self.provenance.get("frame_shape")
+        if noted is None and self.reference is not None:
+            noted = self.reference.shape[1:]
+        return noted and (noted[0], noted[1])

@@ -21,6 +21,7 @@ from rgbmidic.settings import (  # the one strict reader of TOML values
     check_names,
     convert_value,
     read_toml,
+    regular,
 )
 
 __all__ = ["DatasetSettings", "Experiment", "Target", "read_scene"]
@@ -215,7 +216,7 @@ def _field(given: Mapping[str, Any], body: Body, base: Path) -> InPlaneField | N
 
 def _mesh_field(path: Path) -> MeshField:
     try:
-        with np.load(path) as file:
+        with np.load(regular(path)) as file:
             arrays = {name: file[name] for name in ("nodes", "elements", "displacement")}
     except (OSError, KeyError, ValueError) as error:
         raise ConfigurationError(f"{path} is not an npz with nodes, elements and displacement: {error}") from None

@@ -35,12 +35,14 @@ class Pictures:
 
     @cached_property
     def reference(self) -> Picture:
-        """Mean of the lights' reference images; plain where none was kept."""
-        kept = self.result.reference
-        if kept is not None:
-            return np.asarray(kept.mean(axis=0), dtype=np.uint8)
+        """Mean of the lights' reference images, plain beside the part of the frames that was read; plain where none was
+        kept."""
+        kept, (left, top) = self.result.reference, self.result.reference_origin
         columns, rows = np.ceil(self.result.nodes.max(axis=0) + 1).astype(int)
-        return np.full((rows, columns), 60, dtype=np.uint8)
+        picture = np.full(self.result.frame_shape or (rows, columns), 60, dtype=np.uint8)
+        if kept is not None:
+            picture[top : top + kept.shape[1], left : left + kept.shape[2]] = kept.mean(axis=0)
+        return picture
 
     def frame(self, place: int) -> tuple[Picture, str]:
         """The raw frame of a place in the result; the reference, and why, where it cannot be read."""

@@ -18,7 +18,7 @@ from rgbmidic.scene.reflection import angle_weights, surface_from_heights
 from rgbmidic.scene.scene import Scene, State
 from rgbmidic.scene.scenefile import read_scene
 from rgbmidic.scene.zones import Zones, predict_zones, zones_on_surface
-from rgbmidic.settings import TestSettings
+from rgbmidic.settings import TestSettings, regular
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["GeometryWeights"]
@@ -117,24 +117,24 @@ class GeometryWeights:
         valid = images.valid.astype(np.float32)
         if self.limit_deg is None:
             return valid
-        each = [self._binary(self._state(index)) for index in self.reference_frames]
+        each = [self._binary(self._state(index), images) for index in self.reference_frames]
         return np.asarray(valid * np.min(each, axis=0))
 
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
         """Weights (k, H, W) of frame `index` compared with the first reference frame."""
-        return np.asarray(images.valid * self._predicted(self._state(index)))
+        return np.asarray(images.valid * self._predicted(self._state(index), images))
 
-    def _predicted(self, state: State) -> FloatImage:
+    def _predicted(self, state: State, images: IlluminationImages) -> FloatImage:
         if self.limit_deg is not None:
-            return self._binary(state)
+            return self._binary(state, images)
         before, after = self._zones(self._state(self.reference_frames[0]), state), self._zones(state, state)
-        return self._whole(self.instrument.weights(before, after, known=bool(self.states)))
+        return self._at_pixels(self.instrument.weights(before, after, known=bool(self.states)), images)
 
-    def _binary(self, state: State) -> FloatImage:
+    def _binary(self, state: State, images: IlluminationImages) -> FloatImage:
         assert self.limit_deg is not None
         deviation = self._zones(state, state).geometry.deviation_deg
-        seen = self._whole(np.isfinite(deviation).astype(np.float32)) > 0.5
-        smooth = self._whole(np.nan_to_num(deviation, nan=180.0).astype(np.float32))
+        seen = self._at_pixels(np.isfinite(deviation).astype(np.float32), images) > 0.5
+        smooth = self._at_pixels(np.nan_to_num(deviation, nan=180.0).astype(np.float32), images)
         return angle_weights(np.where(seen, smooth, np.nan), self.limit_deg)
 
     def _state(self, index: int) -> State:
@@ -146,10 +146,10 @@ class GeometryWeights:
             return zones_on_surface(self.scene, *self.surface)
         return predict_zones(self.scene, state, material=material_points(self.scene, seen, _grid(self.scene)))
 
-    def _whole(self, coarse: FloatImage) -> FloatImage:
-        """Values (k, h, w) on the grid at all pixels (k, H, W), in the order of the test's lights."""
-        height, width = self.scene.camera.shape
-        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    def _at_pixels(self, coarse: FloatImage, images: IlluminationImages) -> FloatImage:
+        """Values (k, h, w) on the grid at the pixels of images (k, H, W), in the order of the test's lights."""
+        (left, top), (height, width) = images.origin, images.shape
+        x, y = np.meshgrid(*(np.arange(a, a + n, dtype=np.float32) for a, n in ((left, width), (top, height))))
         place = x / _STEP, y / _STEP
         return np.stack([cv2.remap(coarse[light], *place, cv2.INTER_LINEAR) for light in self.order])
 
@@ -174,7 +174,7 @@ def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
     """Points and normals on the grid, from a height map on disk."""
     camera = scene.camera
     try:
-        heights = np.load(path, allow_pickle=False)
+        heights = np.load(regular(path), allow_pickle=False)
     except FileNotFoundError:
         raise ConfigurationError(f"weights.height_map not found: {path}") from None
     except (OSError, ValueError) as error:

@@ -63,6 +63,7 @@ def prepare_weights(
     reference: IlluminationImages,
     region: Region,
     *,
+    shape: tuple[int, int] | None = None,
     frames: int,
     images_of: Callable[[int], IlluminationImages],
 ) -> LightWeights:
@@ -76,6 +77,8 @@ def prepare_weights(
         Images of the reference state.
     region
         What is measured.
+    shape
+        Rows and columns of the frames, of which the images may show a part; None: they show all.
     frames
         Number of frames of the test.
     images_of
@@ -88,7 +91,7 @@ def prepare_weights(
     """
     weights = settings.weights
     if weights.method == "geometry":
-        return GeometryWeights.prepare(settings, lights=reference.names, shape=reference.shape, frames=frames)
+        return GeometryWeights.prepare(settings, lights=reference.names, shape=shape or reference.shape, frames=frames)
     if weights.method != "threshold":
         return ValidPixels()
     if weights.threshold == "auto":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -113,6 +114,40 @@ def test_bad_frames_are_status_2_and_an_interruption_130(
         status, _, error = command("run", test_file, "--out", test_file.parent / "out")
         assert status == expected
         assert error.splitlines()[-1].startswith("error: ")
+
+
+def test_too_many_open_files_are_told_with_their_limit(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    def measure(*_: Any, **__: Any) -> Result:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    _replace_pipeline(monkeypatch, measure)
+    status, _, error = command("run", test_file, "--out", test_file.parent / "out")
+    assert status == 1
+    assert error.splitlines()[-1].startswith("error: Too many open files: ")
+    assert "ulimit -n" in error
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["run", "pipe.toml", "--out", "out"], ["run", "calibrated.toml", "--out", "out"], ["frames", "pipe.toml"],
+     ["run", "masked.toml", "--out", "out"], ["plan", "pipe.toml", "--out", "out"], ["export", ".", "--out", "a.npz"],
+     ["inspect", "f0.tif", "--cfa", "RGGB", "--calibration", "pipe.toml", "--out", "out"]],
+)  # fmt: skip
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders")
+def test_a_pipe_is_refused_at_once_wherever_a_file_is_read(
+    command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alarm: None, arguments: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("pipe.toml", "provenance.json"):
+        os.mkfifo(name)
+    tifffile.imwrite("f0.tif", np.random.default_rng(0).integers(0, 4096, (200, 200), dtype=np.uint16))
+    Path("calibrated.toml").write_text(TEST + '[calibration]\nfile = "pipe.toml"\n')
+    Path("masked.toml").write_text(TEST.replace("rectangle = [40, 40, 160, 120]", 'mask = "pipe.toml"'))
+    status, _, error = command(*arguments)
+    assert status == 2
+    assert "is not a regular file" in error
 
 
 def test_a_termination_ends_a_run_in_the_background_of_a_script_too(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.align import align
@@ -94,7 +94,7 @@ def inspect_files(
             element_size=element_size or (test.element_size if test else ELEMENT_SIZE),
             demosaic=test.illumination.demosaic if test else "auto",
             prefilter=test.solver.prefilter if test else "binomial",
-            name=" + ".join(path.name for path in paths),
+            name=" + ".join(legible(path.name) for path in paths),
             progress=progress,
         )
     except InputError as error:

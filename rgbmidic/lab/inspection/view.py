@@ -48,12 +48,7 @@ class View:
 
     def region(self, region: Region) -> Region:
         """The region in it."""
-        x, y = self.origin
-        corners = None
-        if region.rectangle is not None:
-            x0, y0, x1, y1 = region.rectangle
-            corners = x0 - x, y0 - y, x1 - x, y1 - y
-        return Region(mask=region.mask[self._slices], rectangle=corners)
+        return region.part(*self._slices)
 
     def crosstalk(self, crosstalk: Crosstalk) -> Crosstalk:
         """The crosstalk in it."""

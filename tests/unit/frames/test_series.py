@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
-from collections.abc import Sequence
+import socket
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -188,6 +190,72 @@ def test_one_damaged_file_does_not_stop_the_others(tmp_path: Path) -> None:
     assert series.read(2)[0].values.shape == (40, 50)
     with pytest.raises(FrameError, match=r"f1\.dng"):
         series.read(1)
+
+
+@pytest.mark.parametrize("ending", [".tif", ".dng"])
+def test_a_file_without_permission_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    for index in range(3):
+        write_dng(tmp_path / f"f{index}.dng", noisy_mosaic(seed=index))
+        write_tiff(tmp_path / f"f{index}.tif", noisy_mosaic((40, 50), seed=index))
+    opened = Path.open
+
+    def refused(path: Path, *given: Any, **options: Any) -> Any:  # the user who runs the tests may read everything
+        if path.stem == "f1":
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, *given, **options)
+
+    monkeypatch.setattr(Path, "open", refused)
+    series = open_series(FrameSettings(path=(f"*{ending}",), cfa="RGGB"), tmp_path)
+    assert series.fingerprint() == series.fingerprint()
+    assert series.read(2)[0].values.shape == (40, 50)
+    with pytest.raises(FrameError, match=rf"f1\{ending} cannot be read: Permission denied"):
+        series.read(1)
+
+
+def _pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def _socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+
+
+def _device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders")
+@pytest.mark.parametrize("make", [_pipe, _socket, _device])
+@pytest.mark.parametrize("ending", [".tif", ".dng"])
+def test_what_is_no_regular_file_is_refused_without_opening_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alarm: None, make: Callable[[Path], None], ending: str
+) -> None:
+    monkeypatch.chdir(tmp_path)  # a socket's path is short
+    write_dng(tmp_path / "f0.dng", noisy_mosaic())
+    write_tiff(tmp_path / "f0.tif", noisy_mosaic((40, 50)))
+    make(Path(f"f1{ending}"))
+    series = open_series(FrameSettings(path=(f"*{ending}",), cfa="RGGB"), tmp_path)
+    assert [series.name(index) for index in range(2)] == [f"f0{ending}", f"f1{ending}"]
+    assert series.fingerprint()
+    with pytest.raises(FrameError, match=rf"f1\{ending} cannot be read: it is not a regular file"):
+        series.read(1)
+
+
+def test_a_name_that_is_not_utf_8_becomes_text(tmp_path: Path) -> None:
+    try:
+        _write(tmp_path, [os.fsdecode(b"fr\xe4me 1.tif"), os.fsdecode(b"fr\xe4me 2.tif")])
+    except OSError:
+        pytest.skip("a file system of names in UTF-8")
+    series = open_series(FrameSettings(path=("*.tif",), cfa="RGGB"), tmp_path)
+    assert series.name(1) == "fr\\xe4me 2.tif"
+    assert list(series.inputs(0)) == [f"{tmp_path}/fr\\xe4me 1.tif"]
+    assert series.fingerprint()
+    (tmp_path / os.fsdecode(b"fr\xe4me 1.tif")).unlink()
+    with pytest.raises(FrameError, match=r"fr\\xe4me 1\.tif"):
+        series.read(0)
 
 
 def test_reference_must_exist(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -113,6 +114,16 @@ def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path, monkeypatch: p
         "Probes",
     ):
         assert heading in page.words
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_result_in_a_folder_whose_name_is_no_text_has_a_report(tmp_path: Path) -> None:
+    try:
+        result = make(tmp_path / os.fsdecode(b"k\xf6rper"), [still(0, 0.01)])
+    except ResultError:
+        pytest.skip("a file system of names in UTF-8")
+    write_report(result, tmp_path / "a.html")
+    assert "k\\xf6rper" in Reader(tmp_path / "a.html").words
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -20,6 +20,7 @@ from rgbmidic.report import figures, gallery, remove_figures, save_figure, style
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import AnyArray
+from rgbmidic.view.frames import Pictures
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 X, Y = MESH.nodes.T
@@ -27,16 +28,18 @@ SETTINGS = {"frames": {"path": "x.cine", "kind": "monochrome"}, "region": {"rect
 EVERY_FRAME = {"displacement", "uncertainty", "strain", "misfit", "shares"}
 
 
-def _one_frame(path: Path, reference: AnyArray | None = None, **values: Any) -> Result:
+def _one_frame(
+    path: Path, reference: AnyArray | None = None, notes: dict[str, Any] | None = None, **values: Any
+) -> Result:
     """A result of one frame with the quantities given."""
-    with ResultStore.create(path, make_origin(1, reference=reference)) as store:
+    with ResultStore.create(path, make_origin(1, reference=reference, notes=notes or {})) as store:
         store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values))
     return Result.open(path)
 
 
 def _places(picture: Any) -> tuple[AnyArray, AnyArray]:
     """x and y of the columns and rows of a map."""
-    rows, columns = picture.get_array().shape
+    rows, columns = picture.get_array().shape[:2]
     left, right, bottom, top = picture.get_extent()
     x = left + (np.arange(columns) + 0.5) * (right - left) / columns
     return x, top + (np.arange(rows) + 0.5) * (bottom - top) / rows
@@ -52,6 +55,30 @@ def test_map_has_the_right_value_at_every_place(tmp_path: Path, reference: AnyAr
         assert axis.get_ylim()[0] > axis.get_ylim()[1], "y points down"
         assert axis.get_aspect() == 1
         assert "px" in axis.get_title()
+
+
+def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.arange(8, 120), np.arange(4, 80))
+    cover = np.zeros((3, 38, 56))
+    cover[:, 10:12, 20:22] = 255
+    result = _one_frame(
+        tmp_path / "out",
+        np.stack([x + 1000.0 * y] * 3),
+        {"reference_origin": [8, 4], "frame_shape": [80, 120]},
+        u=X / 10,
+        v=Y / 20,
+        reflection_thumbnail=cover,
+    )
+    whole = Pictures(result=result).reference
+    assert whole.shape == (80, 120)
+    np.testing.assert_array_equal(whole[4:, 8:], result.reference[0])
+    assert (whole[:4] == whole[0, 0]).all()
+    image, shade = figures.reflection_figure(result, 0).axes[0].images
+    assert image.get_extent() == [7.5, 119.5, 79.5, 3.5]
+    places, rows = _places(shade)
+    seen = shade.get_array()[..., 3] > 0
+    assert places[seen.any(axis=0)].tolist() == [48.5, 50.5]
+    assert rows[seen.any(axis=1)].tolist() == [24.5, 26.5]
 
 
 @pytest.mark.parametrize("kind", figures.MAPS)

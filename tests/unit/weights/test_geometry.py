@@ -87,6 +87,15 @@ def test_the_reference_excludes_what_any_of_its_frames_excludes(prepare):
 
 
 @pytest.mark.parametrize("limit_deg", [None, 15.0])
+def test_a_part_of_the_frame_has_the_weights_of_its_place(prepare, limit_deg):
+    weights = prepare(**({"limit_deg": limit_deg} if limit_deg else {}))
+    rows, columns = slice(32, 80), slice(64, 100)
+    part = replace(IMAGES, values=ONES[:, rows, columns], valid=ONES[:, rows, columns] > 0, origin=(64, 32))
+    np.testing.assert_array_equal(weights.reference(part), weights.reference(IMAGES)[:, rows, columns])
+    np.testing.assert_array_equal(weights.deformed(part, 2), weights.deformed(IMAGES, 2)[:, rows, columns])
+
+
+@pytest.mark.parametrize("limit_deg", [None, 15.0])
 def test_pixels_that_are_not_valid_have_no_weight(prepare, limit_deg):
     weights = prepare(**({"limit_deg": limit_deg} if limit_deg else {}))
     valid = ONES > 0
