@@ -5,6 +5,7 @@ from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.solve import solve
+from rgbmidic.correlation.start import find_start
 from rgbmidic.correlation.track import Start, track
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Start",
     "Status",
     "correlate",
+    "find_start",
     "solve",
     "track",
 ]

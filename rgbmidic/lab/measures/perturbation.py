@@ -1,6 +1,6 @@
-"""Perturbation P of a displacement field, the zone a reflection disturbs, and the weighting threshold of a set-up.
+"""Perturbation P of a displacement field over areas, and the residual in percent of the dynamic range.
 
-Paper, sections 2.2 and 3.2: the displacement minus its Gaussian-filtered copy, and its standard deviation over areas.
+Paper, section 2.2: the displacement minus its Gaussian-filtered copy, and its standard deviation over areas.
 """
 
 from __future__ import annotations
