@@ -16,10 +16,11 @@ such a zone's border, "mat" the rest.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -51,12 +52,14 @@ from rgbmidic.fields import (
     reference_share,
 )
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.lab.study.bench import Bench
-from rgbmidic.lab.study.perturbation import area_stds
+from rgbmidic.lab.measures import area_stds
 from rgbmidic.lab.virtual import strained_plate, truth
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights.threshold import threshold_weights
+
+if TYPE_CHECKING:
+    from bench import Bench
 
 KINDS: dict[Kind, str] = {"rgb": "3-CCD", "bayer": "Bayer"}
 ZONES = ("mat", "reflection", "edge")
@@ -207,6 +210,9 @@ def _by_part(parts: Any) -> tuple[str, str]:
 
 def areas(quick: bool) -> None:
     """The paper's bench in one Bayer shot: P in the areas over that of A0, by statistics and by the best threshold."""
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "examples" / "paper"))
+    from bench import Bench
+
     angles = (1.0, 8.0) if quick else (0.33, 1.0, 2.0, 4.0, 8.0, 14.0)
     seeds, size = ((0,), 640) if quick else ((0, 1, 2), 1024)
     heading(

@@ -31,8 +31,6 @@ _TOO_MANY = 0.5
 picture halfway through is an ordinary test, a run that measures the smaller part of its frames is not."""
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-study = typer.Typer(rich_markup_mode=None)
-app.add_typer(study, name="study", help="The paper's own analyses.")
 _messages = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
@@ -87,12 +85,6 @@ def _rgbmidic(
         print(f"rgbmidic {__version__}")
     else:
         command.help_where_alone(context)
-
-
-@study.callback(invoke_without_command=True)
-def _study(context: typer.Context) -> None:
-    """The paper's own analyses."""
-    command.help_where_alone(context)
 
 
 @app.command()
@@ -550,34 +542,6 @@ def _print_table(
     for heading, meaning in (words or {}).items():
         print(f"  {heading}: {meaning}")
     print()
-
-
-@study.command()
-def paper(
-    out: Annotated[Path, typer.Option("--out", help="Folder for what is written; must be empty or new.")],
-    angles: Annotated[str, typer.Option("--angles", help="Degrees, such as 0.333,8; the paper's by default.")] = "",
-    size: Annotated[int, typer.Option("--size", help="Rows and columns of the frames in px.")] = 1024,
-    causes: Annotated[
-        bool | None, typer.Option(help="Also change one thing at a time; by default in frames of 1024 px and more.")
-    ] = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """The paper's experiment on the virtual bench, its statements beside what is measured (docs/study.md)."""
-    from rgbmidic.lab.study import ANGLES, run_paper_study
-    from rgbmidic.lab.study.report import check_folder, write_study
-
-    started = time.perf_counter()
-    wanted = _numbers(angles, "--angles") if angles else ANGLES
-    check_folder(out, overwrite=overwrite)
-    with _progress("study") as progress:
-        results = run_paper_study(
-            wanted, size=size, causes=size >= 1024 if causes is None else causes, progress=progress
-        )
-    claims = write_study(results, out, overwrite=overwrite)
-    console = Console(soft_wrap=True)
-    for claim in claims:
-        console.print(f"{claim.verdict:15} {claim.scene or 'plate':11} {claim.figure}: {claim.statement}", markup=False)
-    console.print(f"report: {out / 'report.md'}   {time.perf_counter() - started:.0f} s")
 
 
 def _numbers(text: str, option: str) -> list[float]:

@@ -6,6 +6,7 @@ from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.renewal import Renewal
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status
 from rgbmidic.correlation.solve import solve
+from rgbmidic.correlation.start import find_start
 from rgbmidic.correlation.track import Start, track
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Status",
     "correlate",
     "fill",
+    "find_start",
     "solve",
     "track",
 ]

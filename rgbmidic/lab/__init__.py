@@ -1,1 +1,1 @@
-"""The laboratory: virtual experiments, the paper's studies, planning, inspection, the demonstration."""
+"""The laboratory: virtual experiments, the paper's measures, planning, inspection, the demonstration."""

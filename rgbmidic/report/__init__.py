@@ -14,14 +14,16 @@ from rgbmidic.report.figures import (
 from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures
 from rgbmidic.report.histories import history_figure
 from rgbmidic.report.page import Page
-from rgbmidic.report.style import save_figure
+from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [
     "MAPS",
     "REPORT",
+    "STYLE",
     "Page",
     "brightness_figure",
     "convergence_figure",
+    "finish_plot",
     "history_figure",
     "map_figure",
     "mask_figure",

@@ -64,7 +64,7 @@ class Reflectance:
 
     @classmethod
     def from_goniometry(cls, *, diffuse: float, specular: float, width_deg: float) -> Reflectance:
-        """From a lobe measured while the light turns about a fixed specimen (`rgbmidic.lab.study.goniometry.Lobe`).
+        """From a lobe measured while the light turns about a fixed specimen (`rgbmidic.lab.measures.Lobe`).
 
         Parameters
         ----------

@@ -1,5 +1,16 @@
 """How much each light counts at each pixel."""
 
+from rgbmidic.weights.disturbed_zone import DisturbedZone, SetUpThreshold, disturbed_zone, set_up_threshold
 from rgbmidic.weights.light_weights import LightWeights, prepare_weights
+from rgbmidic.weights.threshold import blurred, threshold_weights
 
-__all__ = ["LightWeights", "prepare_weights"]
+__all__ = [
+    "DisturbedZone",
+    "LightWeights",
+    "SetUpThreshold",
+    "blurred",
+    "disturbed_zone",
+    "prepare_weights",
+    "set_up_threshold",
+    "threshold_weights",
+]

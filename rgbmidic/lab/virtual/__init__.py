@@ -4,7 +4,7 @@ from rgbmidic.illumination.spectra import Led, Sensitivities
 from rgbmidic.lab.virtual.recording import record
 from rgbmidic.lab.virtual.rendering import render
 from rgbmidic.lab.virtual.scenes import expose, paper_scene, plate_scene, sphere_scene, strained_plate, turned
-from rgbmidic.scene.camera import Camera
+from rgbmidic.scene.camera import Camera, reference_camera
 from rgbmidic.scene.in_plane import AffineField, MeshField
 from rgbmidic.scene.light import Light
 from rgbmidic.scene.projection import material_points, truth
@@ -31,6 +31,7 @@ __all__ = [
     "paper_scene",
     "plate_scene",
     "record",
+    "reference_camera",
     "render",
     "sphere_scene",
     "strained_plate",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.lab.study.goniometry import Lobe
+from rgbmidic.lab.measures import Lobe
 from rgbmidic.lab.virtual import Camera, Sphere
 from rgbmidic.lab.virtual.scenes import plate_scene, sphere_scene
 from rgbmidic.scene.projection import material_points, placed

@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from bench import lamp_for_reflection
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import linearise
-from rgbmidic.lab.study.bench import lamp_for_reflection
 from rgbmidic.lab.virtual import Finish, Light, Scene, Sphere, State, Surface, expose, record, render
 from rgbmidic.mesh import Region
 from rgbmidic.scene.camera import reference_camera

@@ -5,7 +5,7 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.lab.study import disturbed_zone, set_up_threshold
+from rgbmidic.weights import disturbed_zone, set_up_threshold
 from rgbmidic.weights.threshold import threshold_weights
 
 SHAPE = (640, 700)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.lab.study import fit_lobe, goniometry, pixel_levels
+from rgbmidic.lab.measures import fit_lobe, goniometry, pixel_levels
 
 ANGLES = np.arange(-45.0, 90.5, 1.5)
 

@@ -25,7 +25,19 @@ _BLOCKS = 3
 
 
 def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
-    """A height map (H, W) minus the best bipolynomial: all x^i y^j with i and j up to `order`; NaN stays NaN.
+    """A height map minus the best bipolynomial: all x^i y^j with i and j up to `order` (paper, Fig. 10: 4).
+
+    Parameters
+    ----------
+    height : array_like, shape (H, W)
+        NaN where not measured.
+    order
+        Of the polynomial in x and in y.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+        In the unit of the height; NaN stays NaN.
 
     Raises
     ------
@@ -50,12 +62,22 @@ def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
 
 
 def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
-    """Local slope arctan|grad h| in degrees, shape (H, W), by central differences; NaN beside gaps.
+    """Local slope arctan|grad h| by central differences.
 
     Parameters
     ----------
     height, pitch
-        Height map and distance between its points, in one unit.
+        Height map (H, W) and distance between its points, in one unit.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+        Degrees; NaN beside gaps.
+
+    Raises
+    ------
+    InputError
+        The pitch is not positive, or the height is no map.
     """
     values = _as_map(height)
     if not (pitch > 0 and math.isfinite(pitch)):
@@ -65,15 +87,41 @@ def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
 
 
 def slope_uncertainty(height_std: float, pitch: float) -> float:
-    """Standard uncertainty (degrees) of a small local slope: that of a central difference, ``std / (sqrt(2) pitch)``.
+    """Standard uncertainty of a small local slope: that of a central difference, ``std / (sqrt(2) pitch)``.
 
     It holds where the slope is well above it; where it is not, the slope, being positive, is biased upwards.
+
+    Parameters
+    ----------
+    height_std, pitch
+        Standard uncertainty of a height and distance between the points, in one unit.
+
+    Returns
+    -------
+    float
+        Degrees.
     """
     return math.degrees(math.atan(height_std / (math.sqrt(2) * pitch)))
 
 
 def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
-    """True on white, False on black paint, from an intensity map (H, W): Otsu's threshold; NaN counts as black."""
+    """White and black paint of an intensity map, by Otsu's threshold.
+
+    Parameters
+    ----------
+    intensity : array_like, shape (H, W)
+        NaN, where not measured, counts as black.
+
+    Returns
+    -------
+    ndarray, shape (H, W), bool
+        True on white.
+
+    Raises
+    ------
+    InputError
+        The map is of one level.
+    """
     values = _as_map(intensity)
     known = np.isfinite(values)
     if not known.any() or np.ptp(values[known]) == 0:
@@ -96,7 +144,12 @@ def rms_slope(height: npt.ArrayLike, where: BoolArray, pitch: float, *, height_s
     pitch
         Distance between the points, in the unit of the height.
     height_std
-        Standard uncertainty of a height; its share of the slope is taken off.
+        Standard uncertainty of a height; its part in the slope is taken off.
+
+    Returns
+    -------
+    float
+        Degrees.
 
     Raises
     ------

@@ -5,7 +5,7 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import high_pass
-from rgbmidic.lab.study import Area, area_means, area_stds, areas_along_x, perturbation, residual_percent
+from rgbmidic.lab.measures import Area, area_means, area_stds, areas_along_x, perturbation, residual_percent
 
 SHAPE = (300, 420)
 Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)

@@ -9,17 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic._version import __version__
+from causes import RADIUS, Cause
+from claims import Claim, judge
+from figures import draw_figures
+from measurement import METHODS, PaperStudy, SceneStudy
+from rgbmidic import __version__
 from rgbmidic.errors import ResultError
-from rgbmidic.lab.study import figures as figures
-from rgbmidic.lab.study.causes import RADIUS, Cause
-from rgbmidic.lab.study.claim import Claim
-from rgbmidic.lab.study.claims import judge
-from rgbmidic.lab.study.competitors import METHODS
-from rgbmidic.lab.study.results import PaperStudy, SceneStudy
 from rgbmidic.report import Page, save_figure
-
-__all__ = ["check_folder", "write_study"]
 
 _SCENES = {
     "sequential": "two white lamps in succession, monochrome camera",
@@ -28,13 +24,7 @@ _SCENES = {
 
 
 def check_folder(out: Path | str, *, overwrite: bool = False) -> Path:
-    """The folder for a study, made where it does not exist.
-
-    Raises
-    ------
-    ResultError
-        It holds something already and may not be overwritten, or cannot be made.
-    """
+    """The folder for a study, made where it does not exist, refused where it holds something that must be kept."""
     out = Path(out)
     try:
         if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not overwrite)):
@@ -48,108 +38,49 @@ def check_folder(out: Path | str, *, overwrite: bool = False) -> Path:
 
 
 def write_study(study: PaperStudy, out: Path | str, *, overwrite: bool = False) -> tuple[Claim, ...]:
-    """Write tables (CSV), pictures, ``report.md`` and ``report.html``.
-
-    Parameters
-    ----------
-    study
-        What `rgbmidic.lab.study.run_paper_study` gives.
-    out
-        Folder.
-    overwrite
-        Whether files that are there may be replaced.
-
-    Returns
-    -------
-    tuple of Claim
-        The paper's statements with their verdicts.
-    """
+    """Write tables (CSV), pictures, ``report.md`` and ``report.html``; gives the statements with their verdicts."""
     folder = check_folder(out, overwrite=overwrite)
     claims = judge(study)
     _write_tables(study, claims, folder)
-    for name, figure in _figures(study).items():
+    for name, figure in draw_figures(study).items():
         save_figure(figure, folder / name)
     _page(study, claims).write(folder)
     return claims
 
 
 def _write_tables(study: PaperStudy, claims: Iterable[Claim], folder: Path) -> None:
-    _write_csv(folder / "perturbation.csv", ("scene", "method", "angle_deg", "area", "P_px"), _perturbation_rows(study))
-    header = ("scene", "method", "angle_deg", "area", "mean_u_px", "mean_v_px", "error_v_px")
-    _write_csv(folder / "areas.csv", header, _area_rows(study))
-    header = ("scene", "method", "angle_deg", "status", "measured_share", "residual_percent", "frontier_ratio")
-    _write_csv(folder / "solves.csv", header, _solve_rows(study))
+    perturbation, areas, solves = [], [], []
+    for scene in study.scenes:
+        for method in METHODS:
+            for angle in scene.angles:
+                one, state = scene.measurements[method, angle], (scene.bench.name, method, angle)
+                for number, area in enumerate(scene.bench.areas):
+                    perturbation.append([*state, area.name, one.perturbation[number]])
+                    areas.append([*state, area.name, *one.mean[:, number], one.error[number]])
+        for (method, angle), one in scene.measurements.items():
+            solves.append([scene.bench.name, method, angle, one.status, one.measured, one.residual, one.frontier])
+    state = ("scene", "method", "angle_deg")
+    _write_csv(folder / "perturbation.csv", (*state, "area", "P_px"), perturbation)
+    _write_csv(folder / "areas.csv", (*state, "area", "mean_u_px", "mean_v_px", "error_v_px"), areas)
+    header = (*state, "status", "measured_share", "residual_percent", "frontier_ratio")
+    _write_csv(folder / "solves.csv", header, solves)
     turning = study.goniometry
     pixels = [f"pixel_{i}" for i in range(turning.levels.shape[1])]
-    rows = (
-        [angle, *levels] for angle, levels in zip(turning.angles_deg.tolist(), turning.levels.tolist(), strict=True)
-    )
-    _write_csv(folder / "goniometry.csv", ("angle_deg", *pixels), rows)
+    _write_csv(folder / "goniometry.csv", ("angle_deg", *pixels), np.column_stack([turning.angles_deg, turning.levels]))
     columns = ("figure", "scene", "statement", "measured", "verdict", "reason")
     _write_csv(folder / "claims.csv", columns, ([getattr(claim, c) for c in columns] for claim in claims))
 
 
-def _perturbation_rows(study: PaperStudy) -> Iterator[list[Any]]:
-    for scene, method, angle, number, area in _cells(study):
-        yield [scene.bench.name, method, angle, area, scene.measurements[method, angle].perturbation[number]]
-
-
-def _area_rows(study: PaperStudy) -> Iterator[list[Any]]:
-    for scene, method, angle, number, area in _cells(study):
-        one = scene.measurements[method, angle]
-        yield [scene.bench.name, method, angle, area, *one.mean[:, number], one.error[number]]
-
-
-def _solve_rows(study: PaperStudy) -> Iterator[list[Any]]:
-    for scene in study.scenes:
-        for (method, angle), one in scene.measurements.items():
-            yield [scene.bench.name, method, angle, one.status, one.measured, one.residual, one.frontier]
-
-
-def _cells(study: PaperStudy) -> Iterator[tuple[SceneStudy, str, float, int, str]]:
-    for scene in study.scenes:
-        for method in METHODS:
-            for angle in scene.angles:
-                for number, area in enumerate(scene.bench.areas):
-                    yield scene, method, angle, number, area.name
-
-
 def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """A table; numbers with six digits, an empty field where there is none."""
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(header)
-            writer.writerows([_cell(value) for value in row] for row in rows)
-    except OSError as error:
-        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
 
+    def cell(value: Any) -> Any:
+        if not isinstance(value, float | np.floating):
+            return value
+        return f"{float(value):.6g}" if np.isfinite(value) else ""
 
-def _cell(value: Any) -> Any:
-    if not isinstance(value, float | np.floating):
-        return value
-    return f"{float(value):.6g}" if np.isfinite(value) else ""
-
-
-def _figures(study: PaperStudy) -> dict[str, Any]:
-    pictures = {
-        "fig09_goniometry.png": figures.goniometry_figure(study.goniometry),
-        "fig10_11_topography.png": figures.topography_figure(study.topography),
-    }
-    for scene in study.scenes:
-        name = scene.bench.name
-        pictures |= {
-            f"{name}_fig04_images.png": figures.images_figure(scene),
-            f"{name}_fig05_dic.png": figures.displacement_maps(scene, "dic"),
-            f"{name}_fig06_means.png": figures.mean_figure(scene),
-            f"{name}_fig07_08_13_17_perturbation.png": figures.perturbation_figure(scene),
-            f"{name}_fig15_midic.png": figures.displacement_maps(scene, "midic"),
-            f"{name}_fig16_masks.png": figures.masks_figure(scene),
-            f"{name}_ripple.png": figures.ripple_figure(scene),
-        }
-        if scene.threshold is not None:
-            pictures[f"{name}_fig14_threshold.png"] = figures.threshold_figure(scene)
-    return pictures
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows([header, *([cell(value) for value in row] for row in rows)])
 
 
 def _page(study: PaperStudy, claims: Sequence[Claim]) -> Page:
@@ -162,7 +93,9 @@ def _page(study: PaperStudy, claims: Sequence[Claim]) -> Page:
         "paper's P: the paint is that of `rgbmidic.lab.virtual.paper_scene`."
     )
     page.heading("Statements of the paper and what was measured")
-    page.text(_score(claims))
+    verdicts = [claim.verdict for claim in claims]
+    counts = {v: verdicts.count(v) for v in ("reproduced", "in part", "not reproduced", "not measured")}
+    page.text(f"{len(claims)} tests: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items() if n) + ".")
     header = ("paper", "statement", "measured here", "verdict", "why it differs")
     for scene in ("", *(one.bench.name for one in study.scenes)):
         rows = [(c.figure, c.statement, c.measured, c.verdict, c.reason) for c in claims if c.scene == scene]
@@ -175,16 +108,6 @@ def _page(study: PaperStudy, claims: Sequence[Claim]) -> Page:
     page.picture("fig10_11_topography.png", "Figs 10 and 11: intensity, height, and slope with the pixels of 55 um")
     _causes_section(page, study.causes)
     return page
-
-
-def _score(claims: Sequence[Claim]) -> str:
-    counts = {
-        v: sum(claim.verdict == v for claim in claims)
-        for v in ("reproduced", "in part", "not reproduced", "not measured")
-    }
-    return (
-        f"{len(claims)} tests: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count) + "."
-    )
 
 
 def _scene_section(page: Page, scene: SceneStudy) -> None:
@@ -224,10 +147,15 @@ def _causes_section(page: Page, causes: Sequence[Cause]) -> None:
         "angle because the diffuse light changes with its incidence, with wrinkles and without them."
     )
     angles = causes[0].angles
-    rows = [(cause.title, *map(_pair, cause.inside.ravel(), cause.outside.ravel())) for cause in causes]
+    rows = [
+        (
+            cause.title,
+            *(
+                f"{1000 * inside:.1f} / {1000 * outside:.1f}"
+                for inside, outside in zip(cause.inside.flat, cause.outside.flat, strict=True)
+            ),
+        )
+        for cause in causes
+    ]
     header = ("change", *(f"{method} {angle:g}°" for method in ("DIC", "GLC-DIC") for angle in angles))
     page.table(header, rows)
-
-
-def _pair(inside: float, outside: float) -> str:
-    return f"{1000 * inside:.1f} / {1000 * outside:.1f}"

@@ -1,6 +1,6 @@
-"""Perturbation P of a displacement field, the zone a reflection disturbs, and the weighting threshold of a set-up.
+"""Perturbation P of a displacement field over areas, and the residual in percent of the dynamic range.
 
-Paper, sections 2.2 and 3.2: the displacement minus its Gaussian-filtered copy, and its standard deviation over areas.
+Paper, section 2.2: the displacement minus its Gaussian-filtered copy, and its standard deviation over areas.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = [
 AREA_SIZE = (50.0, 100.0)
 """Width and height (px) of the paper's areas."""
 _MEASURED = 0.5
-"""Share of an area that must be measured for a figure on it."""
+"""Fraction of an area that must be measured for a figure on it; a choice."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +57,16 @@ class Area:
         return x - width / 2, y - height / 2, x + width / 2, y + height / 2
 
     def cut(self, image: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        """The pixels of an image (..., H, W) whose centres lie in the area.
+        """The pixels of an image whose centres lie in the area.
+
+        Parameters
+        ----------
+        image
+            Shape (..., H, W).
+
+        Returns
+        -------
+        ndarray, shape (..., h, w)
 
         Raises
         ------
@@ -74,19 +83,55 @@ class Area:
 def areas_along_x(
     first: tuple[float, float], *, pitch: float = 100.0, count: int = 5, size: tuple[float, float] = AREA_SIZE
 ) -> tuple[Area, ...]:
-    """Areas A0, A1, ... along x, from the centre (x, y) of the first one; a negative pitch runs to the left."""
+    """Areas A0, A1, ... in a row along x, as on the paper's Fig. 4.
+
+    Parameters
+    ----------
+    first
+        Centre (x, y) of A0 in px.
+    pitch
+        Distance between the centres in px; a negative one runs to the left.
+    count
+        How many.
+    size
+        (width, height) of each in px.
+
+    Returns
+    -------
+    tuple of Area
+    """
     return tuple(Area(name=f"A{i}", centre=(first[0] + i * pitch, first[1]), size=size) for i in range(count))
 
 
 def perturbation(field: npt.ArrayLike, areas: Sequence[Area], *, sigma: float = SIGMA) -> FloatArray:
-    """Perturbation P of a displacement component (H, W) in each area: the standard deviation of `high_pass`, in px."""
+    """Perturbation P (paper, section 2.2): standard deviation in each area of a displacement without its long waves.
+
+    Parameters
+    ----------
+    field : array_like, shape (H, W)
+        A component of the displacement in px, NaN where not measured (`rgbmidic.fields.at_pixels`).
+    areas
+        Where P is assessed.
+    sigma
+        Standard deviation in px of the Gaussian of `rgbmidic.fields.high_pass`.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        P in px; NaN where less than half of the area is measured.
+
+    Raises
+    ------
+    InputError
+        An area does not lie in the image, or there is nothing to filter.
+    """
     return area_stds(high_pass(field, sigma), areas)
 
 
 def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displacement: FloatArray) -> float:
     """Residual of a measurement in % of the effective dynamic range (paper, section 2.2).
 
-    Standard deviation of the difference between the reference image and the deformed image brought back by the
+    Standard deviation of the difference between the reference image and the deformed image warped by the
     displacement (cubic spline interpolation), over the largest minus the smallest grey level of the two images.
 
     Parameters
@@ -94,7 +139,17 @@ def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displace
     reference, deformed
         Images (H, W) of one light; NaN where invalid.
     displacement
-        (u, v) at the pixels of the reference image, shape (2, H, W); NaN where not measured.
+        (u, v) in px at the pixels of the reference image, shape (2, H, W); NaN where not measured.
+
+    Returns
+    -------
+    float
+        %.
+
+    Raises
+    ------
+    InputError
+        The shapes do not fit, or nothing is measured.
     """
     from scipy.ndimage import map_coordinates
 
@@ -119,10 +174,36 @@ def _over_measured(values: npt.NDArray[np.floating], statistic: object) -> float
 
 
 def area_stds(high_passed: FloatArray, areas: Sequence[Area]) -> FloatArray:
-    """Standard deviation of an image in each area; NaN where less than half of the area is measured."""
+    """Standard deviation of an image in each area.
+
+    Parameters
+    ----------
+    high_passed : ndarray, shape (H, W)
+        For P: `rgbmidic.fields.high_pass` of a displacement in px; NaN where not measured.
+    areas
+        n areas.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the unit of the image; NaN where less than half of the area is measured.
+    """
     return np.array([_over_measured(area.cut(high_passed), np.nanstd) for area in areas])
 
 
 def area_means(field: FloatArray, areas: Sequence[Area]) -> FloatArray:
-    """Mean of an image in each area; NaN where less than half of the area is measured."""
+    """Mean of an image in each area.
+
+    Parameters
+    ----------
+    field : ndarray, shape (H, W)
+        NaN where not measured.
+    areas
+        n areas.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the unit of the image; NaN where less than half of the area is measured.
+    """
     return np.array([_over_measured(area.cut(field), np.nanmean) for area in areas])

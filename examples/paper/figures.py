@@ -2,57 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
-from typing import TYPE_CHECKING, Any, ParamSpec
+from typing import Any
 
 import cv2
+import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+from matplotlib.patheffects import withStroke
 
+from bench import Topography
+from measurement import BLUR, METHODS, PaperStudy, SceneStudy
 from rgbmidic.fields import high_pass
-from rgbmidic.lab.study.competitors import METHODS
-from rgbmidic.lab.study.goniometry import Goniometry
-from rgbmidic.lab.study.paper import BLUR
-from rgbmidic.lab.study.plate import Topography
-from rgbmidic.lab.study.results import SceneStudy
-from rgbmidic.report.style import STYLE, finish_plot, shade
-from rgbmidic.typing import AnyArray
+from rgbmidic.lab.measures import Goniometry
+from rgbmidic.report import STYLE, finish_plot
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-__all__ = [
-    "displacement_maps",
-    "goniometry_figure",
-    "images_figure",
-    "masks_figure",
-    "mean_figure",
-    "perturbation_figure",
-    "ripple_figure",
-    "threshold_figure",
-    "topography_figure",
-]
-
-_AREA_COLOURS = ("#1f8fe0", "#2ca25f", "#d9a400", "#e8590c", "#d6279a")
-_WIDTH = 7.5
-Parameters = ParamSpec("Parameters")
+AREA_COLOURS = ("#1f8fe0", "#2ca25f", "#d9a400", "#e8590c", "#d6279a")
 
 
-def _styled(draw: Callable[Parameters, Figure]) -> Callable[Parameters, Figure]:
-    """The function under the style that all figures share."""
+@mpl.rc_context(STYLE)
+def draw_figures(study: PaperStudy) -> dict[str, Figure]:
+    """The figures by the name of their file."""
+    figures = {
+        "fig09_goniometry.png": goniometry_figure(study.goniometry),
+        "fig10_11_topography.png": topography_figure(study.topography),
+    }
+    for scene in study.scenes:
+        name = scene.bench.name
+        figures |= {
+            f"{name}_fig04_images.png": images_figure(scene),
+            f"{name}_fig05_dic.png": displacement_maps(scene, "dic"),
+            f"{name}_fig06_means.png": mean_figure(scene),
+            f"{name}_fig07_08_13_17_perturbation.png": perturbation_figure(scene),
+            f"{name}_fig15_midic.png": displacement_maps(scene, "midic"),
+            f"{name}_fig16_masks.png": masks_figure(scene),
+            f"{name}_ripple.png": ripple_figure(scene),
+        }
+        if scene.threshold is not None:
+            figures[f"{name}_fig14_threshold.png"] = threshold_figure(scene)
+    return figures
 
-    @wraps(draw)
-    def styled(*arguments: Parameters.args, **settings: Parameters.kwargs) -> Figure:
-        import matplotlib as mpl
 
-        with mpl.rc_context(STYLE):
-            return draw(*arguments, **settings)
-
-    return styled
-
-
-@_styled
 def images_figure(scene: SceneStudy) -> Figure:
     """Fig. 4: the light that crosses the areas at 0 degrees and at the largest angle, and its grey level along them."""
     last = scene.angles[-1]
@@ -73,42 +65,43 @@ def images_figure(scene: SceneStudy) -> Figure:
     return figure
 
 
-@_styled
 def displacement_maps(scene: SceneStudy, method: str) -> Figure:
     """Figs 5 and 15: U_y of a method at the smallest and at the largest angle."""
     figure, axes = _axes(1, len(scene.snapshots), 3.2)
     for axis, (angle, shot) in zip(axes[0], scene.snapshots.items(), strict=True):
         field = shot.displacement[method][1]
         known = field[np.isfinite(field)]
-        limits = np.percentile(known, [0.5, 99.5]) if known.size else (0, 1)
-        _map(figure, axis, field, "viridis", limits[0], limits[1], scene)
+        limits = tuple(np.percentile(known, [0.5, 99.5])) if known.size else (0, 1)
+        figure.colorbar(_map(axis, field, "viridis", limits, scene), ax=axis, aspect=25, pad=0.02)
         axis.set_title(f"U_y (px), {METHODS[method].title}, {angle:g}°")
     return figure
 
 
-@_styled
 def ripple_figure(scene: SceneStudy) -> Figure:
     """U_y without its long waves: every method at the smallest and at the largest angle."""
     count = len(scene.snapshots)
     figure, axes = _axes(count, len(METHODS), 2.2 * count)
     for row, (angle, shot) in enumerate(scene.snapshots.items()):
-        ripples = {method: _ripple(shot.displacement[method][1]) for method in METHODS}
+        fields = {method: shot.displacement[method][1] for method in METHODS}
+        ripples = {
+            method: high_pass(field) if np.isfinite(field).sum() > 10 else np.full(field.shape, np.nan)
+            for method, field in fields.items()
+        }
         limit = float(np.nanpercentile(abs(ripples["dic"]), 97)) or 1e-3
         for column, (method, ripple) in enumerate(ripples.items()):
             axis = axes[row][column]
-            picture = _map(figure, axis, ripple, "RdBu_r", -limit, limit, scene, bar=False)
+            picture = _map(axis, ripple, "RdBu_r", (-limit, limit), scene)
             axis.set_title(f"{METHODS[method].title}, {angle:g}°", fontsize=7.5)
         figure.colorbar(picture, ax=axes[row], label="px", aspect=18, pad=0.01)
     return figure
 
 
-@_styled
 def mean_figure(scene: SceneStudy) -> Figure:
     """Fig. 6: mean displacement of the areas against the angle, plain DIC."""
     figure, axes = _axes(1, 2, 2.6)
     for axis, component, name in zip(axes[0], (1, 0), ("U_y", "U_x"), strict=True):
         for area, colour, series in zip(
-            scene.bench.areas, _AREA_COLOURS, scene.means("dic")[:, component].T, strict=True
+            scene.bench.areas, AREA_COLOURS, scene.series("dic", "mean")[:, component].T, strict=True
         ):
             axis.plot(scene.angles, series, marker="o", markersize=3, linewidth=1, color=colour, label=area.name)
         finish_plot(axis, "angle (°)", f"mean {name} (px)")
@@ -116,13 +109,12 @@ def mean_figure(scene: SceneStudy) -> Figure:
     return figure
 
 
-@_styled
 def perturbation_figure(scene: SceneStudy) -> Figure:
     """Figs 7, 8, 13 and 17: P of the areas against the angle, one panel per method, one scale."""
     figure, axes = _axes(2, 2, 5.4, sharex=True, sharey=True)
     papers = {"dic": "Fig. 7", "glc-dic": "Fig. 8", "midic-unweighted": "Fig. 13", "midic": "Fig. 17"}
     for axis, (method, paper) in zip(axes.flat, papers.items(), strict=True):
-        for area, colour, series in zip(scene.bench.areas, _AREA_COLOURS, scene.perturbation(method).T, strict=True):
+        for area, colour, series in zip(scene.bench.areas, AREA_COLOURS, scene.perturbation(method).T, strict=True):
             axis.semilogy(scene.angles, series, marker="o", markersize=3, linewidth=1, color=colour, label=area.name)
         axis.set_title(f"{METHODS[method].title} ({paper})")
         bottom = axis in axes[1]
@@ -131,7 +123,6 @@ def perturbation_figure(scene: SceneStudy) -> Figure:
     return figure
 
 
-@_styled
 def goniometry_figure(turning: Goniometry) -> Figure:
     """Fig. 9: grey level of the pixels against the angle of the light."""
     figure, axes = _axes(1, 1, 3.6, width=5.5)
@@ -156,7 +147,6 @@ def goniometry_figure(turning: Goniometry) -> Figure:
     return figure
 
 
-@_styled
 def topography_figure(relief: Topography) -> Figure:
     """Figs 10 and 11: intensity, height and local slope of one square millimetre."""
     figure, axes = _axes(1, 3, 2.6)
@@ -182,7 +172,6 @@ def topography_figure(relief: Topography) -> Figure:
     return figure
 
 
-@_styled
 def threshold_figure(scene: SceneStudy) -> Figure:
     """Fig. 14: from P around the reflection to the threshold and the mask."""
     found = scene.threshold
@@ -202,7 +191,7 @@ def threshold_figure(scene: SceneStudy) -> Figure:
         axis.set_title(title, fontsize=8)
         axis.set_xticks([])
         axis.set_yticks([])
-    axes[0][1].add_patch(_circle(zone.centre, zone.radius))
+    axes[0][1].add_patch(Circle(zone.centre, zone.radius, fill=False, edgecolor="#c8102e", linewidth=1))
     axis = axes[0][3]
     axis.plot(zone.radii, 1000 * zone.profile, marker="o", markersize=2.5, linewidth=1, color="#1b6ca8")
     axis.axhline(1500 * zone.unaffected, color="0.5", linewidth=0.8, linestyle="--")
@@ -212,62 +201,41 @@ def threshold_figure(scene: SceneStudy) -> Figure:
     return figure
 
 
-@_styled
 def masks_figure(scene: SceneStudy) -> Figure:
     """Fig. 16: what every light leaves out at the smallest and at the largest angle, with the areas."""
-    count = len(scene.snapshots)
+    count, orange = len(scene.snapshots), ListedColormap(["#e8590c"])
     figure, axes = _axes(count, len(scene.names), 2.6 * count)
     for row, (angle, shot) in enumerate(scene.snapshots.items()):
         for column, name in enumerate(scene.names):
             axis = axes[row][column]
-            axis.imshow(
-                scene.reference[column],
-                cmap="gray",
-                vmin=0,
-                vmax=max(0.3, float(np.nanmax(_smooth(scene.reference[column])))),
-            )
-            shade(axis, 1 - shot.weights[column])
+            image = scene.reference[column]
+            axis.imshow(image, cmap="gray", vmin=0, vmax=max(0.3, float(np.nanmax(_smooth(image)))))
+            excluded = 1 - shot.weights[column]
+            axis.imshow(np.ones_like(excluded), cmap=orange, alpha=0.65 * excluded, interpolation="nearest")
             _mark_areas(axis, scene)
             axis.set_title(f"{name}, {angle:g}°", fontsize=8)
             axis.set_axis_off()
     return figure
 
 
-def _axes(rows: int, columns: int, height: float, *, width: float = _WIDTH, **settings: Any) -> tuple[Figure, Any]:
-    from matplotlib.figure import Figure
-
-    ratios = settings.pop("height_ratios", None)
+def _axes(rows: int, columns: int, height: float, *, width: float = 7.5, **settings: Any) -> tuple[Figure, Any]:
     figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False, height_ratios=ratios, **settings)
+    return figure, figure.subplots(rows, columns, squeeze=False, **settings)
 
 
-def _map(
-    figure: Figure,
-    axis: Axes,
-    field: AnyArray,
-    colours: str,
-    low: float,
-    high: float,
-    scene: SceneStudy,
-    *,
-    bar: bool = True,
-) -> Any:
-    picture = axis.imshow(field, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+def _map(axis: Axes, field: np.ndarray, colours: str, limits: tuple[float, float], scene: SceneStudy) -> Any:
+    """A field over the measured square, with the areas; gives the picture, for a colour bar."""
+    picture = axis.imshow(field, cmap=colours, vmin=limits[0], vmax=limits[1], interpolation="nearest")
     half, (x, y) = scene.bench.half, scene.bench.scene.camera.centre
     axis.set_xlim(x - half, x + half)
     axis.set_ylim(y + half, y - half)
     _mark_areas(axis, scene)
     axis.set_axis_off()
-    if bar:
-        figure.colorbar(picture, ax=axis, aspect=25, pad=0.02)
     return picture
 
 
 def _mark_areas(axis: Axes, scene: SceneStudy, *, label: bool = False) -> None:
-    from matplotlib.patches import Rectangle
-    from matplotlib.patheffects import withStroke
-
-    for area, colour in zip(scene.bench.areas, _AREA_COLOURS, strict=True):
+    for area, colour in zip(scene.bench.areas, AREA_COLOURS, strict=True):
         x0, y0, x1, y1 = area.rectangle
         axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=0.9))
         if label:
@@ -275,16 +243,6 @@ def _mark_areas(axis: Axes, scene: SceneStudy, *, label: bool = False) -> None:
             text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
-def _circle(centre: tuple[float, float], radius: float) -> Any:
-    from matplotlib.patches import Circle
-
-    return Circle(centre, radius, fill=False, edgecolor="#c8102e", linewidth=1)
-
-
-def _smooth(image: AnyArray) -> AnyArray:
+def _smooth(image: np.ndarray) -> np.ndarray:
     filled = np.where(np.isfinite(image), image, np.float32(1))
     return np.asarray(cv2.GaussianBlur(filled, (0, 0), BLUR, borderType=cv2.BORDER_REFLECT_101))
-
-
-def _ripple(field: AnyArray) -> AnyArray:
-    return high_pass(field) if np.isfinite(field).sum() > 10 else np.full(field.shape, np.nan)

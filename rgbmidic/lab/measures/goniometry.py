@@ -18,7 +18,7 @@ __all__ = ["Goniometry", "Lobe", "fit_lobe", "goniometry", "pixel_levels"]
 
 
 VISIBLE = 0.05
-"""The reflection is erratic where the spread between pixels exceeds this share of the white paint's diffuse level."""
+"""The reflection is erratic where the pixels' spread exceeds this fraction of the white paint's diffuse level."""
 _GROUPS = 10
 """Groups of pixels left out in turn to find the lobe's uncertainty."""
 _BEYOND = 2.5
@@ -88,6 +88,16 @@ def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> Floa
         Images (H, W) of one size, proportional to light.
     pixels : array_like, shape (m, 2)
         (x, y) of whole pixels.
+
+    Returns
+    -------
+    ndarray, shape (n, m)
+        In the unit of the frames.
+
+    Raises
+    ------
+    InputError
+        Pixels that are not whole numbers, or lie outside a frame.
     """
     chosen = np.asarray(pixels)
     if chosen.ndim != 2 or chosen.shape[1] != 2 or chosen.dtype.kind not in "iu":
@@ -110,6 +120,10 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, std: npt.ArrayLik
         Light angles and mean grey levels.
     std : array_like, shape (n,), optional
         Standard uncertainty of the levels; None: equal and unknown, taken from the residual.
+
+    Returns
+    -------
+    Lobe
 
     Raises
     ------
@@ -153,7 +167,11 @@ def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: flo
     levels : array_like, shape (n, m)
         Grey levels of m pixels (`pixel_levels`).
     visible
-        The band is where the spread exceeds this share of the white paint's diffuse level.
+        The band is where the spread exceeds this fraction of the white paint's diffuse level.
+
+    Returns
+    -------
+    Goniometry
 
     Raises
     ------
@@ -169,7 +187,9 @@ def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: flo
     lobe = _lobe_of_pixels(angles, values)
     clear = (abs(angles - lobe.centre_deg) > _BEYOND * lobe.width_deg) & (cosine > 0)
     if clear.sum() < 3:
-        raise InputError("fewer than 3 of the angles lie clear of the reflection: the diffuse light cannot be told")
+        raise InputError(
+            "fewer than 3 of the angles lie clear of the reflection: the diffuse light cannot be separated"
+        )
     diffuse = cosine[clear] @ values[clear] / (cosine[clear] @ cosine[clear])
     white = diffuse > (np.quantile(diffuse, 0.1) + np.quantile(diffuse, 0.9)) / 2
     excess = values - cosine[:, None] * diffuse

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
+from bench import BENCHES, SMALLEST, Bench, lamp_for_reflection
 from rgbmidic.errors import InputError
-from rgbmidic.lab.study import BENCHES, Bench, lamp_for_reflection
-from rgbmidic.lab.study.bench import SMALLEST
-from rgbmidic.lab.virtual import Sphere, State
-from rgbmidic.scene.camera import reference_camera
+from rgbmidic.lab.virtual import Sphere, State, reference_camera
 
 
 def mirror_direction(body, camera, pixel, state=None):

@@ -1,25 +1,25 @@
 """A short run of the paper's experiment: the reflection disturbs plain DIC, and MIDIC with weights puts it right."""
 
+import ast
 import csv
 from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from rgbmidic.cli import app
-from rgbmidic.errors import InputError
-from rgbmidic.lab.study import METHODS, run_paper_study
-from rgbmidic.lab.study.causes import VARIATIONS, find_causes
-from rgbmidic.lab.study.claims import judge
-from rgbmidic.lab.study.results import PaperStudy
+import run
+from causes import VARIATIONS, find_causes
+from claims import judge
+from measurement import METHODS, PaperStudy
 
 ANGLES = (1.0, 8.0)
 
 
 @pytest.fixture(scope="module")
 def study() -> PaperStudy:
-    return run_paper_study(ANGLES, size=512, scenes=("sequential",), causes=False)
+    return run.run_paper_study(ANGLES, size=512, scenes=("sequential",), causes=False)
 
 
 def test_reflection_disturbs_one_light_and_midic_follows_the_quiet_area(study):
@@ -83,17 +83,17 @@ def test_verdicts_follow_the_figures(study):
         assert (trend.verdict != "not reproduced") == passes
 
 
-def test_command_writes_tables_pictures_and_report(study, tmp_path, monkeypatch):
+def test_command_writes_tables_pictures_and_report(study, tmp_path, monkeypatch, capsys):
     asked = {}
 
     def canned(angles, **settings):
         asked.update(angles=angles, **settings)
         return study
 
-    monkeypatch.setattr("rgbmidic.lab.study.run_paper_study", canned)
+    monkeypatch.setattr(run, "run_paper_study", canned)
     out = tmp_path / "study"
-    result = CliRunner().invoke(app, ["study", "paper", "--out", str(out), "--angles", "1,8", "--size", "512"])
-    assert result.exit_code == 0, result.output
+    run.main(["--out", str(out), "--angles", "1,8", "--size", "512"])
+    assert "report: " in capsys.readouterr().out
     assert asked["angles"] == [1.0, 8.0]
     assert (asked["size"], asked["causes"]) == (512, False)
     with (out / "perturbation.csv").open() as file:
@@ -108,15 +108,27 @@ def test_command_writes_tables_pictures_and_report(study, tmp_path, monkeypatch)
     assert all(f"]({name})" in report for name in pictures)
     assert "reproduced" in report
     assert all(name in (out / "report.html").read_text(encoding="utf-8") for name in pictures)
-    again = CliRunner().invoke(app, ["study", "paper", "--out", str(out)])
-    assert "not empty" in str(again.exception)
+    with pytest.raises(SystemExit, match="2"):
+        run.main(["--out", str(out)])
+    assert "not empty" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("angles", ["0", "-1,3", "50", "3,x"])
-def test_angles_that_make_no_sense_are_refused_before_any_work(angles, tmp_path):
-    result = CliRunner().invoke(app, ["study", "paper", "--out", str(tmp_path / "out"), f"--angles={angles}"])
-    assert isinstance(result.exception, InputError)
-    assert "angles" in str(result.exception)
+def test_angles_that_make_no_sense_are_refused_before_any_work(angles, tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        run.main(["--out", str(tmp_path / "out"), f"--angles={angles}"])
+    assert "angles" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("script", sorted(Path(run.__file__).parent.glob("*.py")), ids=lambda path: path.name)
+def test_the_study_uses_public_names_only(script):
+    """Names of a package's or a top module's `__all__`: what a laboratory's own script may rely on."""
+    for node in ast.walk(ast.parse(script.read_text(encoding="utf-8"))):
+        assert not (isinstance(node, ast.Import) and any(part.name.startswith("rgbmidic") for part in node.names))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rgbmidic"):
+            home = import_module(node.module)
+            assert hasattr(home, "__path__") or node.module in {"rgbmidic.errors", "rgbmidic.settings"}, node.module
+            assert {part.name for part in node.names} <= set(home.__all__), node.module
 
 
 def test_brightness_disturbs_plain_dic_and_roughness_defeats_the_grey_level_correction():

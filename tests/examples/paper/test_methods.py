@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from measurement import METHODS, Competitor
+from rgbmidic import Region
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.lab.study import METHODS, Competitor
-from rgbmidic.mesh import Region
+from rgbmidic.illumination import IlluminationImages
 
 SHAPE = (160, 170)
 REGION = Region.from_rectangle((10, 10, 159, 149), SHAPE)
