@@ -3,12 +3,15 @@
     python benchmarks/fast_event.py make FOLDER [--frames 500] [--size 1024]
     python benchmarks/fast_event.py score FOLDER RESULT
     python benchmarks/fast_event.py kill FOLDER [--times 20] [--workers 2]
+    python benchmarks/fast_event.py glare [--draws 6]
 
 `make` writes a raw Bayer ``event.cine`` with its calibration, test.toml and the parameters of the motion, which has a
 closed form. A speckled plate is struck: it swings by up to 30 px from frame to frame while a wave runs through it; a
 round fragment in it turns on its own; three reflections, each erratic in its own way, sweep over it; some frames are
 lost, as the time stamps tell. `score` prints the error of every tenth frame beside its stated uncertainty. `kill`
-measures it once, and once more killed at random moments and resumed: both must have the same bits.
+measures it once, and once more killed at random moments and resumed: both must have the same bits. `glare` measures
+another event in memory, a plate with a hole under glare of all lights that stands still in the laboratory, and counts
+the nodes that are wild: off by more than .2 px and 4 times their stated uncertainty.
 """
 
 from __future__ import annotations
@@ -31,9 +34,15 @@ from scipy.ndimage import gaussian_filter
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
-from rgbmidic.frames import cfa_channels
+from rgbmidic.correlation.reference import Deformed, Reference
+from rgbmidic.correlation.track import Start, track
+from rgbmidic.frames import Mosaic, cfa_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.separation import Separation, correlated
 from rgbmidic.results import Result
+from rgbmidic.settings import ELEMENT_SIZE, IlluminationSettings, SolverSettings
 from rgbmidic.typing import FloatArray, FloatImage
 
 CROSSTALK = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
@@ -156,9 +165,9 @@ def _lost_numbers(count: int, lost: int) -> FloatArray:
 class _Renderer:
     """Frames of the test, from a texture and three sparkles that lie on the specimen."""
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: Motion | HoledPlate, seed: int = 11) -> None:
         self.motion = motion
-        rng = np.random.default_rng(11)
+        rng = np.random.default_rng(seed)
         self.fine = _FINE * (motion.size + 400)
         spots = gaussian_filter(rng.normal(size=(self.fine, self.fine)).astype(np.float32), 1.25 * _FINE, mode="wrap")
         paint = 0.45 + 0.3 * np.tanh(2 * spots / spots.std())
@@ -175,16 +184,21 @@ class _Renderer:
     def frame(self, number: int) -> FloatImage:
         """The raw mosaic of one frame, uint16, 12 bit."""
         places = (self.motion.origin(self.points, number) + 200) * _FINE
+        lights = np.stack([0.6 * self._paint(places) * self._reflected(light, number, places) for light in range(3)])
+        return self._recorded(lights, seed=1000 + number)
+
+    def _paint(self, places: FloatArray) -> FloatImage:
         # OpenCV rounds places to 1/32 px: enough for sparkle, not for the truth
         paint, *slopes = np.empty((3, places[..., 0].size), dtype=np.float32)
         sample_with_gradient(
             self.paint, *np.ascontiguousarray(np.moveaxis(places, -1, 0)).reshape(2, -1), paint, *slopes
         )
-        paint = paint.reshape(self.site.shape)
-        lights = np.stack([0.6 * paint * self._reflected(light, number, places) for light in range(3)])
+        return paint.reshape(self.site.shape)
+
+    def _recorded(self, lights: FloatImage, seed: int) -> FloatImage:
         channels = np.tensordot(CROSSTALK, lights, axes=1)
         signal = np.take_along_axis(channels, self.site[None], axis=0)[0] * (WHITE - BLACK) * 0.75
-        rng = np.random.default_rng(1000 + number)
+        rng = np.random.default_rng(seed)
         noisy = signal + rng.normal(size=signal.shape) * np.sqrt(np.maximum(signal, 0) / GAIN + READ_NOISE**2)
         values: FloatImage = np.clip(np.round(noisy + BLACK), 0, WHITE).astype(np.uint16)
         return values
@@ -200,6 +214,126 @@ class _Renderer:
     def _seen(self, texture: FloatImage, places: FloatImage) -> FloatImage:
         x, y = ((places[..., axis] % self.fine).astype(np.float32) for axis in (0, 1))
         return np.asarray(cv2.remap(texture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoledPlate:
+    """A plate with a hole, at rest, then moving by up to 17 px, 2 degrees and 2 % of strain; what differs from draw to
+    draw: hole, glare beside it, sparkle."""
+
+    draw: int
+    hole: FloatArray
+    """Its centre, px."""
+    radius: float
+    spots: FloatArray
+    """Centres (3, 2) of the lights' glare, px."""
+    spread: float
+    """Standard deviation of a light's glare, px."""
+    glare: float
+    """Over the diffuse level."""
+    erratic: float
+    sparkle: float
+    """Standard deviation of the erratic part's grains, px."""
+    shift: FloatArray
+    size: int = 512
+    rest: int = 4
+    moving: int = 12
+
+    @classmethod
+    def drawn(cls, draw: int) -> HoledPlate:
+        """One of them."""
+        rng = np.random.default_rng(draw)
+        angle, direction = rng.uniform(0, 2 * np.pi, 2)
+        hole, radius = rng.uniform(200, 312, 2), rng.uniform(35, 80)
+        spread, level, erratic, sparkle = rng.uniform((45, 1.5, 0.3, 1), (60, 2.5, 0.6, 2))
+        beside = hole + (radius + 15) * np.array([np.cos(angle), np.sin(angle)])
+        return cls(
+            draw=draw,
+            hole=hole,
+            radius=radius,
+            spots=beside + rng.normal(0, 25, (3, 2)),
+            spread=spread,
+            glare=level,
+            erratic=erratic,
+            sparkle=sparkle,
+            shift=17 * np.array([np.cos(direction), np.sin(direction)]),
+        )
+
+    def _affine(self, frame: int) -> tuple[FloatArray, FloatArray]:
+        part = (max(frame - self.rest + 1, 0) / self.moving) ** 2
+        c, s = np.cos(np.radians(2 * part)), np.sin(np.radians(2 * part))
+        return np.array([[c, -s], [s, c]]) @ np.diag([1 + 0.02 * part, 1 - 0.006 * part]), self.shift * part
+
+    def displacement(self, points: FloatArray, frame: int) -> FloatArray:
+        """Displacement (..., 2) of material points (..., 2)."""
+        gradient, shift = self._affine(frame)
+        return (points - self.size / 2) @ (gradient - np.eye(2)).T + shift
+
+    def origin(self, points: FloatArray, frame: int) -> FloatArray:
+        """Material points (H, W, 2) that are seen at the pixels (H, W, 2) of a frame."""
+        gradient, shift = self._affine(frame)
+        return (points - self.size / 2 - shift) @ np.linalg.inv(gradient).T + self.size / 2
+
+    def region(self) -> Region:
+        """The frame but for its border and the hole."""
+        angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+        edge = self.hole + self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return Region.from_rectangle((30, 30, self.size - 31, self.size - 31), (self.size,) * 2).without([edge])
+
+
+class _GlaringRenderer(_Renderer):
+    """Frames of such a plate: the paint, and glare of each light that stands still in the laboratory."""
+
+    def __init__(self, plate: HoledPlate) -> None:
+        super().__init__(plate, seed=100 + plate.draw)
+        self.plate, rng = plate, np.random.default_rng(200 + plate.draw)
+        self.glare = []
+        for spot in plate.spots:
+            grains = sum(gaussian_filter(rng.normal(size=self.site.shape), plate.sparkle) ** 2 for _ in range(2))
+            erratic = 1 - plate.erratic + plate.erratic * grains / grains.mean()
+            distance = ((self.points - spot) ** 2).sum(axis=-1)
+            self.glare.append(0.45 * plate.glare * erratic * np.exp(-distance / (2 * plate.spread**2)))
+
+    def mosaic(self, number: int) -> Mosaic:
+        """One raw frame."""
+        seen = self.plate.origin(self.points, number)
+        solid = np.clip(np.hypot(*np.moveaxis(seen - self.plate.hole, -1, 0)) - self.plate.radius + 0.5, 0, 1)
+        paint = self._paint((seen + 200) * _FINE)
+        lights = 0.4 * (solid * (paint + np.stack(self.glare)) + 0.03 * (1 - solid))
+        values = self._recorded(lights, seed=10_000 * (self.plate.draw + 1) + number)
+        return Mosaic(values=values, cfa=CFA, black_level=BLACK, white_level=WHITE)
+
+
+def glare(draws: int) -> None:
+    """Measure such plates, one line for each."""
+    crosstalk = Crosstalk(matrix=CROSSTALK, lights=("red", "green", "blue"))
+    calibration = Calibration(crosstalk=crosstalk, noise=NoiseModel(gain=GAIN, read_noise=READ_NOISE))
+    settings, solver = IlluminationSettings(), SolverSettings()
+    print("draw  wild nodes  not measured  rms error  largest  rms error/stated  covered")
+    for draw in range(draws):
+        plate = HoledPlate.drawn(draw)
+        renderer, region = _GlaringRenderer(plate), plate.region()
+        frames = [(renderer.mosaic(number),) for number in range(plate.rest + plate.moving)]
+        images, separation = Separation(calibration=calibration).reference(frames[0], frames[1 : plate.rest])
+        mesh = Tri3Mesh.from_region(region, ELEMENT_SIZE)
+        reference = Reference.prepare(correlated(images, settings), region, mesh=mesh, prefilter=solver.prefilter)
+        start, errors, stated = Start(displacement=np.zeros_like(mesh.nodes)), [], []
+        for number in range(plate.rest, len(frames)):
+            ready = correlated(separation(frames[number]), settings)
+            found = track(reference, Deformed.prepare(ready, prefilter=solver.prefilter), start, solver)
+            start = start.after(mesh, found.displacement, found.measured)
+            errors.append(found.displacement - plate.displacement(mesh.nodes, number))
+            stated.append(found.displacement_std)
+        error, std = np.abs(np.concatenate(errors)), np.concatenate(stated)
+        known, ratio = np.isfinite(error[:, 0]), error / std
+        wild = ((error > 0.2) & (ratio > 4)).any(axis=1).sum()
+        _, rms, relative = _figures(error, std)
+        covered = (ratio[known] < 1.96).mean()
+        print(
+            f"{draw:4d}  {wild:4d} of {len(error)}  {1 - known.mean():6.2%}  {rms:.4f}  {error[known].max():.2f}  "
+            f"{relative:.2f}  {covered:.1%}",
+            flush=True,
+        )
 
 
 def score(folder: Path, path: Path) -> None:
@@ -266,13 +400,17 @@ def kill(folder: Path, times: int, workers: int) -> None:
 def main() -> None:
     """Run the command line above."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["make", "score", "kill"])
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("what", choices=["make", "score", "kill", "glare"])
+    parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("result", type=Path, nargs="?")
-    for name, default in (("frames", 500), ("size", 1024), ("lost", 30), ("times", 20), ("workers", 2)):
+    for name, default in (("frames", 500), ("size", 1024), ("lost", 30), ("times", 20), ("workers", 2), ("draws", 6)):
         parser.add_argument(f"--{name}", type=int, default=default)
     given = parser.parse_args()
-    if given.what == "make":
+    if given.folder is None and given.what != "glare":
+        parser.error(f"{given.what} needs a FOLDER")
+    if given.what == "glare":
+        glare(given.draws)
+    elif given.what == "make":
         make(given.folder, given.frames, given.size, given.lost)
     elif given.what == "score":
         score(given.folder, given.result or given.folder / "whole")

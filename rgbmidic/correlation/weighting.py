@@ -150,6 +150,19 @@ def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
 def standard_uncertainty(
     residual: Residual, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
 ) -> FloatArray:
-    """Standard uncertainty of the linear fit's u and v, (N, 2), or of what the `recovery` gives, (N, 5)."""
+    """Standard uncertainty of the linear fit's u and v, (N, 2), or of what the `recovery` gives, (N, 5).
+
+    The latter holds the step, too, that the lights' channel-specific gradients would make from the solution: two
+    gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978). Where a reflection
+    does not follow the surface it pulls with them, and what it still pulls without is less than that
+    (docs/uncertainty.md).
+    """
     std = nodal_std(residual, equations, recovery)
-    return std if precision is None else std * precision.robust_loss(residual.reference, equations.weights)[:, None]
+    if precision is not None:
+        std = std * precision.robust_loss(residual.reference, equations.weights)[:, None]
+    if recovery is None:
+        return std
+    pulls = residual.reference.channel_specific_pulls(equations.weights, residual.difference)
+    step, _ = equations.increment(pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel())
+    disagreement = np.concatenate([recovery.displacement(step), recovery.strain(step)], axis=1)
+    return np.asarray(np.hypot(std, disagreement))
