@@ -163,6 +163,7 @@ def standard_uncertainty(
     if recovery is None:
         return std
     pulls = residual.reference.channel_specific_pulls(equations.weights, residual.difference)
-    step, _ = equations.increment(pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel())
+    pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
+    step, _ = equations.increment(pull, np.zeros_like(pull), rigid_pull)
     disagreement = np.concatenate([recovery.displacement(step), recovery.strain(step)], axis=1)
     return np.asarray(np.hypot(std, disagreement))
