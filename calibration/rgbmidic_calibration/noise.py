@@ -38,8 +38,8 @@ CURVE_WARNING, BEND_SIGNIFICANCE = 0.03, 4.0
 ZEROS_WARNING = 0.005
 PLANES_WARNING = 0.05
 LINEARITY_WARNING = 0.5
-"""Linearity error LE (%) from which lights that shine together are not the sum of the single ones to within what `check`
-allows (`rgbmidic_calibration.verify.Limits.additivity`); EMVA 1288 defines the figure and sets no limit."""
+"""Linearity error LE (%) from which lights that shine together are not the sum of the single ones to within what
+`check` allows (`rgbmidic_calibration.verify.Limits.additivity`); EMVA 1288 defines the figure and sets no limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -300,8 +300,8 @@ def _warnings(
         worst = int(np.nanargmax(linearity))
         warnings.append(
             f"plane {dark.names[worst]}: the linearity error is {linearity[worst]:.2f} %, the limit is "
-            f"{LINEARITY_WARNING:g} %: are the exposure times those of the frames, was the lamp steady? Unmixing needs a "
-            "linear camera"
+            f"{LINEARITY_WARNING:g} %: are the exposure times those of the frames, was the lamp steady? Unmixing "
+            "needs a linear camera"
         )
     if np.isnan(linearity).any() and any(flat.exposure is not None for flat in flats):
         warnings.append(
