@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
+
+import numpy as np
 
 from rgbmidic.command import read_shape
 from rgbmidic.errors import ConfigurationError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.frame_check import unevenness
 from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration.blocks import BlockMeans, block_means
 from rgbmidic_calibration.captures import CaptureFiles, provenance
@@ -113,7 +116,7 @@ def calibrate_crosstalk(
     calibration = Calibration(
         crosstalk=estimate.crosstalk,
         provenance={"crosstalk": provenance("crosstalk", groups, details)},
-        **_camera(first[0]),
+        **_camera(first[0], (next(files.frames()) for files in found.values())),
     )
     return calibration, estimate
 
@@ -138,11 +141,11 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
     estimate = photon_transfer(dark_stack, stacks)
     all_files = [dark_files, *(files for files, _ in groups)]
     details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in groups]}
-    frame = next(dark_files.frames())
+    frame, lit = next(dark_files.frames()), (next(files.frames()) for files, _ in groups)
     return Calibration(
         camera_noise=estimate.camera_noise,
         provenance={"noise": provenance("noise", all_files, details)},
-        **_camera(frame),
+        **_camera(frame, lit),
     ), estimate
 
 
@@ -170,7 +173,7 @@ def calibrate_registration(
     return Calibration(
         registration=estimate.registration,
         provenance={"registration": provenance("registration", groups, details)},
-        **_camera(frame),
+        **_camera(frame, (next(files.frames()) for files in found.values())),
     ), estimate
 
 
@@ -195,9 +198,16 @@ def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float
     return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, told).by_folder()]
 
 
-def _camera(frame: Mosaic | ChannelFrame) -> dict[str, Any]:
-    """Camera settings of a calibration, from one of its frames."""
+def _camera(frame: Mosaic | ChannelFrame, lit: Iterable[Mosaic | ChannelFrame]) -> dict[str, Any]:
+    """Camera settings of a calibration from one of its frames, and how even the grey levels of lit ones are."""
+    uneven = []
+    for capture in lit:
+        planes = [plane[(plane > 0) & (plane < frame.white_level)] for plane in planes_of(capture)[1]]
+        brightest = max(planes, key=lambda plane: float(plane.mean()) if plane.size else 0.0)
+        uneven.append(unevenness(brightest))  # in the dark, noise is too little to smooth the histogram
+    known = [value for value in uneven if np.isfinite(value)]
     return {
+        "unevenness": max(known) if known else None,
         "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
         "black_level": float(frame.black_level.mean()),
         "white_level": frame.white_level,

@@ -52,6 +52,8 @@ class Calibration:
         The camera settings of the captures, where they were stated or told by the files.
     shape
         Rows and columns of the captures.
+    unevenness
+        Of the grey levels' histogram in the captures (`rgbmidic.illumination.frame_check.unevenness`).
     provenance
         Inputs with their hashes, date, software version, by section; kept as written.
     extra
@@ -66,6 +68,7 @@ class Calibration:
     black_level: float | None = None
     white_level: float | None = None
     shape: tuple[int, int] | None = None
+    unevenness: float | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
 
@@ -178,6 +181,7 @@ class Calibration:
             black_level=read_level(camera, "black_level"),
             white_level=read_level(camera, "white_level"),
             shape=None if shape is None else (int(shape[0]), int(shape[1])),
+            unevenness=read_level(camera, "unevenness"),
             provenance=read_section(document, "provenance") or {},
             extra={key: value for key, value in document.items() if key not in known},
         )
@@ -186,6 +190,7 @@ class Calibration:
         """The JSON document, as plain dictionaries, lists and numbers."""
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION}
         camera: dict[str, Any] = {"cfa": self.cfa, "black_level": self.black_level, "white_level": self.white_level}
+        camera["unevenness"] = self.unevenness
         camera["shape"] = None if self.shape is None else list(self.shape)
         document["camera"] = {key: value for key, value in camera.items() if value is not None}
         if self.crosstalk is not None:

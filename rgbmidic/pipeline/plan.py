@@ -6,12 +6,14 @@ reference of the solve.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 from rgbmidic.correlation import Reference
 from rgbmidic.errors import FrameError, RegionError
 from rgbmidic.frames import FrameSeries, open_series, read_frame
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.raw_samples import check_texture, exposure_fault
@@ -20,6 +22,8 @@ from rgbmidic.settings import RegionSettings, TestSettings
 from rgbmidic.weights import LightWeights, prepare_weights
 
 __all__ = ["Plan", "read_region"]
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +78,12 @@ class Plan:
         separation = Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         images, separation = separation.reference(first, map(series.read, others))
         region = read_region(settings.region, images.shape)
+        names = ", ".join(map(series.name, settings.frames.reference))
+        if calibration is not None:
+            again = series.read(others[0]) if others else None
+            for found in check_state(first, calibration, region.mask, names, accept=settings.accept, repeat=again):
+                if not found.certain:
+                    logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration_file, found.text)
         mesh = Tri3Mesh.from_region(region, settings.element_size, settings.cracks)
         weights = prepare_weights(
             settings, images, region, frames=len(series), images_of=lambda index: separation(series.read(index))
@@ -85,7 +95,7 @@ class Plan:
             mesh=mesh,
             prefilter=settings.solver.prefilter,
         )
-        _check_seen(reference, first, region, ", ".join(map(series.name, settings.frames.reference)))
+        _check_seen(reference, first, region, names)
         return cls(
             settings=settings,
             series=series,
