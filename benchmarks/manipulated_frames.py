@@ -188,9 +188,11 @@ def verdict(
 
 
 def calibrations(matrix: FloatArray) -> tuple[Calibration, Calibration]:
-    """Of everything, and of the crosstalk alone as files were before they stated the unevenness."""
+    """Of everything, and what `rgbmidic-calibrate crosstalk` alone writes."""
     crosstalk = Crosstalk(matrix=matrix, lights=("red", "green", "blue"))
-    return Calibration(crosstalk=crosstalk, noise=NOISE, unevenness=0.0), Calibration(crosstalk=crosstalk)
+    return Calibration(crosstalk=crosstalk, noise=NOISE, unevenness=0.0), Calibration(
+        crosstalk=crosstalk, unevenness=0.0
+    )
 
 
 def table(good: Scenes) -> None:

@@ -50,8 +50,9 @@ WINDOW = 9
 """Grey levels over which the histogram is smooth (a parabola) where noise has a standard deviation of `SMOOTHED`."""
 SMOOTHED = 2.0
 UNEVEN, UNEVEN_UNKNOWN = 0.03, 0.1
-"""Relative variance of the histogram about its smooth course that is too much, with calibrated noise and without: good
-scenes reach .006, unprocessed real frames of 8 bit .07, others .022; a gain of 1.05 on stored samples gives .05."""
+"""Relative variance of the histogram about its smooth course that is too much where captures or noise are calibrated,
+and where neither is: good scenes reach .006, unprocessed real frames of 8 bit .07, others .022; a gain of 1.05 on
+stored samples gives .05."""
 GREENS, GREENS_RATIO = 0.03, 1.5
 """Rms of log(G1/G2) over blocks from which the greens differ, and over that of the two other planes: the greens of good
 scenes reach .03 by the texture that each plane samples, the other two planes as much or more."""
@@ -317,7 +318,7 @@ def _levels(planes: Sequence[_Plane], calibrated: float | None) -> Iterator[Mism
     step = bits & -bits or 1
     uneven = [unevenness(plane.stored[plane.usable], plane.noise, plane.black, step) for plane in planes]
     worst, name = max(zip(np.nan_to_num(uneven), (plane.name for plane in planes), strict=True))
-    limit = UNEVEN_UNKNOWN if planes[0].noise is None else UNEVEN
+    limit = UNEVEN_UNKNOWN if planes[0].noise is None and calibrated is None else UNEVEN
     if worst > limit and (calibrated is None or calibrated < UNEVEN):
         said = "the calibration does not say how it was in its captures"
         if calibrated is not None:
@@ -335,8 +336,8 @@ def unevenness(
 ) -> float:
     """Relative variance of the histogram of raw samples about its smooth course, that of counting taken off.
 
-    0 where it is smooth over `WINDOW` levels as noise makes it, 1 where every other level is missing; NaN where too few
-    samples, or too little noise, tell nothing.
+    0 where it is smooth over `WINDOW` levels as noise makes it, .05 where every 21st level is missing, about 2 where
+    every other one is; NaN where too few samples, or too little noise, tell nothing.
 
     Parameters
     ----------
@@ -451,9 +452,9 @@ def _interpolated(planes: Sequence[_Plane]) -> Iterator[Mismatch]:
             return
         energy = (across[0] + along[0].T).ravel()
         ratios.append(across[1] / along[1] if len(planes) == 4 else energy.max() / energy.min())
-    relative = np.array(ratios) / (np.median(ratios) if len(planes) == 4 else 1.0)
-    worst = int(np.argmax(np.abs(np.log(relative))))
-    if abs(np.log(relative[worst])) > np.log(INTERPOLATED):
+    relative = np.array(ratios) / (min(ratios) if len(planes) == 4 else 1.0)
+    worst = int(np.argmax(relative))
+    if relative[worst] > INTERPOLATED:
         yield Mismatch(
             check="demosaiced",
             certain=True,
