@@ -44,6 +44,8 @@ BLACK, WHITE = 64, 4095
 RANGE = WHITE - BLACK
 MEASURED = np.array([[1, 0.15, 0.05], [0.12, 1, 0.33], [0.02, 0.28, 1]])
 """A crosstalk with as much between green and blue as measured cameras have."""
+EVERY = 2
+"""Every second scene is manipulated."""
 Scenes = list[tuple[str, FloatImage]]
 Change = Callable[[FloatArray], FloatArray]
 
@@ -198,14 +200,15 @@ def calibrations(matrix: FloatArray) -> tuple[Calibration, Calibration]:
 def table(good: Scenes) -> None:
     """Errors and warnings of every manipulation, over all scenes and both crosstalks."""
     cases = [(name, lights, matrix) for name, lights in good for matrix in (A, MEASURED)]
-    print(f"{len(cases)} frames a line: errors + warnings (by which checks)")
+    some = cases[:: 2 * EVERY] + cases[1 :: 2 * EVERY]
+    print(f"{len(cases)} good frames, {len(some)} manipulated ones a line: errors + warnings (by which checks)")
     print("| manipulation | strength | calibrated | and a second frame of the state | crosstalk alone calibrated |")
     print("|---|---|---|---|---|")
     lit = [("good", f"light x {factor:g}", {"light": factor}) for factor in (1.0, 0.5, 0.1, 2.2)]
     for name, strength, options in (*lit, *manipulations()):
         columns = ["", "", ""]
         taken = []
-        for label, lights, matrix in cases:
+        for label, lights, matrix in cases if name == "good" else some:
             frame, again = (record(lights, matrix, **options, seed=seed) for seed in (0, 1))
             taken.append((label, frame, again, calibrations(matrix)))
         for column, (repeated, which) in enumerate(((False, 0), (True, 0), (False, 1))):
@@ -223,7 +226,7 @@ def table(good: Scenes) -> None:
 
 
 def real(data: Path) -> None:
-    """Errors and warnings of real raw frames with a calibration that knows nothing."""
+    """Errors and warnings of real raw frames with a calibration whose captures use all grey levels and no more."""
     for path in sorted(data.rglob("*")):
         if path.suffix.lower() not in (".tif", ".tiff", ".png", ".dng", ".cine", ".kdc", ".cihx", ".cih", ".raw"):
             continue
@@ -236,7 +239,7 @@ def real(data: Path) -> None:
             except RgbmidicError:
                 continue
             inside = np.ones(frame.values.shape[-2:], dtype=bool)
-            found = mismatches(frame, Calibration(), inside)
+            found = mismatches(frame, Calibration(unevenness=0.0), inside)
             told = "; ".join(f"{'ERROR' if one.certain else 'warning'} {one.check}: {one.text}" for one in found)
             print(f"{path.relative_to(data)} {stated}: {told or 'passes'}")
             break

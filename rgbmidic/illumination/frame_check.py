@@ -49,10 +49,12 @@ calibrated: a variance .80 and .64 times the calibrated one. Gains are calibrate
 WINDOW = 9
 """Grey levels over which the histogram is smooth (a parabola) where noise has a standard deviation of `SMOOTHED`."""
 SMOOTHED = 2.0
-UNEVEN, UNEVEN_UNKNOWN = 0.03, 0.1
-"""Relative variance of the histogram about its smooth course that is too much where captures or noise are calibrated,
-and where neither is: good scenes reach .006, unprocessed real frames of 8 bit .07, others .022; a gain of 1.05 on
-stored samples gives .05."""
+UNEVEN = 0.03
+"""Relative variance of the histogram about its smooth course that is too much: good scenes reach .006, real raw frames
+without a table of their own .022 above 8 bit; a gain of 1.05 on stored samples gives .05."""
+FINE = 1000
+"""Grey levels of the full scale, that is 10 bit, from which photon noise exceeds `SMOOTHED` where a sensor is lit: with
+a full well of 4,000 electrons it is 8 levels at a third of the scale. 8-bit frames of real cameras reach .23."""
 GREENS, GREENS_RATIO = 0.03, 1.5
 """Rms of log(G1/G2) over blocks from which the greens differ, and over that of the two other planes: the greens of good
 scenes reach .03 by the texture that each plane samples, the other two planes as much or more."""
@@ -164,13 +166,13 @@ def mismatches(
     if min(planes[0].values.shape) < 2 * BLOCK:
         return []
     again = None if repeat is None else _planes(repeat, calibration, inside, window)
-    found = [*_noise(planes, again), *_levels(planes, calibration.unevenness)]
+    full_scale = frame.white_level - float(frame.black_level.mean())
+    found = [*_noise(planes, again), *_levels(planes, calibration.unevenness, full_scale)]
     if len(planes) == 4:
         found += _greens(planes)
     if len(planes) > 1:
         found += _interpolated(planes)
     if len(planes) > 1 and calibration.crosstalk is not None:
-        full_scale = frame.white_level - float(frame.black_level.mean())
         found += _lights(planes, calibration.crosstalk, full_scale, (left, top))
     return found
 
@@ -235,9 +237,8 @@ def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None) -> Iterato
     found: list[tuple[float, str, float, float]] = []
     for number, level in groups:
         for fraction in range(len(FLATTEST)):
-            count, expected, chance, level_mean, deviation, places = (
-                float(np.sum(counts[number, level, fraction, column])) for column in range(6)
-            )
+            sums = counts[number, level, fraction].reshape(-1, 6).sum(axis=0).tolist()
+            count, expected, chance, level_mean, deviation, places = sums
             error = SIGNIFICANCE * np.sqrt(SHARED * chance)
             if places and (count - expected > error or (repeat and expected - count > error)):
                 name = planes[number].name if isinstance(number, int) else "all colours"
@@ -246,12 +247,13 @@ def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None) -> Iterato
         return
     for (ratio, name, at, calibrated), doubtful in ((max(found), QUIET), (min(found), 1 / QUIETER)):
         if ratio > doubtful > 1 or ratio < doubtful < 1:
+            other = "" if ratio > 1 else ", motion between the two frames"
             yield Mismatch(
                 check="noise",
                 certain=ratio > QUIETER,
                 text=f"the noise of {name} at {at:.0f} DN above black is {calibrated / ratio:.2g} DN"
                 f"{'' if repeat else ' or less'}, the calibration says {calibrated:.2g} DN (another camera or gain, "
-                f"gamma, noise reduction, interpolated samples, black level{'?' if ratio > 1 else ', vibration?'})",
+                f"gamma, noise reduction, interpolated samples, black level{other}?)",
             )
 
 
@@ -312,22 +314,26 @@ def _shifted(flatness: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return out
 
 
-def _levels(planes: Sequence[_Plane], calibrated: float | None) -> Iterator[Mismatch]:
-    """Grey levels that are missing or doubled: a gain, a gamma or a table was applied to stored samples."""
+def _levels(planes: Sequence[_Plane], calibrated: float | None, full_scale: float) -> Iterator[Mismatch]:
+    """Grey levels missing or doubled that were not in the captures: a gain, a gamma or a table, on stored samples.
+
+    Some cameras have tables of their own, which their captures show too. Uncalibrated noise smooths the histogram where
+    there are `FINE` levels; with less it may not.
+    """
     bits = int(np.bitwise_or.reduce([np.bitwise_or.reduce(plane.stored, axis=None) for plane in planes]))
     step = bits & -bits or 1
+    known = full_scale >= FINE * step or all(plane.noise is not None for plane in planes)
+    if calibrated is None or calibrated > UNEVEN or not known:
+        return
     uneven = [unevenness(plane.stored[plane.usable], plane.noise, plane.black, step) for plane in planes]
     worst, name = max(zip(np.nan_to_num(uneven), (plane.name for plane in planes), strict=True))
-    limit = UNEVEN_UNKNOWN if planes[0].noise is None and calibrated is None else UNEVEN
-    if worst > limit and (calibrated is None or calibrated < UNEVEN):
-        said = "the calibration does not say how it was in its captures"
-        if calibrated is not None:
-            said = f"{calibrated:.3f} in the captures of the calibration"
+    if worst > UNEVEN:
         yield Mismatch(
             check="levels",
-            certain=calibrated is not None,
-            text=f"grey levels of {name} are missing or doubled (their histogram departs by {worst:.2g} of its square, "
-            f"{said}): a gain, white balance, gamma or 8-bit table was applied to stored samples",
+            certain=True,
+            text=f"grey levels of {name} are missing or doubled (relative variance of their histogram {worst:.2g}, "
+            f"in the captures of the calibration {calibrated:.2g}): a gain, white balance, gamma or 8-bit table was "
+            "applied to stored samples",
         )
 
 
@@ -377,10 +383,16 @@ def _block_means(values: npt.NDArray[np.float32], side: int) -> FloatArray:
     return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float64)
 
 
+def _whole_blocks(planes: Sequence[_Plane], side: int) -> BoolArray:
+    """Blocks of `side` samples that are usable in all planes."""
+    usable = np.logical_and.reduce([plane.usable for plane in planes])
+    return np.asarray(_block_means(usable.astype(np.float32), side) == 1)
+
+
 def _greens(planes: Sequence[_Plane]) -> Iterator[Mismatch]:
     """Two greens that differ from place to place while the two other planes agree: another phase of the pattern."""
     means = [_block_means(plane.values, BLOCK) for plane in planes]
-    clear = np.all([_block_means(plane.usable.astype(np.float32), BLOCK) == 1 for plane in planes], axis=0)
+    clear = _whole_blocks(planes, BLOCK)
     clear &= np.min(means, axis=0) > 0
     if clear.sum() < 36:  # a rms of 36 is known to 12 %
         return
@@ -402,16 +414,16 @@ def _lights(
     mosaic = len(planes) == 4
     side = BLOCK // 2 if mosaic else BLOCK
     red, *greens, blue = (plane.values for plane in planes)
-    channels = [red, np.mean(greens, axis=0), blue]
-    usable = np.min([_block_means(plane.usable.astype(np.float32), side) for plane in planes], axis=0) == 1
+    channels: list[npt.NDArray[Any]] = [red, (greens[0] + greens[-1]) / 2, blue]
+    usable = _whole_blocks(planes, side)
     mean = np.stack([_block_means(channel, side) for channel in channels])
     if usable.sum() < 36 or crosstalk.matrix.shape[0] != 3:
         return
-    texture = np.mean(channels, axis=0)
+    texture = channels[0] + channels[1] + channels[2]
     spread = np.stack([_block_means(channel * texture, side) for channel in channels])
     spread -= mean * _block_means(texture, side)
     own = np.stack([_block_means(channel**2, side) for channel in channels]) - mean**2
-    common = float(np.median((3 * spread.sum(axis=0) / np.maximum(own.sum(axis=0), 1e-9))[usable]))  # 1 to 3
+    common = float(np.median((spread.sum(axis=0) / np.maximum(own.sum(axis=0), 1e-9))[usable]))  # 1 to 3
     y, x = (BLOCK * (np.arange(count) + 0.5) for count in usable.shape)
     unmixing = crosstalk.unmixing_at(np.stack(np.meshgrid(x, y), axis=-1) + origin)
     level, slope = (np.einsum("yxkc,cyx->kyx", unmixing, part) for part in (mean, spread))

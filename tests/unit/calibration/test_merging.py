@@ -43,7 +43,9 @@ def files(tmp_path):
     sections = {"crosstalk": crosstalk(), "camera_noise": camera_noise(), "registration": registration()}
     for name, section in sections.items():
         uneven = {"crosstalk": 0.01, "camera_noise": 0.02}.get(name)
-        Calibration(**{name: section}, **CAMERA, unevenness=uneven, provenance={name: {"date": "today"}}).write(tmp_path / f"{name}.json")
+        Calibration(**{name: section}, **CAMERA, unevenness=uneven, provenance={name: {"date": "today"}}).write(
+            tmp_path / f"{name}.json"
+        )
     return [tmp_path / f"{name}.json" for name in sections]
 
 
