@@ -167,7 +167,14 @@ def mismatches(
         return []
     again = None if repeat is None else _planes(repeat, calibration, inside, window)
     full_scale = frame.white_level - float(frame.black_level.mean())
-    found = [*_noise(planes, again), *_levels(planes, calibration.unevenness, full_scale)]
+    bits = int(np.bitwise_or.reduce([np.bitwise_or.reduce(plane.stored, axis=None) for plane in planes]))
+    step = bits & -bits or 1  # all samples are multiples of it
+    found: list[Mismatch] = []
+    if full_scale >= FINE * step or planes[0].noise is not None:  # else noise may be too little to smooth the histogram
+        uneven, name = _most_uneven(planes, step)
+        found += _levels(name, uneven, calibration.unevenness)
+        if uneven <= UNEVEN:  # the count of small differences wants samples that take any whole value
+            found += _noise(planes, again, step)
     if len(planes) == 4:
         found += _greens(planes)
     if len(planes) > 1:
@@ -209,7 +216,7 @@ def _noise_of(calibration: Calibration, plane: str) -> NoiseModel | None:
     )
 
 
-def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None) -> Iterator[Mismatch]:
+def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None, step: int) -> Iterator[Mismatch]:
     """Noise that is not on the photon transfer line of the calibration, at some grey level of some plane.
 
     Differences ``a - b - c + d`` of four neighbours in a plane hold four times the variance of a sample, and texture.
@@ -229,8 +236,12 @@ def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None) -> Iterato
     usable &= np.isfinite(flatness).all(axis=0)
     if usable.sum() < 1000:
         return
-    parts = (difference, mean, variance, flatness)
-    counts = np.stack([_small_differences(*(part[number][usable] for part in parts)) for number in range(len(planes))])
+    counts = np.stack(
+        [
+            _small_differences(a[usable], b[usable], c[usable], d[usable], step)
+            for a, b, c, d in zip(difference, mean, variance, flatness, strict=True)
+        ]
+    )
     frames = 2 if repeat else 1
     whole = slice(None)
     groups = [(number, level) for number in (*range(len(planes)), whole) for level in (*range(LEVELS), whole)]
@@ -245,7 +256,7 @@ def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None) -> Iterato
                 found.append((count / expected, name, level_mean / places, deviation / places / np.sqrt(frames)))
     if not found:
         return
-    for (ratio, name, at, calibrated), doubtful in ((max(found), QUIET), (min(found), 1 / QUIETER)):
+    for (ratio, name, at, calibrated), doubtful in ((max(found), QUIET), (min(found), 1 / QUIET)):
         if ratio > doubtful > 1 or ratio < doubtful < 1:
             other = "" if ratio > 1 else ", motion between the two frames"
             yield Mismatch(
@@ -263,7 +274,11 @@ def _same(planes: Sequence[_Plane], others: Sequence[_Plane]) -> bool:
 
 
 def _small_differences(
-    difference: npt.NDArray[Any], mean: npt.NDArray[Any], variance: npt.NDArray[Any], flatness: npt.NDArray[Any]
+    difference: npt.NDArray[Any],
+    mean: npt.NDArray[Any],
+    variance: npt.NDArray[Any],
+    flatness: npt.NDArray[Any],
+    step: int,
 ) -> FloatArray:
     """What is counted in a plane, by grey level and by how flat the others are, (LEVELS, len(FLATTEST), 6).
 
@@ -276,7 +291,7 @@ def _small_differences(
         inside = np.flatnonzero(bins == level)
         inside = inside[np.argsort(flatness[inside])][: int(np.ceil(max(FLATTEST) * inside.size))]
         deviation = np.sqrt(variance[inside])
-        limit = np.floor(NEAR * deviation) + 0.5  # differences are whole
+        limit = step * (np.floor(NEAR * deviation / step) + 0.5)  # differences are multiples of the step
         expected = erf(limit / deviation / np.sqrt(2))
         near = np.abs(difference[inside]) < limit
         columns = (near, expected, expected * (1 - expected), mean[inside], deviation / 2, np.ones(inside.size))
@@ -314,25 +329,23 @@ def _shifted(flatness: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return out
 
 
-def _levels(planes: Sequence[_Plane], calibrated: float | None, full_scale: float) -> Iterator[Mismatch]:
+def _most_uneven(planes: Sequence[_Plane], step: int) -> tuple[float, str]:
+    """Largest unevenness of the planes' histograms, 0 where none tells it, and the plane's name."""
+    uneven = [unevenness(plane.stored[plane.usable], plane.noise, plane.black, step) for plane in planes]
+    return max(zip(np.nan_to_num(uneven).tolist(), (plane.name for plane in planes), strict=True))
+
+
+def _levels(name: str, uneven: float, calibrated: float | None) -> Iterator[Mismatch]:
     """Grey levels missing or doubled that were not in the captures: a gain, a gamma or a table, on stored samples.
 
-    Some cameras have tables of their own, which their captures show too. Uncalibrated noise smooths the histogram where
-    there are `FINE` levels; with less it may not.
+    Some cameras have tables of their own, which their captures show too.
     """
-    bits = int(np.bitwise_or.reduce([np.bitwise_or.reduce(plane.stored, axis=None) for plane in planes]))
-    step = bits & -bits or 1
-    known = full_scale >= FINE * step or all(plane.noise is not None for plane in planes)
-    if calibrated is None or calibrated > UNEVEN or not known:
-        return
-    uneven = [unevenness(plane.stored[plane.usable], plane.noise, plane.black, step) for plane in planes]
-    worst, name = max(zip(np.nan_to_num(uneven), (plane.name for plane in planes), strict=True))
-    if worst > UNEVEN:
+    if calibrated is not None and calibrated <= UNEVEN < uneven:
         yield Mismatch(
             check="levels",
             certain=True,
-            text=f"grey levels of {name} are missing or doubled (relative variance of their histogram {worst:.2g}, "
-            f"in the captures of the calibration {calibrated:.2g}): a gain, white balance, gamma or 8-bit table was "
+            text=f"grey levels of {name} are missing or doubled (relative variance of their histogram {uneven:.2g}, in "
+            f"the captures of the calibration {calibrated:.2g}): a gain, white balance, gamma or 8-bit table was "
             "applied to stored samples",
         )
 

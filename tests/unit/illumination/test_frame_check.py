@@ -15,8 +15,10 @@ from rgbmidic.frames import open_series
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.writers import write_dng
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.camera_noise import QUANTISATION
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.frame_check import check_state, mismatches, unevenness
+from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.pipeline import measure
 
 BLACK, WHITE, SHAPE = 64, 4095, (288, 288)
@@ -61,6 +63,24 @@ def test_good_frames_pass(diameter, power, glare):
     for calibration in (CALIBRATION, Calibration(crosstalk=CROSSTALK), Calibration(noise=NOISE), Calibration()):
         assert found(frame, calibration) == {}
         assert found(frame, calibration, repeat) == {}
+
+
+def test_samples_in_the_high_bits_pass():
+    low = NoiseModel(gain=1500.0, read_noise=0.3)  # about one grey level, rounding included
+    frame, repeat = (recorded(lights(8.0), noise=low, seed=seed) for seed in (0, 1))
+    high = [
+        replace(one, values=16 * one.values, black_level=16 * one.black_level, white_level=65520)
+        for one in (frame, repeat)
+    ]
+    noise = NoiseModel(gain=low.gain / 16, read_noise=16 * np.hypot(low.read_noise, QUANTISATION**0.5))
+    assert found(high[0], replace(CALIBRATION, noise=noise), high[1]) == {}
+
+
+def test_a_camera_with_a_table_of_its_own_passes():
+    """Steps of about the noise: differences take few values, and their count tells nothing of it."""
+    noise = camera(gain=6)
+    pair = [recorded(lights(8.0), noise=noise, change=TABLES["8-bit root"], seed=seed) for seed in (0, 1)]
+    assert found(pair[0], replace(CALIBRATION, noise=noise, unevenness=2.0), pair[1]) == {}
 
 
 def test_less_noise_than_calibrated_is_certain_in_one_frame_and_more_is_doubtful_in_two():
