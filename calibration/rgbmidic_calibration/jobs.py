@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -32,6 +32,9 @@ __all__ = [
 ]
 
 KINDS = ("bayer", "rgb", "monochrome")
+LIT = 0.1
+"""Mean above black, relative to the full scale, of a plane whose histogram is looked at: in the dark, noise is too
+little to smooth it. Some cameras apply gains of their own to red and blue, so all planes are."""
 DTYPES = ("uint8", "uint16", ">u2")
 
 
@@ -100,8 +103,9 @@ def calibrate_crosstalk(
     """Crosstalk section from capture files: patterns by light, pattern of the dark frames, what is stated of them."""
     found, dark_files = find_groups(lights, dark, told)
     first: list[Mosaic | ChannelFrame] = []
-    means = {name: _reduce(files, block, first) for name, files in found.items()}
-    dark_means = _reduce(dark_files, block, first) if dark_files else []
+    uneven: list[float] = []
+    means = {name: _reduce(files, block, first, uneven) for name, files in found.items()}
+    dark_means = _reduce(dark_files, block, first, uneven) if dark_files else []
     groups = [*found.values(), *([dark_files] if dark_files else [])]
     labels = {group.role.removeprefix("light "): group.labels for group in groups}
     estimate = estimate_crosstalk(means, dark_means, order=order, allow=allow, labels=labels)
@@ -116,7 +120,7 @@ def calibrate_crosstalk(
     calibration = Calibration(
         crosstalk=estimate.crosstalk,
         provenance={"crosstalk": provenance("crosstalk", groups, details)},
-        **_camera(first[0], (next(files.frames()) for files in found.values())),
+        **_camera(first[0], uneven),
     )
     return calibration, estimate
 
@@ -141,11 +145,12 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
     estimate = photon_transfer(dark_stack, stacks)
     all_files = [dark_files, *(files for files, _ in groups)]
     details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in groups]}
-    frame, lit = next(dark_files.frames()), (next(files.frames()) for files, _ in groups)
+    frame = next(dark_files.frames())
+    uneven = [value for files, _ in groups for value in _unevenness(next(files.frames()))]
     return Calibration(
         camera_noise=estimate.camera_noise,
         provenance={"noise": provenance("noise", all_files, details)},
-        **_camera(frame, lit),
+        **_camera(frame, uneven),
     ), estimate
 
 
@@ -173,7 +178,7 @@ def calibrate_registration(
     return Calibration(
         registration=estimate.registration,
         provenance={"registration": provenance("registration", groups, details)},
-        **_camera(frame, (next(files.frames()) for files in found.values())),
+        **_camera(frame, [value for files in found.values() for value in _unevenness(next(files.frames()))]),
     ), estimate
 
 
@@ -198,16 +203,19 @@ def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float
     return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, told).by_folder()]
 
 
-def _camera(frame: Mosaic | ChannelFrame, lit: Iterable[Mosaic | ChannelFrame]) -> dict[str, Any]:
+def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
+    """Of the histogram of every lit plane, where it can be told."""
+    found = []
+    for plane, black in zip(*planes_of(capture)[1:], strict=True):
+        if plane.mean() > black + LIT * (capture.white_level - black):
+            found.append(unevenness(plane[plane < capture.white_level]))
+    return [value for value in found if np.isfinite(value)]
+
+
+def _camera(frame: Mosaic | ChannelFrame, uneven: Sequence[float]) -> dict[str, Any]:
     """Camera settings of a calibration from one of its frames, and how even the grey levels of lit ones are."""
-    uneven = []
-    for capture in lit:
-        planes = [plane[(plane > 0) & (plane < frame.white_level)] for plane in planes_of(capture)[1]]
-        brightest = max(planes, key=lambda plane: float(plane.mean()) if plane.size else 0.0)
-        uneven.append(unevenness(brightest))  # in the dark, noise is too little to smooth the histogram
-    known = [value for value in uneven if np.isfinite(value)]
     return {
-        "unevenness": max(known) if known else None,
+        "unevenness": max(uneven, default=None),
         "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
         "black_level": float(frame.black_level.mean()),
         "white_level": frame.white_level,
@@ -215,11 +223,14 @@ def _camera(frame: Mosaic | ChannelFrame, lit: Iterable[Mosaic | ChannelFrame]) 
     }
 
 
-def _reduce(files: CaptureFiles, block: int, first: list[Mosaic | ChannelFrame]) -> list[BlockMeans]:
-    """Block averages of every file; the first frame of all is kept for its levels."""
+def _reduce(
+    files: CaptureFiles, block: int, first: list[Mosaic | ChannelFrame], uneven: list[float]
+) -> list[BlockMeans]:
+    """Block averages of every file; the first frame of all is kept for its levels, how uneven they are for all."""
     means = []
     for frame in files.frames():
         if not first:
             first.append(frame)
+        uneven += _unevenness(frame)
         means.append(block_means(frame, block=block))
     return means

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from calibration_scene import MATRICES, captures, expose, speckle_target, white_target
+from tifffile import imread, imwrite
 
 from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
@@ -216,3 +217,15 @@ def test_without_arguments_it_shows_its_help(run):
     code, shown, _ = run()
     assert code == 0
     assert "crosstalk" in shown
+
+
+def test_a_camera_s_own_gain_on_blue_is_stated(run, bench, tmp_path):
+    for source in sorted(bench.glob("light_*/*.tif")):
+        values = imread(source)
+        values[1::2, 1::2] = np.rint((values[1::2, 1::2] - 64.0) * 1.3 + 64)
+        (tmp_path / source.parent.name).mkdir(exist_ok=True)
+        imwrite(tmp_path / source.parent.name / source.name, values)
+    lights = [part.replace("=light", f"={tmp_path}/light") for part in LIGHTS]
+    code, _, error = run("crosstalk", "--dark", "dark/*.tif", *lights, *STATED, "--out", str(tmp_path / "own.json"))
+    assert code == 0, error
+    assert Calibration.read(tmp_path / "own.json").unevenness > 0.1

@@ -73,6 +73,7 @@ def test_samples_in_the_high_bits_pass():
         for one in (frame, repeat)
     ]
     noise = NoiseModel(gain=low.gain / 16, read_noise=16 * np.hypot(low.read_noise, QUANTISATION**0.5))
+    assert found(high[0], replace(CALIBRATION, noise=noise)) == {}
     assert found(high[0], replace(CALIBRATION, noise=noise), high[1]) == {}
 
 
