@@ -476,6 +476,9 @@ def inspect(
     dtype: Dtype = None,
     region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or the frame.")] = "",
     element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's or 25.")] = None,
+    accept: Annotated[
+        list[str] | None, typer.Option("--accept", help="Contradiction to the calibration to accept; else the test's.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -497,6 +500,7 @@ def inspect(
             frame=state_frames(settings, count=len(frames), **stated),
             region=_numbers(region, "--region") if region else None,
             element_size=element_size,
+            accept=tuple(accept) if accept else None,
             progress=progress,
         )
     if out is not None:

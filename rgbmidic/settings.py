@@ -51,6 +51,8 @@ def _hints(settings: Any) -> dict[str, Any]:
 
 
 FrameKind = Literal["bayer", "rgb", "monochrome"]
+FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]
+"""Checks of a frame against its calibration (`rgbmidic.illumination.frame_check`)."""
 
 ELEMENT_SIZE = 25.0
 """Side of the elements in px where nobody states another: the paper's (section 2.2)."""
@@ -415,6 +417,9 @@ class TestSettings:
         The sections of the same name.
     calibration_file
         ``file`` in ``[calibration]``; needed for colour frames.
+    accept
+        ``accept`` in ``[calibration]``: checks of the reference frame against the calibration whose contradictions are
+        accepted (`rgbmidic.illumination.frame_check`).
     element_size
         ``element_size`` in ``[mesh]``: side of the elements in px.
     cracks
@@ -428,6 +433,7 @@ class TestSettings:
     frames: FrameSettings
     region: RegionSettings
     calibration_file: Path | None = field(default=None, metadata={"key": "calibration.file"})
+    accept: tuple[FrameCheck, ...] = field(default=(), metadata={"key": "calibration.accept"})
     element_size: float = field(default=ELEMENT_SIZE, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
     cracks: tuple[tuple[tuple[float, float], ...], ...] = field(default=(), metadata={"key": "mesh.cracks"})
     illumination: IlluminationSettings = field(default_factory=IlluminationSettings)

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels, planes_of
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["BlockMeans", "block_centres", "block_means", "plane_origins", "planes_of", "saturation_pile"]
+__all__ = ["BlockMeans", "block_centres", "block_means", "plane_origins", "saturation_pile"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,27 +61,8 @@ class BlockMeans:
         return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
 
 
-def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.NDArray[np.uint16]], FloatArray]:
-    """Colour planes of a frame: their names, their samples and their black levels.
-
-    Parameters
-    ----------
-    frame
-        A mosaic gives its four planes (H/2, W/2) as views in the order R, G1, G2, B; the last row or column of an odd
-        frame is left out. A 3-CCD frame gives R, G, B; a monochrome frame M.
-    """
-    if isinstance(frame, ChannelFrame):
-        names = ("R", "G", "B") if len(frame.values) == 3 else ("M",)
-        return names, list(frame.values), frame.black_level
-    height, width = (side - side % 2 for side in frame.values.shape)
-    order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
-    values = frame.values[:height, :width]
-    planes = [values[position // 2 :: 2, position % 2 :: 2] for position in order]
-    return ("R", "G1", "G2", "B"), planes, frame.black_level.ravel()[order]
-
-
 def plane_origins(frame: Mosaic | ChannelFrame) -> tuple[tuple[int, int], ...]:
-    """Row and column of the first sample of every plane of `planes_of`."""
+    """Row and column of the first sample of every plane of `rgbmidic.frames.data.planes_of`."""
     if isinstance(frame, ChannelFrame):
         return ((0, 0),) * len(frame.values)
     order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")

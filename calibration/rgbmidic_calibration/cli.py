@@ -189,7 +189,10 @@ def design(
     ],
     light: Annotated[
         list[str],
-        typer.Option(help="NAME=CENTRE:WIDTH in nm, NAME=FILE.csv[#COLUMN], or NAME=source of colour-science."),
+        typer.Option(
+            help="NAME=CENTRE:WIDTH (full width at half maximum) in nm, NAME=FILE.csv[#COLUMN], or NAME=source of "
+            "colour-science."
+        ),
     ],
     choose: Annotated[int, typer.Option(help="Lamps in a set; of more candidates the best sets are found.")] = 3,
     show_sets: Annotated[int, typer.Option("--sets", help="How many of the best sets to list.")] = 5,

@@ -146,6 +146,8 @@ def best_sets(camera: Sensitivities, lamps: Mapping[str, Lamp], count: int = 3) 
 def read_lamp(text: str) -> Lamp:
     """A lamp from CENTRE or CENTRE:WIDTH in nm, FILE.csv, FILE.csv#COLUMN, or a name that colour-science knows.
 
+    WIDTH is the full width at half maximum; an LED without one gets 25 nm.
+
     Raises
     ------
     ConfigurationError

@@ -6,10 +6,13 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
+import numpy as np
+
 from rgbmidic.command import read_shape
 from rgbmidic.errors import ConfigurationError
-from rgbmidic.frames.data import Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.frame_check import unevenness
 from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration.blocks import BlockMeans, block_means
 from rgbmidic_calibration.captures import CaptureFiles, provenance
@@ -29,6 +32,9 @@ __all__ = [
 ]
 
 KINDS = ("bayer", "rgb", "monochrome")
+LIT = 0.1
+"""Mean above black, relative to the full scale, of a plane whose histogram is looked at: in the dark, noise is too
+little to smooth it. Some cameras apply gains of their own to red and blue, so all planes are."""
 DTYPES = ("uint8", "uint16", ">u2")
 
 
@@ -96,8 +102,9 @@ def calibrate_crosstalk(
 ) -> tuple[Calibration, CrosstalkEstimate]:
     """Crosstalk section from capture files: patterns by light, pattern of the dark frames, what is stated of them."""
     found, dark_files = find_groups(lights, dark, told)
-    means = {name: _reduce(files, block) for name, files in found.items()}
-    dark_means = _reduce(dark_files, block) if dark_files else []
+    uneven: list[float] = []
+    means = {name: _reduce(files, block, uneven) for name, files in found.items()}
+    dark_means = _reduce(dark_files, block, uneven) if dark_files else []
     groups = [*found.values(), *([dark_files] if dark_files else [])]
     labels = {group.role.removeprefix("light "): group.labels for group in groups}
     estimate = estimate_crosstalk(means, dark_means, order=order, allow=allow, labels=labels)
@@ -112,7 +119,7 @@ def calibrate_crosstalk(
     calibration = Calibration(
         crosstalk=estimate.crosstalk,
         provenance={"crosstalk": provenance("crosstalk", groups, details)},
-        **_camera(groups[0]),
+        **_camera(groups[0], uneven),
     )
     return calibration, estimate
 
@@ -137,10 +144,11 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
     estimate = photon_transfer(dark_stack, stacks)
     all_files = [dark_files, *(files for files, _ in groups)]
     details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in groups]}
+    uneven = [value for files, _ in groups for value in _unevenness(next(files.frames()))]
     return Calibration(
         camera_noise=estimate.camera_noise,
         provenance={"noise": provenance("noise", all_files, details)},
-        **_camera(dark_files),
+        **_camera(dark_files, uneven),
     ), estimate
 
 
@@ -167,7 +175,7 @@ def calibrate_registration(
     return Calibration(
         registration=estimate.registration,
         provenance={"registration": provenance("registration", groups, details)},
-        **_camera(groups[0]),
+        **_camera(groups[0], [value for files in found.values() for value in _unevenness(next(files.frames()))]),
     ), estimate
 
 
@@ -192,20 +200,35 @@ def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float
     return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, told).by_folder()]
 
 
-def _camera(files: CaptureFiles) -> dict[str, Any]:
-    """Camera settings of a calibration, from the first of its frames; levels that nobody stated or tells stay open."""
+def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
+    """Of the histogram of every lit plane, where it can be told."""
+    found = []
+    for plane, black in zip(*planes_of(capture)[1:], strict=True):
+        if plane.mean() > black + LIT * (capture.white_level - black):
+            found.append(unevenness(plane[plane < capture.white_level]))
+    return [value for value in found if np.isfinite(value)]
+
+
+def _camera(files: CaptureFiles, uneven: Sequence[float]) -> dict[str, Any]:
+    """Camera settings of a calibration, from the first of its frames, and how even the grey levels of lit ones are;
+    levels that nobody stated or tells stay open."""
     told, frame = files.series.lights[0][0].told(0), next(files.frames())
     levels = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
     said = {name for name in levels for source in (told, files.stated) if getattr(source, name) is not None}
     kind = "bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome"
     return {
         "kind": kind,
+        "unevenness": max(uneven, default=None),
         "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
         **{name: level for name, level in levels.items() if name in said},
         "shape": (frame.values.shape[-2], frame.values.shape[-1]),
     }
 
 
-def _reduce(files: CaptureFiles, block: int) -> list[BlockMeans]:
-    """Block averages of every file."""
-    return [block_means(frame, block=block) for frame in files.frames()]
+def _reduce(files: CaptureFiles, block: int, uneven: list[float]) -> list[BlockMeans]:
+    """Block averages of every file; how uneven the grey levels of each are is added to `uneven`."""
+    means = []
+    for frame in files.frames():
+        uneven += _unevenness(frame)
+        means.append(block_means(frame, block=block))
+    return means

@@ -35,7 +35,8 @@ def merge_files(paths: Sequence[Path]) -> Calibration:
     for path, calibration in read.items():
         _add(provenance, calibration.provenance, f"provenance of {path}")
         _add(extra, calibration.extra, path)
-    return Calibration(**chosen, provenance=provenance, extra=extra)
+    uneven = [calibration.unevenness for calibration in read.values() if calibration.unevenness is not None]
+    return Calibration(**chosen, unevenness=max(uneven, default=None), provenance=provenance, extra=extra)
 
 
 def _agreed(name: str, read: Mapping[str, Calibration]) -> Any:

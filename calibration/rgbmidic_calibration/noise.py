@@ -37,6 +37,9 @@ SCATTER_WARNING = 1.5
 CURVE_WARNING, BEND_SIGNIFICANCE = 0.03, 4.0
 ZEROS_WARNING = 0.005
 PLANES_WARNING = 0.05
+LINEARITY_WARNING = 0.5
+"""Linearity error LE (%) from which lights that shine together are not the sum of the single ones to within what
+`check` allows (`rgbmidic_calibration.verify.Limits.additivity`); EMVA 1288 defines the figure and sets no limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -292,6 +295,18 @@ def _warnings(
                 f"{curve.scatter:.1f} times as much as noise): did the target move, or the lamp "
                 "flicker, between frames?"
             )
+    linearity = noise.linearity_error.value
+    if (linearity > LINEARITY_WARNING).any():
+        worst = int(np.nanargmax(linearity))
+        warnings.append(
+            f"plane {dark.names[worst]}: the linearity error is {linearity[worst]:.2f} %, the limit is "
+            f"{LINEARITY_WARNING:g} %: are the exposure times those of the frames, was the lamp steady? Unmixing "
+            "needs a linear camera"
+        )
+    if np.isnan(linearity).any() and any(flat.exposure is not None for flat in flats):
+        warnings.append(
+            "no linearity error for some plane: it takes three exposure times that reach 5 to 95 % of the range there"
+        )
     if np.ptp(noise.gain.value) > PLANES_WARNING * noise.gain.value.mean():
         warnings.append("the gains of the planes differ: the camera applies digital gain per colour; the mean is used")
     return warnings

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-from rgbmidic_calibration.blocks import plane_origins, planes_of, saturation_pile
+from rgbmidic_calibration.blocks import plane_origins, saturation_pile
 
 __all__ = ["TemporalStack", "same_camera", "stack_frames"]
 

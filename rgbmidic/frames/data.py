@@ -11,7 +11,16 @@ from rgbmidic.errors import InputError
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.typing import FloatArray
 
-__all__ = ["BAYER_PATTERNS", "ChannelFrame", "Mosaic", "Window", "cfa_channels", "sampled_channels", "shift_cfa"]
+__all__ = [
+    "BAYER_PATTERNS",
+    "ChannelFrame",
+    "Mosaic",
+    "Window",
+    "cfa_channels",
+    "planes_of",
+    "sampled_channels",
+    "shift_cfa",
+]
 
 _GRID = 32
 """Windows begin and, within the frame, end at whole multiples of this (px): a mosaic's pattern, packed samples of
@@ -177,3 +186,22 @@ def _check_levels(black: FloatArray, white: float) -> None:
             f"black and white level must be finite with 0 <= black < white; given are black {black.tolist()}, "
             f"white {white}"
         )
+
+
+def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.NDArray[np.uint16]], FloatArray]:
+    """Colour planes of a frame: their names, their samples and their black levels.
+
+    Parameters
+    ----------
+    frame
+        A mosaic gives its four planes (H/2, W/2) as views in the order R, G1, G2, B; the last row or column of an odd
+        frame is left out. A 3-CCD frame gives R, G, B; a monochrome frame M.
+    """
+    if isinstance(frame, ChannelFrame):
+        names = ("R", "G", "B") if len(frame.values) == 3 else ("M",)
+        return names, list(frame.values), frame.black_level
+    height, width = (side - side % 2 for side in frame.values.shape)
+    order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
+    values = frame.values[:height, :width]
+    planes = [values[position // 2 :: 2, position % 2 :: 2] for position in order]
+    return ("R", "G1", "G2", "B"), planes, frame.black_level.ravel()[order]

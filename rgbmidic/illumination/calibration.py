@@ -58,6 +58,8 @@ class Calibration:
         Rows and columns of the captures.
     name
         What messages call it: its file.
+    unevenness
+        Of the grey levels' histogram in the captures (`rgbmidic.illumination.frame_check.unevenness`).
     provenance
         Inputs with their hashes, date, software version, by section; kept as written.
     extra
@@ -73,6 +75,7 @@ class Calibration:
     black_level: float | None = None
     white_level: float | None = None
     shape: tuple[int, int] | None = None
+    unevenness: float | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
     name: str = field(default="the calibration", compare=False)
@@ -211,6 +214,7 @@ class Calibration:
             black_level=read_level(camera, "black_level"),
             white_level=read_level(camera, "white_level"),
             shape=None if shape is None else (int(shape[0]), int(shape[1])),
+            unevenness=read_level(camera, "unevenness"),
             provenance=read_section(document, "provenance") or {},
             extra={key: value for key, value in document.items() if key not in known},
         )
@@ -218,7 +222,9 @@ class Calibration:
     def to_document(self) -> dict[str, Any]:
         """The JSON document, as plain dictionaries, lists and numbers."""
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION}
-        camera = {name: getattr(self, name) for name in ("kind", "cfa", "black_level", "white_level")}
+        camera: dict[str, Any] = {
+            name: getattr(self, name) for name in ("kind", "cfa", "black_level", "white_level", "unevenness")
+        }
         camera["shape"] = None if self.shape is None else list(self.shape)
         document["camera"] = {key: value for key, value in camera.items() if value is not None}
         if self.crosstalk is not None:

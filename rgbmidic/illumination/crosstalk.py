@@ -183,6 +183,8 @@ class Crosstalk:
 
     def unmixing_at(self, points: npt.ArrayLike) -> FloatArray:
         """The (pseudo-)inverse of A at points (x, y) in px of shape (..., 2): shape (..., k, C)."""
+        if self.field is None:
+            return np.broadcast_to(self.unmixing, (*np.shape(points)[:-1], *self.unmixing.shape))
         return np.asarray(np.linalg.pinv(self.at(points)), dtype=np.float64)
 
     @property

@@ -17,6 +17,11 @@ from rgbmidic.typing import FloatArray
 __all__ = ["Led", "Sensitivities", "spectral_response"]
 
 
+HALF_MAXIMUM = 0.921823
+"""Full width at half maximum of Ohno's model over its width parameter: twice the x where (g + 2 g^5)/3 is 1/2 for
+g = exp(-x^2)."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Led:
     """A light-emitting diode, by the model of Ohno (Optical Engineering 44, 111302, 2005).
@@ -26,7 +31,7 @@ class Led:
     centre
         Wavelength of the peak (nm).
     width
-        Half spectral width parameter of the model (nm); the full width at half maximum is about 1.2 times as large.
+        Full width at half maximum (nm), as data sheets state it.
     """
 
     centre: float
@@ -38,7 +43,7 @@ class Led:
 
     def power(self, wavelengths: FloatArray) -> FloatArray:
         """Spectral power at the wavelengths (nm), of unit sum: equal spacing is assumed."""
-        g = np.exp(-(((wavelengths - self.centre) / self.width) ** 2))
+        g = np.exp(-(((wavelengths - self.centre) * HALF_MAXIMUM / self.width) ** 2))
         shape = (g + 2 * g**5) / 3
         if not shape.sum() > 0:
             raise InputError(f"{self} emits nothing within {wavelengths[0]} to {wavelengths[-1]} nm")

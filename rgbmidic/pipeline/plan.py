@@ -20,6 +20,7 @@ from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import FrameError, RegionError
 from rgbmidic.frames import FrameSeries, Window, open_series, read_frame
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -129,6 +130,13 @@ class Plan:
             calibration = calibration.cropped(settings.frames.crop_origin, window.frame)
         separation = Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         images, separation = separation.reference(first, (series.read(index, window) for index in others), window)
+        names = ", ".join(map(series.name, settings.frames.reference))
+        if calibration is not None:
+            again = series.read(others[0], window) if others else None
+            here = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
+            for found in check_state(first, here, region.mask, names, accept=settings.accept, repeat=again):
+                if not found.certain:
+                    logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration_file, found.text)
         cracks = [np.subtract(path, window.origin) for path in settings.cracks]
         mesh = Tri3Mesh.from_region(region, settings.element_size, cracks)
         weights = prepare_weights(
@@ -150,7 +158,7 @@ class Plan:
         speckle = _speckle(images, region)
         if small := too_small(settings.element_size, speckle, HARDLY_ENOUGH):
             logger.warning("%s", small)
-        _check_seen(reference, first, region, ", ".join(map(series.name, settings.frames.reference)))
+        _check_seen(reference, first, region, names)
         return cls(
             settings=settings,
             series=series,

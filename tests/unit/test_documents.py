@@ -12,6 +12,7 @@ import pytest
 
 from rgbmidic import NodeStatus, Status, TestSettings, cli
 from rgbmidic.command import execute
+from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.demo import run_demo
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
@@ -141,6 +142,9 @@ def test_the_commands_of_a_page_run_on_the_demo_s_files_as_written(page, demo, m
     for program, *arguments in found:
         arguments = [part.replace("60,60,390,390", "60,60,260,260") for part in arguments]  # smaller files here
         assert execute(programs[program], arguments) == 0, (arguments, capsys.readouterr().err)
+    if page.parent.name == "calibration":
+        noise = Calibration.read("noise.json").camera_noise
+        assert (noise.linearity_error.value < 0.05).all()  # of a camera that is linear
 
 
 def test_the_python_of_the_readme_runs_on_the_demo_s_files_as_written(demo, monkeypatch):

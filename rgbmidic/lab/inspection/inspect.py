@@ -16,6 +16,7 @@ from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import ReflectionAwareDemosaicer
 from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
+from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.separate import DEFAULT_METHOD, reconstructed_lights, separate
@@ -52,6 +53,7 @@ def inspect_files(
     frame: FrameSettings | None = None,
     region: Sequence[float] | None = None,
     element_size: float | None = None,
+    accept: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Inspection:
     """Inspect one frame on disk, or the frames of one state of lights fired in succession.
@@ -68,6 +70,8 @@ def inspect_files(
         What the file does not tell (its `path` is not used); instead of the test's.
     region, element_size
         (x0, y0, x1, y1) and side of the elements in px; instead of the test's, else the whole frame and 25.
+    accept
+        As in `inspect_frame`; instead of the test's.
     progress
         As in `inspect_frame`.
 
@@ -95,6 +99,7 @@ def inspect_files(
             demosaic=test.illumination.demosaic if test else "auto",
             prefilter=test.solver.prefilter if test else "binomial",
             name=" + ".join(legible(path.name) for path in paths),
+            accept=accept if accept is not None else (test.accept if test else ()),
             progress=progress,
         )
     except InputError as error:
@@ -111,6 +116,7 @@ def inspect_frame(
     prefilter: str = "binomial",
     name: str = "frame",
     seed: int = 0,
+    accept: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Inspection:
     """What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect.
@@ -135,6 +141,8 @@ def inspect_frame(
         Of the frame, for reports.
     seed
         Of what is drawn for the prediction.
+    accept
+        Contradictions to the calibration that are accepted, by the names of the checks (`FrameCheck`).
     progress
         Called with the steps done, their number and what comes next.
 
@@ -142,6 +150,8 @@ def inspect_frame(
     ------
     InputError
         The frame is too small, saturated everywhere in the region, or of another kind than the calibration.
+    FrameError
+        The frame contradicts the calibration.
     CalibrationError
         The calibration varies over frames of another size.
     RegionError
@@ -153,6 +163,7 @@ def inspect_frame(
     if not isinstance(region, Region):
         region = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1) if region is None else region, shape)
     tell = progress or (lambda done, total, line: None)
+    contradictions = check_state(frames, known, region.mask, name, accept=accept)
     mesh, view = Tri3Mesh.from_region(region, element_size), View.around(region)
     region = view.region(region)
     linear = [linearise(view.frame(shot), known.noise) for shot in frames]
@@ -196,6 +207,7 @@ def inspect_frame(
         texture=separated.images.texture,
         noise=samples.noise,
         noise_known=known.noise is not None,
+        contradictions=contradictions,
         crosstalk_known=single or known.crosstalk is not None,
         element_size=element_size,
         nodes=mesh.nodes,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.illumination.frame_check import Mismatch
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
@@ -147,6 +148,8 @@ class Inspection:
         Camera noise, calibrated or estimated from the frame.
     noise_known, crosstalk_known : bool
         Whether the calibration tells them; a monochrome camera has no crosstalk to know.
+    contradictions : tuple of Mismatch
+        What of the frame contradicts the calibration: doubtful, or accepted.
     element_size : float
         px.
     nodes : ndarray, shape (N, 2), float64
@@ -176,6 +179,7 @@ class Inspection:
     noise: NoiseModel
     noise_known: bool
     crosstalk_known: bool
+    contradictions: tuple[Mismatch, ...]
     element_size: float
     nodes: FloatArray
     elements: npt.NDArray[np.int32]
@@ -210,6 +214,8 @@ def findings(inspection: Inspection) -> Iterator[Finding]:
 
 
 def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
+    for found in inspection.contradictions:
+        yield Finding(code=f"not calibrated: {found.check}", text=found.text)
     if inspection.greens > GREENS:
         yield Finding(
             code="pattern",

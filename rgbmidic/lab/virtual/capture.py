@@ -20,8 +20,9 @@ from rgbmidic.typing import FloatImage
 __all__ = ["check_frames", "dark_frames", "flat_frames", "single_light_frames", "target_scene"]
 
 Frame = Mosaic | ChannelFrame
-EXPOSURES = (0.06, 0.15, 0.3, 0.5, 0.8, 1.3)
-"""Share of the full scale that the brightest sample of a white card reaches; in the last it saturates."""
+EXPOSURES = tuple(0.13 * time for time in (0.5, 1, 2, 4, 6, 10))
+"""Share of the full scale that the brightest sample of a white card reaches, .13 per ms of the exposure times that
+calibration/README.md states; in the last it saturates."""
 _NO_LIGHT = Light(name="off", position=(0.0, 0.0, 0.0), power=0.0)
 
 

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from calibration_scene import MATRICES, captures, expose, speckle_target, white_target
+from tifffile import imread, imwrite
 
 from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
@@ -58,6 +59,7 @@ def test_crosstalk_writes_a_file_with_provenance(run, tmp_path):
     calibration = Calibration.read(out)
     assert calibration.crosstalk.matrix == pytest.approx(MATRIX, abs=2e-3)
     assert (calibration.cfa, calibration.black_level, calibration.white_level) == ("RGGB", 64, 4095)
+    assert abs(calibration.unevenness) < 0.01  # the captures use all grey levels
     origin = json.loads(out.read_text())["provenance"]["crosstalk"]
     assert len(origin["inputs"]) == 8
     assert {len(entry["sha256"]) for entry in origin["inputs"]} == {64}
@@ -223,3 +225,15 @@ def test_without_arguments_it_shows_its_help(run):
     code, shown, _ = run()
     assert code == 0
     assert "crosstalk" in shown
+
+
+def test_a_camera_s_own_gain_on_blue_is_stated(run, bench, tmp_path):
+    for source in sorted(bench.glob("light_*/*.tif")):
+        values = imread(source)
+        values[1::2, 1::2] = np.rint((values[1::2, 1::2] - 64.0) * 1.3 + 64)
+        (tmp_path / source.parent.name).mkdir(exist_ok=True)
+        imwrite(tmp_path / source.parent.name / source.name, values)
+    lights = [part.replace("=light", f"={tmp_path}/light") for part in LIGHTS]
+    code, _, error = run("crosstalk", "--dark", "dark/*.tif", *lights, *STATED, "--out", str(tmp_path / "own.json"))
+    assert code == 0, error
+    assert Calibration.read(tmp_path / "own.json").unevenness > 0.1

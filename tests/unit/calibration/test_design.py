@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
-from rgbmidic.illumination.spectra import Led, Sensitivities
+from rgbmidic.illumination.spectra import HALF_MAXIMUM, Led, Sensitivities
 from rgbmidic_calibration.design import MeasuredLamp, best_sets, design, draw_design, read_camera, read_lamp
 
 LEDS = {"red": Led(centre=630, width=18), "green": Led(centre=525, width=30), "blue": Led(centre=465, width=20)}
+OHNO = {name: Led(centre=lamp.centre, width=HALF_MAXIMUM * lamp.width) for name, lamp in LEDS.items()}
+"""Lamps whose parameter in Ohno's model, as colour-science takes it, is 18, 30 and 20 nm."""
 LOWEST, HIGHEST = 1.55, 3.55
 """Condition numbers of the nine shared cameras under LEDs of equal peak power, rows divided by the diagonal."""
 
@@ -98,10 +100,18 @@ def test_picture(tmp_path):
     assert (tmp_path / "d.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("width", [12.0, 20.0, 35.0])
+def test_width_of_an_led_is_its_full_width_at_half_maximum(width):
+    wavelengths = np.arange(380, 881, 0.01)
+    power = read_lamp(f"630:{width}").power(wavelengths)
+    above = wavelengths[power >= power.max() / 2]
+    assert np.ptp(above) == pytest.approx(width, abs=0.03)
+
+
 def rows_by_diagonal(camera):
     """Matrix for LEDs of equal peak power with every row divided by its diagonal."""
-    found = design(camera, LEDS)
-    peak = np.array([1 / lamp.power(camera.wavelengths).max() for lamp in LEDS.values()])
+    found = design(camera, OHNO)
+    peak = np.array([1 / lamp.power(camera.wavelengths).max() for lamp in OHNO.values()])
     response = found.response * peak
     return response / np.diag(response)[:, None]
 
@@ -118,11 +128,11 @@ def test_nine_real_cameras(shared_data):
 
 
 def test_nikon_5100_of_two_sources(shared_data):
-    expected = [[1, 0.27, 0.09], [0.04, 1, 0.24], [0, 0.39, 1]]
+    expected = [[1, 0.27, 0.09], [0.04, 1, 0.24], [0, 0.39, 1]]  # of lamps whose parameter is 18, 30, 20 nm
     from_json = read_camera(str(shared_data / "camera_sensitivities" / "nikon_d5100_380_780_5.json"))
     table = shared_data / "led_and_camera_spectra" / "colour_science_0.4.7_spectra.csv"
     from_csv = read_camera(f"{table}#Nikon 5100 (NPL)")
     for camera in (from_json, from_csv):
         assert rows_by_diagonal(camera) == pytest.approx(np.array(expected), abs=0.01)
-    measured = read_lamp(f"{table}#Ohno2005_red_630_18").power(from_csv.wavelengths)
-    assert measured == pytest.approx(LEDS["red"].power(from_csv.wavelengths), abs=1e-4)
+    model = read_lamp(f"{table}#Ohno2005_red_630_18").power(from_csv.wavelengths)  # 18 is the model's parameter
+    assert model == pytest.approx(OHNO["red"].power(from_csv.wavelengths), abs=1e-4)

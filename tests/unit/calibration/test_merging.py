@@ -42,7 +42,10 @@ def registration(lights=LIGHTS):
 def files(tmp_path):
     sections = {"crosstalk": crosstalk(), "camera_noise": camera_noise(), "registration": registration()}
     for name, section in sections.items():
-        Calibration(**{name: section}, **CAMERA, provenance={name: {"date": "today"}}).write(tmp_path / f"{name}.json")
+        uneven = {"crosstalk": 0.01, "camera_noise": 0.02}.get(name)
+        Calibration(**{name: section}, **CAMERA, unevenness=uneven, provenance={name: {"date": "today"}}).write(
+            tmp_path / f"{name}.json"
+        )
     return [tmp_path / f"{name}.json" for name in sections]
 
 
@@ -53,6 +56,7 @@ def test_merged_file_has_every_section(files, tmp_path):
     assert merged.crosstalk.field.coefficients.shape == (2, 3, 3)
     assert merged.camera_noise.defects == ((3, 4, "hot"),)
     assert merged.noise.gain == 4.0
+    assert merged.unevenness == 0.02
     assert merged.registration.parameters == pytest.approx(registration().parameters)
     assert set(merged.provenance) == {"crosstalk", "camera_noise", "registration"}
     assert (merged.cfa, merged.shape) == ("RGGB", (100, 120))

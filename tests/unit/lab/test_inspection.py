@@ -17,7 +17,7 @@ import rgbmidic
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.correlation import correlate
-from rgbmidic.errors import FrameError, InputError, RegionError
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
@@ -296,7 +296,12 @@ def test_without_calibration_the_channels_stand_for_the_lights():
 def test_a_wrong_pattern_is_told():
     lights = mat_lights().copy() * np.array([1.0, 0.6, 0.4], dtype=np.float32)[:, None, None]
     wrong = replace(raw(lights), cfa="GRBG")
-    assert "pattern" in codes(inspect_frame(wrong, calibration=CALIBRATION))
+    with pytest.raises(FrameError, match=r'greens of the pattern differ.*calibration.accept = \["greens"\]'):
+        inspect_frame(wrong, calibration=CALIBRATION)
+    told = codes(inspect_frame(wrong, calibration=CALIBRATION, accept=["greens"]))
+    assert told >= {"pattern", "not calibrated: greens"}
+    with pytest.raises(ConfigurationError, match="accept takes noise, levels, greens, lights, demosaiced, not green"):
+        inspect_frame(wrong, calibration=CALIBRATION, accept=["green"])
     assert "pattern" not in codes(inspect_frame(raw(lights), calibration=CALIBRATION))
 
 
@@ -318,8 +323,10 @@ def test_lights_in_succession_and_three_channels():
     seen = inspect_frame(frames)
     assert [one.name for one in seen.channels] == ["M1", "M2"]
     assert [light.name for light in seen.lights] == ["light 1", "light 2"]
-    lights = np.clip(np.rint(np.tensordot(A, glaring_lights(), axes=1)) + BLACK, 0, 4095).astype(np.uint16)
-    colour = ChannelFrame(values=lights, black_level=np.array(BLACK), white_level=4095)
+    channels = np.tensordot(A, glaring_lights(), axes=1)
+    channels = channels + np.random.default_rng(1).normal(size=channels.shape) * np.sqrt(NOISE.variance(channels))
+    values = np.clip(np.rint(channels) + BLACK, 0, 4095).astype(np.uint16)
+    colour = ChannelFrame(values=values, black_level=np.array(BLACK), white_level=4095)
     seen = inspect_frame(colour, calibration=CALIBRATION)
     assert (seen.kind, seen.texture) == ("rgb", None)
     assert seen.lights[1].reflecting > 0.9

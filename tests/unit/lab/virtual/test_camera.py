@@ -7,7 +7,7 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
-from rgbmidic.illumination.spectra import spectral_response
+from rgbmidic.illumination.spectra import HALF_MAXIMUM, spectral_response
 from rgbmidic.lab.virtual import Camera, Led, Light, Sensitivities, expose, paper_scene, record, render, sphere_scene
 from rgbmidic.lab.virtual.capture import dark_frames, single_light_frames
 
@@ -104,7 +104,7 @@ def test_camera_files_and_colour_science(shared_data):
     table = np.genfromtxt(
         shared_data / "led_and_camera_spectra/colour_science_0.4.7_spectra.csv", delimiter=",", skip_header=1
     )
-    blue = Led(centre=465, width=20).power(table[:, 0])
+    blue = Led(centre=465, width=HALF_MAXIMUM * 20).power(table[:, 0])
     assert np.allclose(blue / blue.max(), table[:, 7] / table[:, 7].max(), atol=1e-4)
     nikon = Sensitivities.from_colour("Nikon 5100 (NPL)")
     assert np.allclose(np.interp(table[:, 0], nikon.wavelengths, nikon.values[1]), table[:, 11], atol=2e-3)
