@@ -310,19 +310,21 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
     others' gradient is an instrument in the statistical sense: it knows the texture and nothing of that. The contrast
     is the regression on it, which makes the Hessian the light's sensitivity to a displacement.
 
-    A light whose gradient the others' do not predict (another pattern, or theirs are noise) keeps its own in the mean.
+    A light whose gradient the others' do not predict (another pattern, or theirs are noise) keeps its own in the mean,
+    as it does where a single other one is seen: that one may be the one that reflects.
     """
     if gradient.shape[1] == 1:
         return gradient
     used = np.asarray(weights > 0, dtype=np.float32)
     total, count = (gradient * used).sum(axis=1), used.sum(axis=0)
+    everyone = total / np.maximum(count, 1)
     out = np.empty_like(gradient)
     for light, seen in enumerate(used):
-        own = gradient[:, light]
-        mean = np.where(count > seen, total - own * seen, own) / np.maximum(count - seen, 1)
+        own, others = gradient[:, light], count - seen
+        mean = np.where(others > 1, (total - own * seen) / np.maximum(others, 1), everyone)
         contrast, correlation = _regression(own, mean, seen, pixels)
         if correlation < _SHARED:
-            mean = total / np.maximum(count, 1)
+            mean = everyone
             contrast, _ = _regression(own, mean, seen, pixels)
         out[:, light] = mean * contrast
     return out

@@ -90,6 +90,14 @@ def test_what_a_light_alone_shows_is_not_in_the_gradient_it_is_matched_with(prep
         assert np.corrcoef(beyond, slope_along_x(reference, one))[0, 1] > 0.7
 
 
+def test_of_two_lights_each_keeps_its_own_gradient_in_the_mean(prepared):
+    """The other may be the one that reflects: alone it would leave nothing to match with."""
+    a = speckle(1)
+    reference = prepared(a + white(1, 5), a + white(2, 150))
+    assert np.corrcoef(reference.gradient_x[0], slope_along_x(reference, a + white(1, 5)))[0, 1] > 0.6
+    assert np.corrcoef(reference.gradient_x[0], reference.gradient_x[1])[0, 1] > 0.99
+
+
 def test_lights_that_share_no_texture_keep_their_own(prepared):
     reference = prepared(*(speckle(seed) for seed in (1, 2, 3)))
     for light, image in enumerate(reference.images):
@@ -108,15 +116,18 @@ def test_where_one_light_alone_is_known_it_keeps_its_own_gradient(prepared):
 
 
 def test_the_uncertainty_holds_what_a_light_alone_still_pulls():
-    """A pattern that stands still in one of two lights while the texture moves by half a pixel."""
+    """A pattern that stands still in one of three lights while the texture moves by half a pixel."""
     a, still = speckle(1), 0.5 * (speckle(4) - 1000)
     moved = np.real(np.fft.ifft2(np.fft.fft2(a) * np.exp(-2j * np.pi * 0.5 * np.fft.fftfreq(SIDE))))
-    noise = [white(n, 10) for n in range(4)]
+    noise = [white(n, 10) for n in range(6)]
     clean, pulled = (
-        measured([a + noise[0] + more, a + noise[1]], [moved + noise[2] + more, moved + noise[3]])
+        measured(
+            [a + noise[0] + more, a + noise[1], a + noise[2]],
+            [moved + noise[3] + more, moved + noise[4], moved + noise[5]],
+        )
         for more in (0 * still, still)
     )
     assert np.abs((pulled.displacement - (0.5, 0)) / pulled.displacement_std).max() < 4
     usual, stated = (np.median(one.displacement_std, axis=0) for one in (clean, pulled))
-    assert stated[0] > 2 * usual[0]
-    assert stated[0] > 1.5 * stated[1]
+    assert stated[0] > 1.5 * usual[0]
+    assert stated[0] > 1.3 * stated[1]

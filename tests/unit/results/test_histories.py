@@ -183,7 +183,7 @@ def test_channels_are_brought_to_the_frames_and_make_a_stress(result: Result, tm
     labels = [axis.get_ylabel() for axis in figure.axes]
     assert labels == ["extension (mm)", "strain", "force_kN", "room", "stress (MPa)", "stress (MPa)"]
     assert figure.axes[-1].get_xlabel() == "gauge_1_strain"
-    assert figure.axes[0].get_xlabel() == "time (s)"
+    assert figure.axes[0].get_xlabel() == "time (ms)"
 
 
 @pytest.mark.parametrize(
