@@ -27,8 +27,8 @@ _WIDE = 400
 """Columns that a table may take: where the terminal has fewer it breaks the lines, and nothing is cut off."""
 _CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
 _TOO_MANY = 0.5
-"""Fraction of the deformed frames beyond which failed ones make a run a failure: a specimen that breaks or leaves the
-picture halfway through is an ordinary test, a run that measures the smaller part of its frames is not."""
+"""Fraction of the deformed frames beyond which those that failed or did not converge make a run a failure: a specimen
+that breaks or leaves the picture halfway through is an ordinary test, a run that measures few of its frames is not."""
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 _messages = Console(stderr=True)
@@ -148,7 +148,7 @@ def finish(
 
 def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
     """Draw a finished result, in as many processes as cores if none are asked for, and tell what became of its frames;
-    a failure where more than `_TOO_MANY` of them failed."""
+    a failure where more than `_TOO_MANY` of them failed or did not converge."""
     from rgbmidic._kernels.threads import threads
     from rgbmidic.report import remove_figures, remove_report, write_figures
 
@@ -157,12 +157,12 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
     if draw:
         write_figures(result, result.path / "figures", processes=processes or threads())
     _print_summary(result, time.perf_counter() - started)
-    failed = [index for index in result.deformed if result.status[index] == _FAILED]
+    failed = [index for index in result.deformed if result.status[index] != _CONVERGED]
     if unread := int(result.unread.sum()):
         _messages.print(f"note: frames that could not be read: {unread}; --resume tries them again", soft_wrap=True)
     if len(failed) > _TOO_MANY * len(result.deformed) or not result.deformed:
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
-        count = f"{len(failed)} of {len(result.deformed)} deformed frames failed"
+        count = f"{len(failed)} of {len(result.deformed)} deformed frames failed or did not converge"
         raise typer.Exit(command.fail(f"{count}; {first}", command.FAILURE))
 
 

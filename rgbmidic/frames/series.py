@@ -9,7 +9,8 @@ import math
 import os
 import re
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
@@ -136,17 +137,20 @@ class FrameSeries:
             legible(source.path): file_fingerprint(source.path) if in_part else source.fingerprint for source in sources
         }
 
-    def fingerprint(self) -> str:
-        """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order; a file that
-        cannot be read, which fails its own frame only, counts with its name."""
-        digest = hashlib.sha256()
+    def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
+        """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order, and the names
+        of those that count with their name alone: those that cannot be read, which fail their own frames only, and
+        those named as `unread` when the fingerprint was made that this one is compared with."""
+        digest, without = hashlib.sha256(), []
         for source in (source for sources in self.lights for source in sources):
-            try:
-                content = file_fingerprint(source.path)
-            except FrameError:
-                content = "missing"
-            digest.update(f"{legible(source.path.name)}\0{content}\n".encode())
-        return digest.hexdigest()
+            name, content = legible(source.path.name), "unread"
+            if name not in unread:
+                with suppress(FrameError):
+                    content = file_fingerprint(source.path)
+            if content == "unread":
+                without.append(name)
+            digest.update(f"{name}\0{content}\n".encode())
+        return digest.hexdigest(), tuple(without)
 
     def _locate(self, index: int) -> Iterator[tuple[FrameSource, int]]:
         """Source, and frame in it, of every light of a state."""

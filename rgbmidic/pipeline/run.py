@@ -18,7 +18,7 @@ from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.schedule import Schedule
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import Origin, Result, ResultStore
-from rgbmidic.results.provenance import read_provenance
+from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.store import listed
 from rgbmidic.settings import TestSettings
 
@@ -171,13 +171,15 @@ def _places(chosen: range, frames: range | None) -> range:
 def _store(plan: Plan, out: Path, part: range | None, *, overwrite: bool, resume: bool) -> ResultStore:
     series = plan.series
     recording = series.recording
+    begun = (resume or part is not None) and (out / PROVENANCE).exists()
+    fingerprint, unread = series.fingerprint(read_provenance(out).get("unread_files", ()) if begun else ())
     origin = Origin(
         nodes=plan.reference.mesh.nodes + plan.window.origin,
         elements=plan.reference.mesh.elements,
         names=[series.name(index) for index in series.chosen],
         lights=plan.images.names,
         settings=plan.settings,
-        inputs={" + ".join(plan.settings.frames.path): series.fingerprint()},
+        inputs={" + ".join(plan.settings.frames.path): fingerprint},
         references=[place for place, index in enumerate(series.chosen) if index in plan.settings.frames.reference],
         reference=plan.images.values,
         notes={
@@ -185,6 +187,7 @@ def _store(plan: Plan, out: Path, part: range | None, *, overwrite: bool, resume
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
             "lost_frames": series.lost,
+            "unread_files": list(unread),
             "frame_shape": list(plan.window.frame),
             "reference_origin": list(plan.window.origin),
         },

@@ -292,6 +292,29 @@ def test_frames_that_were_away_for_a_moment_are_measured_when_they_are_back(
         np.testing.assert_equal({**again.frame(index).values, "inputs": None, "reason": None}, expected)
 
 
+def test_a_file_that_could_not_be_read_from_the_start_is_measured_when_it_can_be(
+    movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out = copied(movie, tmp_path), tmp_path / "result"
+    opened = Path.open
+
+    def refused(self: Path, *arguments: Any, **named: Any) -> Any:
+        if self.name == "f003.tif":
+            raise PermissionError(13, "Permission denied")
+        return opened(self, *arguments, **named)
+
+    with monkeypatch.context() as away:
+        away.setattr(Path, "open", refused)
+        before = measure(settings(folder, last=6), out)
+    assert np.flatnonzero(before.unread).tolist() == [3]
+    after = measure(settings(folder, last=6), out, resume=True)
+    assert not after.unread.any()
+    np.testing.assert_array_equal(after.u, whole.u[:7])
+    (folder / "f005.tif").write_bytes((folder / "f004.tif").read_bytes())
+    with pytest.raises(ResultError, match=r"the input .* was"):
+        measure(settings(folder, last=6), out, resume=True)
+
+
 @pytest.mark.parametrize("kind", ["folder", "movie"])
 def test_a_source_that_vanishes_stops_the_run_and_fails_no_frame(
     movie: Path, whole: Result, tmp_path: Path, kind: str
