@@ -282,7 +282,9 @@ def history(
     measure: Annotated[
         str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")
     ] = None,
-    window: Annotated[int | None, typer.Option("--window", help="Frames for rates, 4 or more; 0: no rates.")] = None,
+    window: Annotated[
+        int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more; 0: no rates.")
+    ] = None,
     rigid: Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")] = None,
     channels: Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then a column each.")] = None,
     offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,

@@ -329,7 +329,7 @@ class ProbeSettings:
     measure
         Strain measure of the strain gauges.
     window
-        Frames that velocities, accelerations and strain rates are taken over; 0: none are.
+        Frames that a parabola takes in for velocities, accelerations and strain rates; 0: none are taken.
     rigid_motion
         ``"tell"``: shift and rotation of the measured field as a whole are told beside the probes; ``"remove"``: they
         are also taken off the displacements.

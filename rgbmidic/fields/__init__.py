@@ -8,7 +8,7 @@ from rgbmidic.fields.high_pass import SIGMA, high_pass
 from rgbmidic.fields.history import History, Nodal, Probe
 from rgbmidic.fields.locate import Places
 from rgbmidic.fields.means import Mean
-from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
+from rgbmidic.fields.measures import EQUIVALENT, MEASURES, Strain, strain_of_gradient
 from rgbmidic.fields.probes import PROBES, make_probe
 from rgbmidic.fields.rates import Rates, rates
 from rgbmidic.fields.rigid import RigidMotion
@@ -16,6 +16,7 @@ from rgbmidic.fields.strain import StrainGauges, shortest_gauge, strain_of
 from rgbmidic.fields.units import Units, column
 
 __all__ = [
+    "EQUIVALENT",
     "MEASURES",
     "PROBES",
     "SIGMA",

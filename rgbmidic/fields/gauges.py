@@ -94,7 +94,7 @@ class Gauge:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StrainGauge:
-    """A virtual strain gauge: strain, principal strains with their direction, equivalent.
+    """A virtual strain gauge: strain, principal strains with their direction, equivalent of the Hencky strain.
 
     Attributes
     ----------

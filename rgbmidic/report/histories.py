@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["history_figure"]
 
 _MARKERS = 60
-"""Frames up to which each gets a marker."""
+"""Known values up to which each gets a marker."""
 _PANEL = 2.4
 """Height of a panel in inches, its numbers included."""
 _KINDS = ("velocity", "acceleration", "strain_rate", "rate", "strain", "extension", "direction", "stress")
@@ -56,14 +56,15 @@ def _kind(told: Told) -> str:
     """What stands on the axis: quantities of one kind and unit share a panel, other channels have one each."""
     if told.std is None and told.name != "stress":
         return told.name
-    kind = next((kind for kind in _KINDS if told.name.endswith(f"_{kind}") or told.name == kind), "")
+    name = told.name.removesuffix("_before").removesuffix("_after")
+    kind = next((kind for kind in _KINDS if name.endswith(f"_{kind}") or name == kind), "")
     if kind:
         return kind.replace("_", " ")
     return {"deg": "rotation", "": "strain"}.get(told.unit, "displacement")
 
 
 def _line(axis: Axes, over: FloatArray, told: Told) -> None:
-    marker = "o" if len(over) <= _MARKERS else None
+    marker = "o" if np.isfinite(told.values).sum() <= _MARKERS else None
     (line,) = axis.plot(over, told.values, marker=marker, markersize=2.5, linewidth=1, label=literal(told.name))
     if told.std is not None:
         low, high = told.values - 2 * told.std, told.values + 2 * told.std

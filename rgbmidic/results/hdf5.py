@@ -180,7 +180,7 @@ def _declare(out: h5py.File, told: Physical, entry: Quantity) -> None:
         words = " ".join(code.replace(" ", "_") for code in entry.codes)
         dataset.attrs.update({"flag_values": np.arange(len(entry.codes), dtype=entry.dtype), "flag_meanings": words})
     if told.is_strain(entry.name):
-        dataset.attrs["measure"] = told.measure
+        dataset.attrs["measure"] = "hencky" if entry.name.startswith("equivalent") else told.measure
         gauge = "element" if "element" in axes else f"{told.gauges.length * told.length:.6g} {told.units.length}"
         dataset.attrs["gauge"] = gauge
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from rgbmidic.fields import MEASURES, NodalCovariance, Strain, StrainGauges, Units, strain_of_gradient
+from rgbmidic.fields import EQUIVALENT, MEASURES, NodalCovariance, Strain, StrainGauges, Units, strain_of_gradient
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.measures import frame_times, scale_of, units_of
 from rgbmidic.results.quantities import QUANTITIES, Quantity
@@ -33,8 +33,8 @@ _STRAIN = (
     Quantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane"),
     Quantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane"),
     Quantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y"),
-    Quantity("equivalent", _NODE, "", "equivalent", "von Mises equivalent strain at constant volume"),
-    Quantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of the equivalent strain"),
+    Quantity("equivalent", _NODE, "", "equivalent", EQUIVALENT),
+    Quantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of equivalent"),
 )
 _ELEMENT_STRAIN = tuple(
     replace(entry, name=f"{entry.name}_element", axes=_ELEMENT, meaning=f"{entry.meaning}, constant in an element")

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import History, Nodal, NodalCovariance, Probe, RigidMotion, Units, make_probe, rates
+from rgbmidic.fields import EQUIVALENT, History, Nodal, NodalCovariance, Probe, RigidMotion, Units, make_probe, rates
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.histories import Histories, Told
@@ -163,7 +163,7 @@ def _checked(probe: Probe, nodal: Nodal, result: Result) -> list[History]:
 def _told(
     history: History, units: Units, clock: FloatArray, window: int, share: float, references: npt.NDArray[np.bool_]
 ) -> Iterator[Told]:
-    """A history in the units of the reader, and its rates over a window of frames."""
+    """A history in the units of the reader, and its rates over a window of frames, at kinks those of both sides."""
     length = history.unit == "px"
     unit = units.length if length else history.unit
     yield _in_units(history.name, unit, history.values, history.std, units if length else None)
@@ -171,11 +171,13 @@ def _told(
         return
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
     found = rates(clock, history.values, history.std, window=span, share=share, references=references)
-    parts = {"rate" if not length else "velocity": (found.velocity, found.velocity_std, 1)}
-    if length:
-        parts["acceleration"] = (found.acceleration, found.acceleration_std, 2)
-    for name, (values, std, power) in parts.items():
-        yield _in_units(f"{history.name}_{name}", units.per_time(unit, power), values, std, units if length else None)
+    for power, name in enumerate(("velocity", "acceleration") if length else ("velocity",), start=1):
+        for side in ("", "_before", "_after"):
+            values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")
+            if side and not np.isfinite(values).any():
+                continue  # no kink
+            told = f"{history.name}_{name if length else 'rate'}{side}"
+            yield _in_units(told, units.per_time(unit, power), values, std, units if length else None)
 
 
 def _in_units(name: str, unit: str, values: FloatArray, std: FloatArray, lengths: Units | None) -> Told:
@@ -225,6 +227,8 @@ def _remarks(
             f"{np.nanmax(speed) * exposed:.3g} px, by more than {_BLURRED:g} px in {int(blurred.sum())} frames from "
             f"frame {frames[blurred][0]} on"
         )
+    if any(history.name.endswith("_equivalent") for part in read.values() for history in part):
+        yield f"equivalent: {EQUIVALENT}"
     for name, missing in _gaps({name: part[0].values for name, part in read.items()}).items():
         yield f"{name} is not measured in {missing} of {len(frames)} frames"
     for name, missing in _gaps({told.name: told.values for told in beside}).items():

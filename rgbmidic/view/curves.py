@@ -41,6 +41,8 @@ def groups(histories: Histories) -> dict[str, list[Told]]:
     """What can be shown together: the same quantity of all probes, by its name and unit."""
     found: dict[str, list[Told]] = {}
     for told in histories.quantities:
+        if told.name.endswith(("_before", "_after")):  # single frames, no curve
+            continue
         kind = next(kind for kind in sorted(KINDS, key=len, reverse=True) if told.name.startswith(f"{kind}_"))
         name = told.name.removeprefix(f"{kind}_").partition("_")[2]
         found.setdefault(f"{name} ({told.unit})" if told.unit else name, []).append(told)

@@ -57,12 +57,21 @@ def test_a_rotation_of_30_degrees_is_no_strain_but_a_small_one_of_13_percent():
     np.testing.assert_allclose(small.components, [[np.cos(np.pi / 6) - 1] * 2 + [0]] * NODES, atol=1e-12)
 
 
-def test_the_equivalent_of_a_tensile_test_is_its_strain():
-    e = 0.07
-    gradient = np.diag([np.exp(-e / 2), np.exp(e)]) - np.eye(2)
-    strain = strain_of_gradient(gradient, np.zeros((4, 4)), "hencky")
-    assert strain.equivalent == pytest.approx(e)
-    assert abs(strain.direction_deg) == pytest.approx(90)
+@pytest.mark.parametrize("measure", MEASURES)
+@pytest.mark.parametrize("stretch", [1.02, 1.5])
+def test_the_equivalent_of_a_tensile_test_at_constant_volume_is_the_logarithm_of_the_stretch(measure, stretch):
+    """Green-Lagrange strain in its place gives .647 at a stretch of 1.5, which is neither ln 1.5 nor its own .625."""
+    for angle in (0, 30):
+        gradient = turn(angle) @ np.diag([stretch**-0.5, stretch]) - np.eye(2)
+        strain = strain_of_gradient(gradient, np.zeros((4, 4)), measure)
+        assert strain.equivalent == pytest.approx(np.log(stretch))
+
+
+def test_the_equivalent_of_simple_shear_is_von_mises_s():
+    gradient = np.array([[0, 0.8], [0, 0]])
+    stretch = 0.4 + np.sqrt(0.4**2 + 1)
+    found = strain_of_gradient(gradient, np.zeros((4, 4)))
+    assert found.equivalent == pytest.approx(2 / np.sqrt(3) * np.log(stretch))
 
 
 @pytest.mark.parametrize("measure", MEASURES)

@@ -11,8 +11,8 @@ from nodal_tests import COVARIANCE, MESH, NodalTest
 from rgbmidic.fields import MEASURES, Nodal, StrainGauges, make_probe, rates, reference_share
 from rgbmidic.typing import FloatArray
 
-RIGHT = (0.9, 1.1)
-"""rms(error / stated), the range that was asked for."""
+RIGHT, RATES = (0.9, 1.1), (0.7, 1.2)
+"""rms(error / stated), the ranges that were asked for."""
 SHARE = reference_share(1)
 
 
@@ -54,13 +54,22 @@ def ratios(
 
 
 def nodal_errors(test: NodalTest, window: float, measured: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """Displacement, velocity and acceleration at the nodes; the truth of the rates: the same without noise."""
+    """Displacement, velocity and acceleration at the nodes."""
     std = np.repeat(test.std[..., None], 2, axis=2)
-    options = {"window": window, "share": SHARE, "references": test.references}
-    found, true = (rates(test.times, field, std, **options) for field in (measured, test.truth))
+    found = rates(test.times, measured, std, window=window, share=SHARE, references=test.references)
+    velocity, acceleration = true_rates(test)
     yield "displacement", (measured - test.truth)[1:] / std[1:]
-    yield "velocity", (found.velocity - true.velocity) / found.velocity_std
-    yield "acceleration", (found.acceleration - true.acceleration) / found.acceleration_std
+    yield "velocity", (found.velocity - velocity) / found.velocity_std
+    yield "acceleration", (found.acceleration - acceleration) / found.acceleration_std
+
+
+def true_rates(test: NodalTest) -> tuple[FloatArray, FloatArray]:
+    """Velocity and acceleration of the motion at the nodes."""
+    step = 1e-6
+    before, now, after = (
+        np.stack([test.motion(MESH.nodes, time + shift) for time in test.times]) for shift in (-step, 0, step)
+    )
+    return (after - before) / (2 * step), (after - 2 * now + before) / step**2
 
 
 def strain_errors(test: NodalTest, window: float, measured: FloatArray) -> Iterator[tuple[str, FloatArray]]:
@@ -83,7 +92,9 @@ def strain_errors(test: NodalTest, window: float, measured: FloatArray) -> Itera
 @pytest.mark.parametrize(("errors", "draws"), [(nodal_errors, 8), (strain_errors, 20)])
 def test_every_quantity_is_as_far_off_as_it_says(name, errors, draws):
     found = ratios(name, errors, draws)
-    assert all(RIGHT[0] <= ratio <= RIGHT[1] for ratio in found.values()), found
+    for key, ratio in found.items():
+        low, high = RIGHT if key in ("displacement", "strain") else RATES
+        assert low <= ratio <= high, found
 
 
 @pytest.mark.parametrize("name", TESTS)
@@ -92,11 +103,7 @@ def test_rates_without_noise_are_those_of_the_motion(name):
     test, window = TESTS[name]
     std = np.repeat(test.std[..., None], 2, axis=2)
     found = rates(test.times, test.truth, std, window=window, share=SHARE, references=test.references)
-    step = 1e-6
-    before, now, after = (
-        np.stack([test.motion(MESH.nodes, time + shift) for time in test.times]) for shift in (-step, 0, step)
-    )
-    velocity, acceleration = (after - before) / (2 * step), (after - 2 * now + before) / step**2
+    velocity, acceleration = true_rates(test)
     inner = (test.times > test.times[0] + window / 2) & (test.times < test.times[-1] - window / 2)
     assert np.abs(found.velocity - velocity)[inner].max() < np.median(found.velocity_std)
     assert np.abs(found.acceleration - acceleration)[inner].max() < np.median(found.acceleration_std)

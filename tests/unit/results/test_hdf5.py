@@ -84,6 +84,7 @@ def test_strain_is_finite_and_blank_beside_what_is_not_measured(file: h5py.File)
         assert file[name].attrs["measure"] == "green-lagrange"
         assert file[name].attrs["gauge"].endswith(" mm")
     assert np.nanmax(np.abs(file["exx"][0])) < 1e-12
+    assert {file[name].attrs["measure"] for name in ("equivalent", "equivalent_std")} == {"hencky"}
 
 
 def test_the_virtual_fields_method_has_strain_place_and_area_of_every_element(file: h5py.File) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,19 @@ def stretch(number: int) -> np.ndarray:
     return np.stack([0.01 * share * (MESH.nodes[:, 0] - 10) + 2 * number, np.zeros(NODES)])
 
 
-def make(path: Path, *, timed: bool = True, scale: ScaleSettings | None = None, **notes: Any) -> Result:
+def struck(number: int) -> np.ndarray:
+    """u and v (2, N): at rest up to the frame number 5, then 3 px a frame along x."""
+    return np.stack([np.full(NODES, 3.0 * max(number - 5, 0)), np.zeros(NODES)])
+
+
+def make(
+    path: Path,
+    *,
+    timed: bool = True,
+    scale: ScaleSettings | None = None,
+    motion: Callable[[int], np.ndarray] = stretch,
+    **notes: Any,
+) -> Result:
     settings = TestSettings(
         frames=FrameSettings(path=("f*.tif",), kind="monochrome"),
         region=RegionSettings(rectangle=(10, 5, 110, 75)),
@@ -52,7 +65,7 @@ def make(path: Path, *, timed: bool = True, scale: ScaleSettings | None = None, 
     origin = replace(make_origin(len(NUMBERS), settings=settings, notes=notes), lights=("light",))
     with ResultStore.create(path, origin) as store:
         for index, number in enumerate(NUMBERS):
-            u, v = stretch(number)
+            u, v = motion(number)
             std = np.full(NODES, 0.01 if index else 0.0)
             if index == 5:
                 u[LOST_NODE] = v[LOST_NODE] = std[LOST_NODE] = np.nan
@@ -103,6 +116,28 @@ def test_rates_know_the_times_of_the_frames_that_are_there(result: Result) -> No
     np.testing.assert_allclose(
         rate.values[2:-2], 0.02 * (70 / gauge) ** 2 * np.array(NUMBERS)[2:-2] / 10 * RATE / 10, rtol=0.01
     )
+
+
+def test_a_kink_is_told_with_the_rates_of_both_sides_and_only_there(tmp_path: Path) -> None:
+    found = read(make(tmp_path / "a", scale=SCALE, motion=struck), points=((30.0, 30.0),), window=5)
+    before, after = found["point_1_u_velocity_before_mm_per_s"], found["point_1_u_velocity_after_mm_per_s"]
+    place = NUMBERS.index(5)
+    assert [np.flatnonzero(np.isfinite(side.values)).tolist() for side in (before, after)] == [[place]] * 2
+    assert abs(before.values[place]) < 2 * before.std[place] < 3 * 0.05 * RATE / 2
+    assert abs(after.values[place] - 3 * 0.05 * RATE) < 2 * after.std[place] < 3 * 0.05 * RATE / 2
+    velocity = found["point_1_u_velocity"]
+    assert np.abs(velocity.values[:place]).max() < 10
+    assert velocity.std[place] > 0.4 * 3 * 0.05 * RATE  # it reaches to both sides
+    figure = history_figure(found)
+    assert "velocity (mm/s)" in [axis.get_ylabel() for axis in figure.axes]
+    with pytest.raises(KeyError):
+        read(make(tmp_path / "b"), points=((30.0, 30.0),), window=5)["point_1_u_velocity_after"]
+
+
+def test_the_equivalent_strain_is_said_to_be_hencky_s(result: Result) -> None:
+    said = "equivalent: von Mises equivalent of the Hencky strain, for a material of constant volume"
+    assert said in read(result, strain_gauges=((60, 40, 60),)).remarks
+    assert said not in read(result, points=(PLACE,)).remarks
 
 
 def test_the_table_has_one_header_line_and_one_row_a_frame(result: Result, tmp_path: Path) -> None:
