@@ -305,6 +305,7 @@ BUILT: dict[str, Any] = {
 BUILT["test"] = TestSettings(
     **{name: built for name, built in BUILT.items() if " " not in name},
     calibration_file=Path("calibration.json"),
+    accept=("noise", "greens"),
     element_size=20,
     cracks=(SQUARE,),
     base=Path("/data"),
