@@ -34,13 +34,11 @@ from scipy.ndimage import map_coordinates
 from rgbmidic._kernels.threads import threads
 from rgbmidic.correlation import correlate
 from rgbmidic.fields import at_pixels
-from rgbmidic.illumination.align import align
-from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
-from rgbmidic.illumination.normalise import normalise
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.illumination.separate import DEMOSAICERS, separate
-from rgbmidic.illumination.unmix import unmix
+from rgbmidic.illumination.unmix import align, unmix
 from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.camera import PIXEL

@@ -35,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.track import Start, track
+from rgbmidic.correlation.start import Start, track
 from rgbmidic.frames import Mosaic, cfa_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.linearise import NoiseModel

@@ -112,7 +112,7 @@ def write_raw_test(folder: Path, f: FloatArray, g: FloatArray) -> None:
     """Two raw Bayer frames of the pair under three lights, with calibration and TEST.toml."""
     from rgbmidic import Calibration
     from rgbmidic.frames.data import Mosaic
-    from rgbmidic.frames.writers import write_dng
+    from rgbmidic.frames.images import write_dng
     from rgbmidic.lab.virtual import plate_scene, record
 
     scene = plate_scene(size=len(f))

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients
+from rgbmidic._kernels.lights import unmix
 from rgbmidic._kernels.threads import set_threads
-from rgbmidic._kernels.unmix import unmix
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import FloatArray
@@ -76,7 +76,7 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     matrix, needed = np.eye(3, dtype=np.float32) + np.float32(0.1), np.eye(3, dtype=bool)
     return [
         ("right-hand side", owned, 20, lambda: reference.right_side(deformed, 0, values, weights, motion)),
-        ("comparison", owned, 20, lambda: reference.bring_back(deformed, 0, *compared)),
+        ("comparison", owned, 20, lambda: reference.warp(deformed, 0, *compared)),
         ("Hessian", owned, 20, lambda: reference.hessian_blocks(0, weights)),
         ("spline coefficients", count, 16, lambda: bspline_coefficients(image[0], coefficients)),
         ("unmixing, 3 lights", count, 30, lambda: unmix(channels, known, matrix, needed, lights, lit)),

@@ -29,7 +29,7 @@ def record_of(nodes: int, lights: int, side: int) -> FrameRecord:
     """A record of noise, with pictures of a weight that is 1 nearly everywhere."""
     random = np.random.default_rng(0)
     fields = {name: random.normal(size=nodes) for name, entry in QUANTITIES.items() if entry.axes == ("node",)}
-    fields |= {"node_status": np.zeros(nodes), "light_share": random.random((nodes, lights))}
+    fields |= {"node_status": np.zeros(nodes), "light_fraction": random.random((nodes, lights))}
     picture = np.full((lights, side, side), 255, np.uint8)
     picture[:, : side // 4, : side // 4] = random.integers(0, 256, (lights, side // 4, side // 4))
     pictures = {"weights_thumbnail": picture, "reflection_thumbnail": picture}

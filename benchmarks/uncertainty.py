@@ -49,7 +49,7 @@ from rgbmidic.fields import (
     field_rms,
     high_pass,
     make_probe,
-    reference_share,
+    reference_fraction,
 )
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.measures import area_stds
@@ -483,7 +483,7 @@ def probes(quick: bool) -> None:
         read = [probe.histories(Nodal(**dict(zip(NODAL, draw[..., probe.nodes], strict=True)))) for draw in fields]
         for histories in zip(*read, strict=True):
             error, std = (np.stack([getattr(one, name) for one in histories]) for name in ("values", "std"))
-            change = (error[:, 1] - error[:, 0]) / difference_std(std[:, 0], std[:, 1], reference_share(1))
+            change = (error[:, 1] - error[:, 0]) / difference_std(std[:, 0], std[:, 1], reference_fraction(1))
             name = histories[0].name.removeprefix(f"{kind}_{number}_")
             if histories[0].unit == "deg" or name in ("e1", "e2", "equivalent"):  # mean nothing without strain
                 continue

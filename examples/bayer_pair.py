@@ -12,7 +12,7 @@ import numpy as np
 from rgbmidic import Calibration, measure, read_test
 from rgbmidic.fields import at_nodes
 from rgbmidic.frames.data import Mosaic
-from rgbmidic.frames.writers import write_dng
+from rgbmidic.frames.images import write_dng
 from rgbmidic.lab.virtual import State, plate_scene, record, render, strained_plate, truth
 
 SETTINGS = """

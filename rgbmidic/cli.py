@@ -301,7 +301,7 @@ def history(
     from rgbmidic.report import history_figure, save_figure
     from rgbmidic.results import Channels, Result, history_rows, probes_of, write_histories
     from rgbmidic.results.files import check_file
-    from rgbmidic.results.probing import read_histories
+    from rgbmidic.results.histories import read_histories
     from rgbmidic.settings import read_test
 
     picture = out.with_suffix(".png")
@@ -414,11 +414,11 @@ def plan(
     overwrite: Overwrite = False,
 ) -> None:
     """Where each lamp will reflect, what uncertainty to expect, and where the lamps would stand better."""
-    from rgbmidic.lab.output import check_folder
+    from rgbmidic.lab.demo import check_folder
     from rgbmidic.lab.planning import report as planning
     from rgbmidic.lab.planning.lamps import propose_colours, propose_lamps
     from rgbmidic.lab.planning.plan import make_plan
-    from rgbmidic.scene.scenefile import read_scene
+    from rgbmidic.scene.scene import read_scene
 
     check_folder(out, planning.FILES, overwrite=overwrite)
     made = make_plan(read_scene(scene))
@@ -485,8 +485,8 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
+    from rgbmidic.lab.demo import check_folder
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
-    from rgbmidic.lab.output import check_folder
     from rgbmidic.settings import read_test
 
     if out is not None:
@@ -577,8 +577,8 @@ def _tell_first_run() -> None:
 
 
 def _progress(what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:
-    """A bar on stderr for people who watch, see `rgbmidic.progress`."""
-    from rgbmidic.progress import progress_bar
+    """A bar on stderr for people who watch, see `rgbmidic.timing`."""
+    from rgbmidic.timing import progress_bar
 
     return progress_bar(what, _messages)
 
@@ -595,7 +595,7 @@ def _print_summary(result: Result, seconds: float) -> None:
     if (count := len(result.setting("frames", "reference", [0]))) > 1:
         gain = ((1 + 1 / count) / 2) ** 0.5
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
-    for light, share in zip(result.lights, result.mean_share[deformed].T, strict=True):
+    for light, share in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
         known = share[share == share]
         rows[light] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
     if measured and (stages := _stages(result, deformed)):

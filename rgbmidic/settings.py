@@ -86,10 +86,10 @@ class FrameSettings:
     lights
         Number of lights that fire in turn before a monochrome camera which records one series: frame i shows light
         i mod `lights`, and so many frames make one state, which is what the other keys count.
-    renew
+    update_reference
         Whether a later frame becomes the reference where the match with the one before no longer serves, for paint that
-        changes. Uncertainties add up (`rgbmidic.correlation.renewal`), and a node that is lost in such a frame is lost
-        for good.
+        changes. Uncertainties add up (`rgbmidic.correlation.reference_update`), and a node that is lost in such a frame
+        is lost for good.
     shape, dtype
         Rows and columns, and sample type, of headerless files.
     crop_origin
@@ -107,7 +107,7 @@ class FrameSettings:
     last: int | None = _bounded(None, at_least=0)
     step: int = _bounded(1, at_least=1)
     lights: int = _bounded(1, at_least=1)
-    renew: bool = False
+    update_reference: bool = False
     shape: tuple[int, int] | None = _bounded(None, at_least=1)
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
     crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)

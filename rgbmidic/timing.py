@@ -1,14 +1,20 @@
-"""Where the time of a frame goes: seconds in every stage, what a stage calls of other stages not counted with it."""
+"""Where the time of a frame goes: seconds in every stage, what a stage calls of other stages not counted with it.
+
+The bar that shows how far a long command has come.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
 
-__all__ = ["STAGES", "each", "stage", "timed"]
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+
+__all__ = ["STAGES", "each", "progress_bar", "stage", "timed"]
 
 T = TypeVar("T")
 
@@ -76,3 +82,23 @@ def each(name: str, items: Iterable[T]) -> Iterator[T]:
 
 
 _END = object()
+
+
+@contextmanager
+def progress_bar(what: str, console: Console) -> Iterator[Callable[[int, int, str], None]]:
+    """A bar, and the function that moves it: frames done, their total, a line about the last one.
+
+    Nothing is shown where nobody watches: an error stays one line, a log file stays short.
+    """
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
+    last = TextColumn("{task.fields[line]}", markup=False)
+    with Progress(*columns, last, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=None, line="")
+        yield lambda done, total, line: bar.update(task, completed=done, total=total, line=line)
+
+
+class _Rate(ProgressColumn):
+    """Frames per second."""
+
+    def render(self, task: Task) -> str:
+        return f"{task.speed:.3g}/s" if task.speed else ""

@@ -11,7 +11,7 @@ import tifffile
 from hypothesis import strategies as st
 
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
-from rgbmidic.frames.writers import _cfa_tags, _colour_tags
+from rgbmidic.frames.images import _cfa_tags, _colour_tags
 
 __all__ = ["channel_frames", "colour_mosaic", "mosaics", "noisy_mosaic", "write_cropped_dng", "write_monochrome_dng"]
 

@@ -24,7 +24,11 @@ def smooth_record(index: int) -> FrameRecord:
     x, y = MESH.nodes.T
     u, v = 0.002 * index * (x - 60), 0.001 * index * (y - 40)
     both = {"u": u, "v": v, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.02)}
-    more = {"exx": np.full(NODES, 0.002 * index), "misfit": np.ones(NODES), "light_share": np.full((NODES, 3), 1 / 3)}
+    more = {
+        "exx": np.full(NODES, 0.002 * index),
+        "misfit": np.ones(NODES),
+        "light_fraction": np.full((NODES, 3), 1 / 3),
+    }
     return FrameRecord.of(nodes=NODES, lights=3, number=index, status=0, node_status=np.zeros(NODES), **both, **more)
 
 
@@ -54,11 +58,11 @@ def random_record(seed: int) -> FrameRecord:
         "node_status": blank,
         "match": random.uniform(0.9, 1),
         "best_match": random.uniform(0.9, 1),
-        "renewals": np.arange(seed % 3),
+        "reference_updates": np.arange(seed % 3),
         "misfit": np.ones(NODES),
-        "light_share": np.full((NODES, len(LIGHTS)), 1 / len(LIGHTS)),
+        "light_fraction": np.full((NODES, len(LIGHTS)), 1 / len(LIGHTS)),
         "residual": random.uniform(10, 20, 3),
-        "weight_share": random.uniform(0.5, 1, 3),
+        "weight_fraction": random.uniform(0.5, 1, 3),
         "brightness": random.uniform(0.9, 1.1, (3, 2)),
         "seconds": random.uniform(0, 1, len(STAGES)),
         "rigid": random.normal(0, 1, (3, seed % 3)),

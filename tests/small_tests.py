@@ -13,7 +13,7 @@ import numpy.typing as npt
 from textures import Affine, Texture
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.writers import write_dng, write_tiff
+from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual import Scene, plate_scene, record, render, strained_plate, truth
 from rgbmidic.settings import TestSettings, read_test

@@ -223,7 +223,7 @@ def merge(
     """Noise, crosstalk and registration from several files into one."""
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import check_output
-    from rgbmidic_calibration.merging import merge_files
+    from rgbmidic_calibration.jobs import merge_files
 
     check_output(out, overwrite=overwrite)
     calibration = merge_files(files)
@@ -247,6 +247,6 @@ def show(
         check_output(picture, overwrite=overwrite, option="--picture")
     display.calibration(calibration, file)
     if picture is not None:
-        from rgbmidic_calibration.pictures import draw_calibration
+        from rgbmidic_calibration.design import draw_calibration
 
         draw_calibration(calibration, picture)

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.camera_noise import CameraNoise, Quantity
+from rgbmidic.illumination.linearise import CameraNoise, Quantity
 from rgbmidic.typing import FloatArray
-from rgbmidic_calibration.pattern import fixed_pattern
-from rgbmidic_calibration.stacks import TemporalStack, same_camera
+from rgbmidic_calibration.captures import TemporalStack, same_camera
+from rgbmidic_calibration.plausibility import fixed_pattern
 
 __all__ = ["NoiseEstimate", "TransferCurve", "photon_transfer"]
 

@@ -20,7 +20,7 @@ from rgbmidic.correlation.solution import NodeStatus, Solution
 from rgbmidic.errors import CalibrationError, RgbmidicError
 from rgbmidic.illumination.registration import PARAMETERS, Registration, frame_geometry, registration_basis
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-from rgbmidic_calibration.stacks import TemporalStack, same_camera
+from rgbmidic_calibration.captures import TemporalStack, same_camera
 
 __all__ = ["ELEMENT", "LightMatch", "RegistrationEstimate", "estimate_registration", "jitter", "light_picture"]
 

@@ -9,9 +9,8 @@ from pathlib import Path
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings
-from rgbmidic_calibration.blocks import block_means
-from rgbmidic_calibration.captures import CaptureFiles
-from rgbmidic_calibration.stacks import TemporalStack, stack_frames
+from rgbmidic_calibration.captures import CaptureFiles, TemporalStack, stack_frames
+from rgbmidic_calibration.ratio import block_means
 from rgbmidic_calibration.verify import (
     Additivity,
     CheckItem,

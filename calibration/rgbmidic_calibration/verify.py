@@ -9,14 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.camera_noise import QUANTISATION
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linearise import QUANTISATION, NoiseModel
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.typing import FloatArray
-from rgbmidic_calibration.blocks import BlockMeans, block_centres
+from rgbmidic_calibration.captures import TemporalStack, same_camera
+from rgbmidic_calibration.ratio import BlockMeans, block_centres
 from rgbmidic_calibration.registration import estimate_registration
-from rgbmidic_calibration.stacks import TemporalStack, same_camera
 
 __all__ = [
     "Additivity",

@@ -62,7 +62,7 @@ def _write_tables(study: PaperStudy, claims: Iterable[Claim], folder: Path) -> N
     state = ("scene", "method", "angle_deg")
     _write_csv(folder / "perturbation.csv", (*state, "area", "P_px"), perturbation)
     _write_csv(folder / "areas.csv", (*state, "area", "mean_u_px", "mean_v_px", "error_v_px"), areas)
-    header = (*state, "status", "measured_share", "residual_percent", "frontier_ratio")
+    header = (*state, "status", "measured_fraction", "residual_percent", "frontier_ratio")
     _write_csv(folder / "solves.csv", header, solves)
     turning = study.goniometry
     pixels = [f"pixel_{i}" for i in range(turning.levels.shape[1])]

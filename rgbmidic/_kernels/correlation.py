@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic._kernels.compilation import compiled, helper
 from rgbmidic._kernels.interpolation import _FAST, PAD
-from rgbmidic._kernels.threads import over_ranges
+from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
 __all__ = [
     "BLOCK",
-    "bring_back",
     "element_hessian",
     "element_right_side",
     "element_squares",
@@ -24,6 +22,7 @@ __all__ = [
     "element_vector",
     "interpolate_nodal",
     "subtract_quadratic",
+    "warp",
 ]
 
 _SIXTH = np.float32(1.0 / 6.0)
@@ -33,7 +32,7 @@ _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
 _LEVEL = np.float32(1e-7)
 BLOCK = 8
-"""Side (px) of the blocks of which `bring_back` is told whether all their weights are 1."""
+"""Side (px) of the blocks of which `warp` is told whether all their weights are 1."""
 _LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
@@ -245,7 +244,7 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
 
 @over_ranges("elements")
 @compiled(fastmath=_FAST)
-def bring_back(
+def warp(
     start, stop, coefficients, deformed_weight, partial, reference, reference_weight, runs, run_offsets, origin,
     elements, barycentric, displacement, difference, weight, moments,
 ):  # fmt: skip

@@ -1,14 +1,37 @@
-"""Cubic B-spline interpolation: prefilter and evaluation (Unser, IEEE Signal Process. Mag. 16(6), 1999)."""
+"""Cubic B-spline interpolation: prefilter and evaluation (Unser, IEEE Signal Process. Mag. 16(6), 1999).
+
+Compiled loops between the owned pixels and images, or coarse grids of square blocks, of the rectangle around them.
+
+`lines` (R, 4) int32 are the rows of pixels of the elements in the order of the image's rows: first slot, number of
+pixels, row and column in the rectangle; row r has ``line_offsets[r]:line_offsets[r + 1]``. Pixels are counted without
+sign: an index that may be negative would be looked at each time. What is summed is first added up along the columns of
+a block's rows, side by side in memory.
+
+A field on a triangle mesh as the coloured pixels of a screen.
+"""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from rgbmidic._kernels.compilation import compiled, helper
-from rgbmidic._kernels.threads import over_ranges
+from rgbmidic._kernels.texture import expand_row
+from rgbmidic._kernels.threads import compiled, helper, over_ranges
 from rgbmidic.typing import FloatImage
 
-__all__ = ["PAD", "bspline_coefficients", "pixel_gradient", "sample_with_gradient"]
+__all__ = [
+    "PAD",
+    "block_sums",
+    "bspline_coefficients",
+    "from_grid",
+    "from_image",
+    "paint_field",
+    "pixel_gradient",
+    "product_sums",
+    "sample_with_gradient",
+    "to_image",
+]
 
 PAD = 2
 """Rows and columns by which the coefficient array exceeds the image on every side."""
@@ -175,3 +198,201 @@ def _weights(t):
         (1 + 2 * t - 3 * t2) / 2,
         t2 / 2,
     )
+
+
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
+_LANES = 8
+"""Pixels in a vector register: lines have 13 on average, and what does not fill a vector costs as much as eight."""
+
+
+@over_ranges("out", axis=1)
+@compiled(fastmath=_FAST)
+def block_sums(start, stop, values, lines, line_offsets, side, out):
+    """Sums of fields (n, P) over blocks of `side` px: ``out`` (n, h, w)."""
+    columns = np.empty(out.shape[2] * side, dtype=np.float32)
+    for n in range(len(values)):
+        for block in range(start, stop):
+            columns[:] = 0
+            first, last = line_offsets[block * side], line_offsets[min((block + 1) * side, line_offsets.size - 1)]
+            for q in range(first, last):
+                slot, number, column = np.uint64(lines[q, 0]), np.uint64(lines[q, 1]), np.uint64(lines[q, 3])
+                for i in range(number):
+                    columns[column + i] += values[n, slot + i]
+            _gather(columns, side, out[n, block])
+
+
+@over_ranges("out", axis=3)
+@compiled(fastmath=_FAST)
+def product_sums(start, stop, values, weights, lines, line_offsets, side, out):
+    """Sums over blocks of ``s a b`` and of ``s = sqrt(w_a w_b)`` for each two fields a, b of `values` (k, P) and their
+    `weights` (k, P), the second not after the first: ``out`` (k, k, 2, h, w)."""
+    lights, width = len(values), out.shape[4] * side
+    field, root = np.empty((2, lights, width + _LANES), dtype=np.float32)
+    sums = np.empty((lights, lights, 2, width), dtype=np.float32)
+    for block in range(start, stop):
+        sums[:] = 0
+        for row in range(block * side, min((block + 1) * side, line_offsets.size - 1)):
+            for light in range(lights):
+                own, w = field[light], root[light]
+                _to_row(row, values[light], lines, line_offsets, own)
+                _to_row(row, weights[light], lines, line_offsets, w)
+                for i in range(np.uint64(width)):
+                    w[i] = np.sqrt(w[i])
+                for i in range(np.uint64(width)):
+                    own[i] *= w[i]
+                for other in range(light + 1):
+                    b, v = field[other], root[other]
+                    product, share = sums[light, other, 0], sums[light, other, 1]
+                    for i in range(np.uint64(width)):
+                        product[i] += own[i] * b[i]
+                    for i in range(np.uint64(width)):
+                        share[i] += w[i] * v[i]
+        for light in range(lights):
+            for other in range(light + 1):
+                for n in range(2):
+                    _gather(sums[light, other, n], side, out[light, other, n, block])
+
+
+@helper(fastmath=_FAST)
+def _to_row(row, values, lines, line_offsets, out):
+    """A row of the image of `values` (P,), 0 where no pixel is owned; `out` is longer by a vector.
+
+    Whole vectors are copied, where memory goes on so far: the next line overwrites what is too much, or a gap does.
+    """
+    filled = np.int64(0)
+    for q in range(line_offsets[row], line_offsets[row + 1]):
+        slot, number, column = np.int64(lines[q, 0]), np.int64(lines[q, 1]), np.int64(lines[q, 3])
+        for i in range(np.uint64(filled), np.uint64(column)):
+            out[i] = _ZERO
+        whole = (number + _LANES - 1) // _LANES * _LANES
+        if slot + whole > values.size:
+            whole = number
+        first, target = np.uint64(slot), np.uint64(column)
+        for i in range(np.uint32(whole)):
+            out[target + i] = values[first + i]
+        filled = column + number
+    for i in range(np.uint64(filled), np.uint64(out.size)):
+        out[i] = _ZERO
+
+
+@helper(fastmath=_FAST)
+def _gather(columns, side, out):
+    """Sums of each `side` of the columns into `out` (w,)."""
+    for block in range(out.size):
+        total = _ZERO
+        for i in range(np.uint64(block * side), np.uint64((block + 1) * side)):
+            total += columns[i]
+        out[block] = total
+
+
+@over_ranges("lines")
+@compiled()
+def to_image(start, stop, lines, values, top, left, out):
+    """Fields (n, P) float32 of the owned pixels as images ``out`` (n, H, W), in which the rectangle begins at row `top`
+    and column `left`."""
+    for n in range(len(values)):
+        for q in range(start, stop):
+            slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
+            row, column = np.uint64(top + lines[q, 2]), np.uint64(left + lines[q, 3])
+            for i in range(number):
+                out[n, row, column + i] = values[n, slot + i]
+
+
+@over_ranges("lines")
+@compiled()
+def from_image(start, stop, lines, image, top, left, out):
+    """The way back: ``out`` (n, P) from such images (n, H, W)."""
+    for n in range(len(image)):
+        for q in range(start, stop):
+            slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
+            row, column = np.uint64(top + lines[q, 2]), np.uint64(left + lines[q, 3])
+            for i in range(number):
+                out[n, slot + i] = image[n, row, column + i]
+
+
+@over_ranges("line_offsets")
+@compiled(fastmath=_FAST)
+def from_grid(start, stop, lines, line_offsets, grid, side, out):
+    """Grids (n, h, w) float32 of blocks of `side` px interpolated linearly between their centres, constant beyond the
+    outermost, at the owned pixels: ``out`` (n, P)."""
+    row = np.empty(grid.shape[2] * side, dtype=np.float32)
+    between = np.empty(grid.shape[2], dtype=np.float32)
+    for r in range(start, min(stop, line_offsets.size - 1)):
+        for n in range(len(grid)):
+            expand_row(grid[n], r, side, between, row)
+            for q in range(line_offsets[r], line_offsets[r + 1]):
+                slot, number, column = np.uint64(lines[q, 0]), np.uint64(lines[q, 1]), np.uint64(lines[q, 3])
+                for i in range(number):
+                    out[n, slot + i] = row[column + i]
+
+
+_EDGE = 1e-6
+_EACH = np.uint32(0x010101)
+_OPAQUE = np.uint32(0xFF000000)
+
+
+@over_ranges("out", grain=16)
+@compiled()
+def paint_field(start, stop, out, grey, x, y, elements, values, low, high, colours, share, nearest):
+    """Paint the linear interpolation of `values` (N,) over a grey picture; elements with a NaN node stay grey.
+
+    Parameters
+    ----------
+    out : (H, W) uint32
+        Receives red, green, blue and an opacity of 255, the lowest byte first.
+    grey : (H, W) uint8
+    x, y : (N,)
+        Where each node is on the screen, in its pixels; the centre of the first is (0, 0).
+    elements : (E, 3)
+    low, high
+        Values of the first and the last of the colours; beyond them these stay.
+    colours : (C,) uint32
+        Red, green, blue, each times the field's opacity, and 255, the lowest byte first.
+    share
+        Of the grey picture that is seen through the field, in 256ths.
+    nearest
+        Whether a pixel shows the value of the corner that counts most there, and not the mean of the three.
+    """
+    width, last = out.shape[1], np.float32(colours.shape[0] - 1)
+    for row in range(start, stop):
+        for column in range(width):
+            out[row, column] = np.uint32(grey[row, column]) * _EACH | _OPAQUE
+    scale, share = colours.shape[0] / (high - low), np.uint32(share)
+    for e in range(elements.shape[0]):
+        i, j, k = elements[e, 0], elements[e, 1], elements[e, 2]
+        xi, yi, xj, yj, xk, yk = x[i], y[i], x[j], y[j], x[k], y[k]
+        vi, vj, vk = values[i], values[j], values[k]
+        if not math.isfinite(vi + vj + vk + xi + yi + xj + yj + xk + yk):
+            continue
+        top = max(math.ceil(min(yi, yj, yk) - _EDGE), start)
+        bottom = min(math.floor(max(yi, yj, yk) + _EDGE), stop - 1)
+        area = (xj - xi) * (yk - yi) - (yj - yi) * (xk - xi)
+        if top > bottom or area == 0.0 or max(xi, xj, xk) < 0.0 or min(xi, xj, xk) > width - 1.0:
+            continue
+        # weights of the second and the third corner: a0 + ac column + ar row
+        ac, ar = (yk - yi) / area, -(xk - xi) / area
+        bc, br = -(yj - yi) / area, (xj - xi) / area
+        for row in range(int(top), int(bottom) + 1):
+            a0, b0 = ar * (row - yi) - ac * xi, br * (row - yi) - bc * xi
+            left, right = 0.0, width - 1.0
+            for slope, base in ((ac, a0), (bc, b0), (-ac - bc, 1.0 - a0 - b0)):
+                if slope > 0.0:
+                    left = max(left, (-_EDGE - base) / slope)
+                elif slope < 0.0:
+                    right = min(right, (-_EDGE - base) / slope)
+                elif base < -_EDGE:
+                    right = -1.0
+            first, end = math.ceil(left), math.floor(right)
+            slope = np.float32(scale * (ac * (vj - vi) + bc * (vk - vi)))
+            base = np.float32(scale * (vi + a0 * (vj - vi) + b0 * (vk - vi) - low))
+            for column in range(first, end + 1):
+                place = base + slope * np.float32(column)
+                if nearest:
+                    a, b = a0 + ac * column, b0 + bc * column
+                    c = 1.0 - a - b
+                    own = vi if c >= a and c >= b else (vj if a >= b else vk)
+                    place = np.float32(scale * (own - low))
+                index = np.int32(min(max(place, np.float32(0)), last))
+                seen = (np.uint32(grey[row, column]) * share) >> np.uint32(8)
+                out[row, column] = colours[index] + seen * _EACH

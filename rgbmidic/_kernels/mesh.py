@@ -1,12 +1,33 @@
-"""Which element owns which pixel, and which nodes are far apart."""
+"""Which element owns which pixel, and which nodes are far apart.
+
+Values given at the nodes of a triangle mesh, interpolated linearly at any points.
+
+Compiled loops of the reconstruction by local linear prediction: fixed filters per tile, chosen from a table.
+
+Sparse factorisation; solves with it, and quadratic forms, of many vectors at once, side by side in memory.
+"""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from rgbmidic._kernels.compilation import compiled
+from rgbmidic._kernels.interpolation import _FAST
+from rgbmidic._kernels.texture import between
+from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
-__all__ = ["claim_pixels", "colour_nodes"]
+__all__ = [
+    "TILE",
+    "claim_pixels",
+    "colour_nodes",
+    "factorise",
+    "fill_unknown",
+    "interpolate_nodal",
+    "node_energies",
+    "predict",
+    "solve_factors",
+]
 
 
 @compiled()
@@ -55,3 +76,267 @@ def colour_nodes(starts, near, taken, colour):
         colour[node] = own
         for k in range(begin, end):
             taken[near[k], own] = True
+
+
+_EDGE = -1e-9
+
+
+@over_ranges("out", grain=4096)
+@compiled()
+def interpolate_nodal(start, stop, out, x, y, nodes, elements, values, box, first, members):
+    """Write the linear interpolation (2,) of `values` (N, 2) at every point, NaN outside the mesh.
+
+    Parameters
+    ----------
+    out : (M, 2)
+    x, y : (M,)
+    nodes, elements, values : (N, 2), (E, 3), (N, 2)
+    box : (5,)
+        Bins that list the elements: x0, y0, side, columns, rows.
+    first, members
+        ``members[first[b]:first[b + 1]]`` are the elements whose bounding box meets bin b.
+    """
+    columns, rows = int(box[3]), int(box[4])
+    for p in range(start, stop):
+        out[p, 0] = out[p, 1] = np.nan
+        i, j = math.floor((x[p] - box[0]) / box[2]), math.floor((y[p] - box[1]) / box[2])
+        if not (0 <= i < columns and 0 <= j < rows):
+            continue
+        b = j * columns + i
+        for m in range(first[b], first[b + 1]):
+            a, c, d = elements[members[m], 0], elements[members[m], 1], elements[members[m], 2]
+            ux, uy = nodes[c, 0] - nodes[a, 0], nodes[c, 1] - nodes[a, 1]
+            wx, wy = nodes[d, 0] - nodes[a, 0], nodes[d, 1] - nodes[a, 1]
+            qx, qy = x[p] - nodes[a, 0], y[p] - nodes[a, 1]
+            area = ux * wy - uy * wx
+            s, t = (qx * wy - qy * wx) / area, (ux * qy - uy * qx) / area
+            if s >= _EDGE and t >= _EDGE and s + t <= 1.0 - _EDGE:
+                for k in range(2):
+                    out[p, k] = (1.0 - s - t) * values[a, k] + s * values[c, k] + t * values[d, k]
+                break
+
+
+TILE = 16
+"""Side in px of the squares within which the filters are the same."""
+_SIZE = 5
+"""Usual side of the square of samples, whose taps are added in one go."""
+_STRIP = 256
+"""Columns at a time: what a core's caches hold of their filters."""
+
+
+@helper()
+def _channel(i, j, red_row, red_column):
+    if i % 2 == red_row:
+        return 0 if j % 2 == red_column else 1
+    return 1 if j % 2 == red_column else 2
+
+
+@over_ranges("out")
+@compiled()
+def fill_unknown(start, stop, padded, share, red_row, red_column, pad, out, unknown):
+    """Replace samples that are NaN by what the known ones around tell of the common texture.
+
+    `padded` as written by `scaled_contrast`; `share` (3, h, w) is the share of the common texture in each tile. `out`,
+    a copy of `padded`, receives ``sqrt(share) * texture``; where too little is known within one pixel it receives 0
+    and `unknown` (like `padded`) is set.
+    """
+    height, width = padded.shape
+    for i in range(start, stop):
+        for j in range(width):
+            if np.isfinite(padded[i, j]):
+                continue
+            ti = min(max(i - pad, 0) // TILE, share.shape[1] - 1)
+            tj = min(max(j - pad, 0) // TILE, share.shape[2] - 1)
+            total = weight = near = 0.0
+            for a in range(max(i - 2, 0), min(i + 3, height)):
+                for b in range(max(j - 2, 0), min(j + 3, width)):
+                    if np.isfinite(padded[a, b]):
+                        s = share[_channel(a - pad, b - pad, red_row, red_column), ti, tj]
+                        distance = (a - i) ** 2 + (b - j) ** 2
+                        w = np.exp(-0.8 * distance)
+                        total += w * np.sqrt(s) * padded[a, b]
+                        weight += w * s
+                        near += s if distance <= 2 else 0.0
+            own = share[_channel(i - pad, j - pad, red_row, red_column), ti, tj]
+            out[i, j] = np.sqrt(own) * total / weight if near > 0.5 else 0.0
+            unknown[i, j] = near <= 0.5
+
+
+# contraction to fused multiply-add alone: NaN and infinity keep their meaning
+@helper(fastmath={"contract"}, forceinline=True)
+def _filtered(r0, r1, r2, r3, r4, lines, out):
+    """Sum of the products of five rows of samples with the taps `lines` (25, _STRIP)."""
+    for j in range(out.size):
+        total = np.float32(0.0)
+        for b in range(_SIZE):
+            upper = lines[b, j] * r0[j + b] + lines[_SIZE + b, j] * r1[j + b]
+            lower = lines[3 * _SIZE + b, j] * r3[j + b] + lines[4 * _SIZE + b, j] * r4[j + b]
+            total += upper + lines[2 * _SIZE + b, j] * r2[j + b] + lower
+        out[j] = total
+
+
+@helper(fastmath={"contract"}, forceinline=True)
+def _add_tap(row, line, out):
+    for j in range(out.size):
+        out[j] += line[j] * row[j]
+
+
+@helper()
+def _spread(taps, parity, channel, index, first, lines):
+    """Filters of tiles, tap by tap, written out along the pixels from the tile `first` on."""
+    for tile in range(first, min(first + _STRIP // TILE, index.size)):
+        chosen = taps[index[tile], parity, channel]
+        for k in range(lines.shape[0]):
+            source, line = chosen[k], lines[k, (tile - first) * TILE :]
+            for j in range(TILE):
+                line[j] = source[j]
+
+
+@over_ranges("index")
+@compiled(fastmath={"contract"})
+def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, mean_block, mixing, out):
+    """Mixtures of the channels ``mean + scale * sum of taps x samples around`` from the scaled contrast.
+
+    Parameters
+    ----------
+    padded : (H + 2 pad, 16 w + 2 pad) float32
+        Scaled contrast, finite, with pad = size // 2.
+    index : (h, w) int32
+        Which filters each tile of 16 x 16 px uses.
+    taps : (T, 2, 3, size², 16) float32
+        By row parity, channel and tap; the last axis runs over the columns of the tile, which alternate between two
+        phases.
+    scale, mean : (3, h, W) float32
+        Rows of grids of `scale_block` and `mean_block` px, widened to the pixels.
+    mixing : (n, 3) float32
+    out : (n, H, W) float32
+    """
+    rows, columns = out.shape[1:]
+    lines, channels = np.empty((size * size, _STRIP), np.float32), np.empty((3, TILE, _STRIP), np.float32)
+    for ti in range(start, stop):
+        top, bottom = ti * TILE, min((ti + 1) * TILE, rows)
+        for left in range(0, columns, _STRIP):
+            number = min(_STRIP, columns - left)
+            for c in range(3):
+                for parity in range(2):
+                    _spread(taps, parity, c, index[ti], left // TILE, lines)
+                    for i in range(top + parity, bottom, 2):
+                        made = channels[c, i - top, :number]
+                        if size == _SIZE:
+                            _filtered(
+                                padded[i, left:],
+                                padded[i + 1, left:],
+                                padded[i + 2, left:],
+                                padded[i + 3, left:],
+                                padded[i + 4, left:],
+                                lines,
+                                made,
+                            )
+                        else:
+                            for j in range(number):
+                                made[j] = 0
+                            for k in range(size * size):
+                                _add_tap(padded[i + k // size, left + k % size :], lines[k], made)
+                        low, high, part = between(i, mean_block, mean.shape[1])
+                        above, below = mean[c, low, left:], mean[c, high, left:]
+                        low, high, ahead = between(i, scale_block, scale.shape[1])
+                        gain, other = scale[c, low, left:], scale[c, high, left:]
+                        for j in range(number):
+                            level = above[j] + part * (below[j] - above[j])
+                            made[j] = level + (gain[j] + ahead * (other[j] - gain[j])) * made[j]
+            for n in range(len(out)):
+                red, green, blue = mixing[n]
+                for i in range(top, bottom):
+                    r, g, b, target = channels[0, i - top], channels[1, i - top], channels[2, i - top], out[n, i, left:]
+                    for j in range(number):
+                        target[j] = red * r[j] + green * g[j] + blue * b[j]
+
+
+_BLOCK = 32
+"""Vectors at a time: those of some 3,000 unknowns stay in a core's own cache."""
+
+
+@compiled(fastmath=_FAST)
+def factorise(data, given_starts, given_nodes, given, before_starts, before, starts, rows, lower, inverse):
+    """Factorise a symmetric positive definite matrix as ``L D L^T``, with a block of 2 x 2 for each two nodes (Davis,
+    Direct Methods for Sparse Linear Systems, 2006, section 4.8).
+
+    Row k of the matrix has the blocks ``data[given[p]]``, (n, 2, 2) places, at the nodes ``given_nodes[p]`` up to k, p
+    from ``given_starts[k]`` to ``given_starts[k + 1]``; row k of L, whose own block is 1, has blocks at the nodes
+    `before` it, and column k at `rows` after it, in their order. `lower` (R, 4) receives the latter, `inverse` (N, 3)
+    entries xx, xy and yy of the inverse of each block of D.
+    """
+    work, filled = np.zeros((len(inverse), 4)), starts[:-1].copy()
+    for k in range(len(inverse)):
+        for p in range(given_starts[k], given_starts[k + 1]):
+            i = given_nodes[p]
+            work[i, 0], work[i, 1] = data[given[p, 0, 0]], data[given[p, 0, 1]]
+            work[i, 2], work[i, 3] = data[given[p, 1, 0]], data[given[p, 1, 1]]
+        xx, xy, yy = work[k, 0], work[k, 1], work[k, 3]
+        work[k] = 0.0
+        for q in range(before_starts[k], before_starts[k + 1]):
+            i = before[q]
+            a, b, c, d = work[i, 0], work[i, 1], work[i, 2], work[i, 3]
+            work[i] = 0.0
+            for p in range(starts[i], filled[i]):
+                e, f, g, h, r = lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3], rows[p]
+                work[r, 0] -= a * e + b * f
+                work[r, 1] -= a * g + b * h
+                work[r, 2] -= c * e + d * f
+                work[r, 3] -= c * g + d * h
+            s, t, u = inverse[i, 0], inverse[i, 1], inverse[i, 2]
+            e, f, g, h, p = a * s + b * t, a * t + b * u, c * s + d * t, c * t + d * u, filled[i]
+            lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3] = e, f, g, h
+            filled[i] += 1
+            xx -= e * a + f * b
+            xy -= e * c + f * d
+            yy -= g * c + h * d
+        scale = 1.0 / (xx * yy - xy * xy)
+        inverse[k, 0], inverse[k, 1], inverse[k, 2] = yy * scale, -xy * scale, xx * scale
+
+
+@over_ranges("x", axis=2, grain=_BLOCK)
+@compiled(fastmath=_FAST)
+def solve_factors(start, stop, starts, rows, lower, inverse, x):
+    """Solve ``L D L^T x = b`` in place, for x (N, 2, R) float64 and such factors."""
+    n = len(inverse)
+    for first in range(start, stop, _BLOCK):
+        begin, end = np.uint64(first), np.uint64(min(first + _BLOCK, stop))
+        for j in range(np.uint64(n)):
+            for p in range(starts[j], starts[j + np.uint64(1)]):
+                i, a, b, c, d = np.uint64(rows[p]), lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3]
+                for r in range(begin, end):
+                    x[i, 0, r] -= a * x[j, 0, r] + b * x[j, 1, r]
+                    x[i, 1, r] -= c * x[j, 0, r] + d * x[j, 1, r]
+        for back in range(n):
+            own = np.uint64(n - 1 - back)
+            xx, xy, yy = inverse[own, 0], inverse[own, 1], inverse[own, 2]
+            for r in range(begin, end):
+                u, v = x[own, 0, r], x[own, 1, r]
+                x[own, 0, r] = xx * u + xy * v
+                x[own, 1, r] = xy * u + yy * v
+            for p in range(starts[own], starts[own + np.uint64(1)]):
+                i, a, b, c, d = np.uint64(rows[p]), lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3]
+                for r in range(begin, end):
+                    x[own, 0, r] -= a * x[i, 0, r] + c * x[i, 1, r]
+                    x[own, 1, r] -= b * x[i, 0, r] + d * x[i, 1, r]
+
+
+@over_ranges("x", axis=1, grain=_BLOCK)
+@compiled(fastmath=_FAST)
+def node_energies(start, stop, values, columns, starts, x, out):
+    """What each node adds to ``x^T S x`` of every column of x (2 N, R): ``out`` (N, R), for S given by its rows."""
+    product = np.empty(_BLOCK)
+    for first in range(start, stop, _BLOCK):
+        base, width = np.uint64(first), np.uint64(min(_BLOCK, stop - first))
+        for node in range(np.uint64(out.shape[0])):
+            for c in range(width):
+                out[node, base + c] = 0.0
+            for row in range(np.uint64(2) * node, np.uint64(2) * node + np.uint64(2)):
+                product[:] = 0.0
+                for p in range(starts[row], starts[row + np.uint64(1)]):
+                    k, value = np.uint64(columns[p]), values[p]
+                    for c in range(width):
+                        product[c] += value * x[k, base + c]
+                for c in range(width):
+                    out[node, base + c] += product[c] * x[row, base + c]

@@ -6,8 +6,7 @@ a piece is Schwarz's (Ann Stat 6, 1978), with a price for each parameter in plac
 
 import numpy as np
 
-from rgbmidic._kernels.compilation import compiled, helper
-from rgbmidic._kernels.threads import over_ranges
+from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
 __all__ = ["HIGHEST", "LOWEST", "mean_rates"]
 

@@ -22,8 +22,7 @@ import math
 
 import numpy as np
 
-from rgbmidic._kernels.compilation import compiled, helper
-from rgbmidic._kernels.threads import over_ranges
+from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
 __all__ = ["CYLINDER", "PLATE", "SPHERE", "sample_paint", "trace_rows"]
 

@@ -7,8 +7,7 @@ interpolated linearly, beyond the outermost they are constant. ``red_row, red_co
 
 import numpy as np
 
-from rgbmidic._kernels.compilation import compiled, helper
-from rgbmidic._kernels.threads import over_ranges
+from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
 __all__ = [
     "PLANE_PAIRS",

@@ -2,6 +2,8 @@
 
 A kernel holds no lock of the interpreter (``nogil=True``) and writes only what belongs to its items, so that the result
 is the same bits on any number of threads.
+
+How the kernels are compiled: once for the processor, kept in a cache, free of the interpreter's lock.
 """
 
 from __future__ import annotations
@@ -11,16 +13,17 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from itertools import pairwise
 from threading import Barrier
 from typing import Any
 
+from numba import njit
 from threadpoolctl import ThreadpoolController
 
 from rgbmidic.errors import InputError
 
-__all__ = ["one_blas_thread", "over_ranges", "set_threads", "start_threads", "threads"]
+__all__ = ["compiled", "helper", "one_blas_thread", "over_ranges", "set_threads", "start_threads", "threads"]
 
 _VARIABLE = "RGBMIDIC_THREADS"
 _chosen: list[int] = []
@@ -145,3 +148,9 @@ def _default() -> int:
     if not given.isdecimal() or int(given) < 1:
         raise InputError(f"{_VARIABLE} must be a whole number from 1; given is {given!r}")
     return int(given)
+
+
+# a division by zero gives what the processor gives, and C callers are not catered for: less code, sooner compiled
+compiled = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+helper = partial(compiled, no_cpython_wrapper=True)
+"""For a function that only kernels call."""

@@ -1,19 +1,17 @@
 """The MIDIC solve: one displacement field from k weighted image pairs (paper, section 3.2)."""
 
 from rgbmidic.correlation.correlate import correlate
-from rgbmidic.correlation.fill import fill
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.renewal import Renewal
-from rgbmidic.correlation.solution import NodeStatus, Solution, Status
+from rgbmidic.correlation.reference_update import ReferenceUpdate
+from rgbmidic.correlation.solution import NodeStatus, Solution, Status, fill
 from rgbmidic.correlation.solve import solve
-from rgbmidic.correlation.start import find_start
-from rgbmidic.correlation.track import Start, track
+from rgbmidic.correlation.start import Start, find_start, track
 
 __all__ = [
     "Deformed",
     "NodeStatus",
     "Reference",
-    "Renewal",
+    "ReferenceUpdate",
     "Solution",
     "Start",
     "Status",

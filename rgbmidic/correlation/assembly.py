@@ -1,20 +1,116 @@
-"""From sums per element to the sparse normal equations of the whole mesh, ready to be factorised."""
+"""Elimination of the unknowns of a mesh, two a node: its order and structure once, the numbers for every matrix.
+
+From sums per element to the sparse normal equations of the whole mesh, ready to be factorised.
+
+Rigid motions of the lights after the first: their functions, their equations, and whether the images show them.
+
+With the nodal displacement u, the rigid coefficients beta and the Hessian M_j of light j, the equations are bordered:
+``[[M + H, B], [B^T, C]]`` with ``M = sum M_j``, ``B = [M_2 R, M_3 R, ...]``, ``C = diag(R^T M_j R)`` and the hold H,
+the weak smoothness that carries unseen nodes along. To a unit of beta the displacement answers by ``-X``,
+``X = (M + H)^-1 B``, so that light j moves by ``D_j = E_j - X``, with E_j the light's own functions R. The Schur
+complement ``C - B^T X = sum D_j^T M_j D_j + X^T H X`` is what the images say of beta and what the hold says.
+
+Blocks over which scores are summed, and how much of such a sum the fit of the displacement leaves over.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
+from scipy.linalg import eigh
+from scipy.sparse.linalg import splu
 
-from rgbmidic.correlation.elimination import Elimination
-from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.sparse import with_data
-from rgbmidic.typing import FloatArray
+from rgbmidic._kernels.correlation import element_hessian
+from rgbmidic._kernels.mesh import factorise, solve_factors
+from rgbmidic.mesh import PixelMap, Tri3Mesh
+from rgbmidic.mesh.tri3 import with_data
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Assembly"]
+__all__ = ["BLOCK", "Assembly", "Elimination", "RigidMotions", "block_side", "rigid_functions", "unfitted_fraction"]
+
+_SINGULAR = 1e11
+"""Entries of a node's own block over what is left of it when the others are eliminated, from which that is rounding:
+1e13 to 1e20 in singular matrices of 60 to 4,800 nodes, 3e8 at most where the smoothness alone holds one direction
+(measured)."""
+
+Index = npt.NDArray[np.integer]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Elimination:
+    """Structure of the factors of symmetric matrices with a block of 2 x 2 for each two nodes that share an edge.
+
+    Attributes
+    ----------
+    place : ndarray, shape (N,)
+        When each node is eliminated. All else counts the nodes so.
+    own : ndarray, shape (N, 2)
+        Places of the entries xx and yy of each node's own block in the matrix' data.
+    given : tuple of ndarray
+        Rows of the lower half of the matrix: where each starts, nodes, and places (n, 2, 2) in the matrix' data.
+    lower : csc_matrix, shape (N, N)
+        Blocks of the lower factor under its diagonal.
+    before : csr_matrix, shape (N, N)
+        The same by rows.
+    """
+
+    place: Index
+    own: Index
+    given: tuple[Index, Index, Index]
+    lower: sp.csc_matrix
+    before: sp.csr_matrix
+
+    @classmethod
+    def of_pairs(cls, row: Index, column: Index, slots: Index) -> Elimination:
+        """For matrices with blocks at the nodes `row` (n,) and `column` (n,), column after column, diagonal included,
+        whose data have them at `slots` (n, 2, 2). Who has fewest neighbours left goes first."""
+        edges = np.bincount(column)
+        # negative beside the diagonal: nothing that is filled in cancels
+        values = np.where(row == column, edges[column] + 1.0, -1.0)
+        graph = sp.csc_matrix((values, row, np.concatenate([[0], np.cumsum(edges)])), shape=(edges.size,) * 2)
+        factors = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        whole, place = factors.L, factors.perm_c
+        whole.sort_indices()
+        below = np.ones(whole.nnz, dtype=bool)
+        below[whole.indptr[:-1]] = False  # the diagonal is the first of each column
+        rows, starts = whole.indices[below], np.concatenate([[0], np.cumsum(np.diff(whole.indptr) - 1)])
+        lower = sp.csc_matrix((np.ones(rows.size, dtype=bool), rows, starts), shape=whole.shape)
+        half = np.flatnonzero(place[column] <= place[row])
+        half = half[np.argsort(place[row[half]], kind="stable")]
+        own = np.empty((edges.size, 2), dtype=np.int64)
+        own[place[row[row == column]]] = slots[row == column][:, [0, 1], [0, 1]]
+        given_starts = np.searchsorted(place[row[half]], np.arange(edges.size + 1))
+        given = given_starts, place[column[half]], np.ascontiguousarray(slots[half])
+        return cls(place=place, own=own, given=given, lower=lower, before=sp.csr_matrix(lower))
+
+    def factorise(self, data: FloatArray) -> Callable[[FloatArray], FloatArray]:
+        """Factorise a positive definite matrix given by its data; the function that solves for right-hand sides (2 N,)
+        or (2 N, R).
+
+        Raises
+        ------
+        LinAlgError
+            The matrix is not positive definite, or singular in double precision.
+        """
+        lower, inverse = np.empty((self.lower.nnz, 4)), np.empty((self.place.size, 3))
+        structure = self.lower.indptr, self.lower.indices
+        factorise(data, *self.given, self.before.indptr, self.before.indices, *structure, lower, inverse)
+        xx, xy, yy = inverse.T
+        growth = (xx + yy) * data[self.own].sum(axis=1)
+        if not ((xx > 0) & (xx * yy > xy * xy) & (growth < _SINGULAR)).all():
+            raise np.linalg.LinAlgError("the matrix is singular, or not positive definite")
+
+        def solve(right_sides: FloatArray) -> FloatArray:
+            solution = np.empty((self.place.size, 2, right_sides[0].size))
+            solution[self.place] = right_sides.reshape(solution.shape)
+            solve_factors(*structure, lower, inverse, solution)
+            return solution[self.place].reshape(right_sides.shape)
+
+        return solve
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,3 +203,200 @@ def _sums(rows: npt.NDArray[np.int64], number: npt.NDArray[np.int64], count: int
     """The matrix that adds up entries: each of its columns counts in the next `number` of the `rows`."""
     indptr = np.concatenate([[0], np.cumsum(number)])
     return sp.csc_matrix((np.ones(rows.size), rows.ravel(), indptr), shape=(count, number.size))
+
+
+_RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
+"""Number of rigid functions of a light."""
+_SHOWN = 0.5
+"""Fraction of its Schur complement that the images have of a rigid motion that is measured. The rest is the hold's,
+which knows nothing of it. Lights that see within one element of one another leave .998 or more to the images, lights
+an element further apart .02 or less (measured)."""
+_ROUNDING = 1e-9
+"""Fraction of ``R^T M_j R`` under which a Schur complement is rounding (1e-13), or the hold of a constant where there
+is nothing else between two bodies (1e-9)."""
+_NAMED = 0.1
+"""Least part of a light in a motion that the images do not show, by which the light is named."""
+
+
+def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
+    """Nodal values (2 N, m) of the rigid motions: shifts in x and y (px), rotation (rad) about the mesh's middle."""
+    arm = nodes - nodes.mean(axis=0)
+    columns = np.zeros((len(nodes), 2, 3))
+    columns[:, 0, 0] = columns[:, 1, 1] = 1
+    columns[:, 0, 2], columns[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    return columns.reshape(-1, 3)[:, : _RIGID_FUNCTIONS[rigid]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigidMotions:
+    """The rigid unknowns of one pass: K = (k - 1) m coefficients, light after light, m functions each.
+
+    Attributes
+    ----------
+    follows : ndarray, shape (2 N, K)
+        X: the displacement follows a unit of each coefficient by its negative.
+    moves : ndarray, shape (k, 2 N, K)
+        D: what each light moves by then.
+    pull : ndarray, shape (2 N, K)
+        ``B + H X``: what a displacement takes from the right-hand sides of the coefficients.
+    inverse : ndarray, shape (K, K)
+        Of the Schur complement without smoothness, in the directions that the images show, else 0.
+    hidden : ndarray, shape (k,), bool
+        Lights with a weight whose rigid motion the images do not show: they share no texture with the first light,
+        directly or through others.
+    """
+
+    follows: FloatArray
+    moves: FloatArray
+    pull: FloatArray
+    inverse: FloatArray
+    hidden: BoolArray
+
+    @classmethod
+    def eliminate(
+        cls,
+        assembly: Assembly,
+        per_light: Sequence[FloatArray],
+        functions: FloatArray,
+        hold: sp.csc_matrix,
+        solve: Callable[[FloatArray], FloatArray],
+        textured: BoolArray,
+    ) -> RigidMotions:
+        """The rigid unknowns left when the displacement is eliminated.
+
+        Parameters
+        ----------
+        assembly
+            Of the mesh.
+        per_light
+            Element blocks (E, 3, 3, 3) of the Hessian of each of the k lights.
+        functions : ndarray, shape (2 N, m)
+            Rigid functions.
+        hold : csc_matrix, shape (2 N, 2 N)
+            H.
+        solve
+            Solves with ``M + H`` for (2 N, K).
+        textured : ndarray, shape (E,), bool
+            Elements with texture enough: what noise alone shows elsewhere counts for nothing.
+        """
+        lights, count = len(per_light), functions.shape[1]
+        each = np.zeros((lights, lights - 1, len(functions), count))
+        each[np.arange(1, lights), np.arange(lights - 1)] = functions
+        own = each.transpose(0, 2, 1, 3).reshape(lights, len(functions), -1)
+        border = np.sum([assembly.matrix(blocks) @ part for blocks, part in zip(per_light, own, strict=True)], axis=0)
+        follows = solve(border)
+        moves, held = own - follows, hold @ follows
+
+        def energy(chosen: BoolArray) -> FloatArray:
+            """``sum D_j^T M_j D_j`` over the chosen elements (E,)."""
+            hessians = (assembly.matrix(blocks * chosen[:, None, None, None]) for blocks in per_light)
+            return np.asarray(sum(part.T @ (hessian @ part) for hessian, part in zip(hessians, moves, strict=True)))
+
+        everywhere = energy(np.ones_like(textured))
+        alone = np.einsum("jnc,nc->c", own, border)  # diagonal of C
+        unit = np.sqrt(np.where(alone > 0, alone, 1.0))
+        scale = unit[:, None] * unit
+        whole = (everywhere + follows.T @ held) / scale
+        shown, directions = eigh(energy(textured) / scale, whole + _ROUNDING * np.eye(len(unit)))
+        known = directions[:, shown > _SHOWN] / unit[:, None]
+        unknown = directions[:, shown <= _SHOWN] * (alone > 0)[:, None]
+        unknown = unknown / np.maximum(np.linalg.norm(unknown, axis=0), 1e-300)
+        part = (unknown**2).sum(axis=1).reshape(lights - 1, count).sum(axis=1)
+        return cls(
+            follows=follows,
+            moves=moves,
+            pull=border + held,
+            inverse=known @ np.linalg.inv(known.T @ everywhere @ known) @ known.T,
+            hidden=np.append(False, part > _NAMED),
+        )
+
+    def increment(self, free: FloatArray, held_side: FloatArray, rigid_side: FloatArray) -> FloatArray:
+        """Increment (K,) of the coefficients, which the smoothness of unseen nodes has no part in.
+
+        The smoothness would pull the lights together where none sees both sides: what it does to the displacement,
+        `held_side` (2 N,) and H times the increment, is taken out of the coefficients' own equations.
+
+        Parameters
+        ----------
+        free : ndarray, shape (2 N,)
+            Increment of the displacement with the coefficients as they are.
+        held_side : ndarray, shape (2 N,)
+            The smoothness' part of its right-hand side.
+        rigid_side : ndarray, shape (K,)
+            Right-hand side of the coefficients.
+        """
+        return np.asarray(self.inverse @ (rigid_side - self.pull.T @ free + self.follows.T @ held_side))
+
+
+BLOCK = 13
+"""Least side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
+_OF_ELEMENT = 0.75
+"""Side of a block in sides of an element: what elements cannot follow is alike over about that. With 13 px the error of
+40 px elements on waves of 3 to 5 elements was 1.5 to 2.3 times the stated one, so 0.8 to 1.2 times (DIC Challenge)."""
+_ACROSS = 4
+"""Blocks across a region from which they grow with the element: two of 19 px stated 1.8 times too much."""
+_MANY = 700
+"""Blocks, every other one in both directions, whose projections are told from one another by their random signs to half
+a per cent of the share; where a region has fewer, those further apart are projected together, every fourth at most."""
+_ANCHOR = 1e-6
+"""Multiple of the identity, over the texture of an unknown, that holds nodes without."""
+_LEAST = 0.05
+"""Share under which the residual tells nothing of the noise: a region of one block (elements of 4 px leave 0.1)."""
+
+
+def block_side(pixels: PixelMap, element: float) -> int:
+    """Side (px) of the blocks for elements of side `element` (px); a small region has `_ACROSS` of them across."""
+    return max(BLOCK, min(round(_OF_ELEMENT * element), min(pixels.bounds[2:]) // _ACROSS))
+
+
+def unfitted_fraction(
+    pixels: PixelMap,
+    assembly: Assembly,
+    gradient: FloatImage,
+    weights: FloatImage,
+    side: int,
+) -> float:
+    """Share of the variance of a block's score that is left after the displacement has been fitted to white noise.
+
+    The residual is the noise less its projection P on the columns ``J = grad f phi`` of the least-squares problem. The
+    score of block b is the product with ``c = grad f 1_b``, so ``1 - |P c|^2 / |c|^2`` of its variance is left, with
+    ``|P c|^2 = (J^T c)^T (J^T J)^-1 (J^T c)``; the mean over the blocks is returned. Blocks apart are projected
+    together, with random signs. It falls from 0.85 for elements of 40 px to 0.1 for 4 px, and is not known (NaN) where
+    nothing is left, in a region of about one block.
+
+    Parameters
+    ----------
+    pixels, assembly
+        Of the mesh.
+    gradient, weights : ndarray, shape (2, k, P), (k, P), float32
+        Of the reference images.
+    side
+        Of the blocks, px.
+    """
+
+    def summed(signs: FloatImage | np.float32) -> FloatArray:
+        out = np.zeros((len(pixels.origin), 3, 3, 3))
+        own, geometry = np.empty_like(out), (pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric)
+        for gx, gy, weight in zip(*gradient, weights, strict=True):
+            element_hessian(gx, gy, weight * signs, *geometry, own)
+            out += own
+        return out
+
+    hessian = summed(np.float32(1))
+    total = float(hessian[..., (0, 2)].sum())
+    if not total:
+        return 1.0
+    rows, columns = pixels.grid(side)
+    apart = int(np.clip(np.ceil(2 * np.sqrt(_MANY / (rows * columns))), 2, 4))
+    sign = np.random.default_rng(0).choice(np.array([-1, 1], dtype=np.float32), (rows, columns))
+    projected = []
+    for place in np.ndindex(apart, apart):
+        chosen = np.zeros_like(sign)
+        chosen[place[0] :: apart, place[1] :: apart] = sign[place[0] :: apart, place[1] :: apart]
+        products = summed(pixels.in_blocks(chosen, side)).sum(axis=1)  # the shape functions of an element add up to 1
+        xx_to_yy = assembly.at_nodes(products)
+        projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
+    sides, anchor = np.stack(projected, axis=1), _ANCHOR * total / assembly.size
+    solve = assembly.factorise(assembly.matrix(hessian, anchor * assembly.diagonal))
+    share = 1 - float((sides * solve(sides)).sum()) / total
+    return share if share > _LEAST else float("nan")

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation.fill import fill
 from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.solution import Solution
+from rgbmidic.correlation.solution import Solution, fill
 from rgbmidic.correlation.solve import solve
-from rgbmidic.correlation.track import Start, track
+from rgbmidic.correlation.start import Start, track
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.illumination.normalise import normalise as divide_by_local_mean
+from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names
 from rgbmidic.typing import FloatArray, FloatImage

@@ -10,19 +10,23 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.correlation import (
     BLOCK,
-    bring_back,
     element_hessian,
     element_right_side,
     element_sums,
     element_vector,
+    warp,
 )
 from rgbmidic._kernels.interpolation import pixel_gradient
-from rgbmidic.correlation.assembly import Assembly
-from rgbmidic.correlation.images import spline_coefficients, spline_values, usable_pixels, usable_reach
-from rgbmidic.correlation.recovery import linear_fit_offset
-from rgbmidic.correlation.uncertainty.blocks import block_side, unfitted_share
-from rgbmidic.correlation.uncertainty.propagation import NodeColouring
-from rgbmidic.correlation.windows import spread, window_means
+from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
+from rgbmidic.correlation.images import (
+    spline_coefficients,
+    spline_values,
+    spread,
+    usable_pixels,
+    usable_reach,
+    window_means,
+)
+from rgbmidic.correlation.recovery import NodeColouring, linear_fit_offset
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
@@ -98,7 +102,7 @@ class Reference:
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded.
     unfitted : float
-        Share of the variance of a block's score that the fit leaves in the residual (`unfitted_share`).
+        Share of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
     values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
     texture : ndarray, shape (2, P), float32
@@ -166,7 +170,7 @@ class Reference:
             colouring=NodeColouring.from_mesh(mesh),
             material=mesh,
             linear_offset=linear_fit_offset(mesh),
-            unfitted=unfitted_share(pixels, assembly, gradient, weighted, block_side(pixels, mesh.size)),
+            unfitted=unfitted_fraction(pixels, assembly, gradient, weighted, block_side(pixels, mesh.size)),
             images=ready,
             weights=usable,
             values=pixels.gather(ready),
@@ -196,7 +200,7 @@ class Reference:
         """Element blocks of a light's Hessian with the pixel weights (P,)."""
         return self.blocks(weight, self.gradient_x[light], self.gradient_y[light])
 
-    def bring_back(
+    def warp(
         self,
         deformed: Deformed,
         light: int,
@@ -217,7 +221,7 @@ class Reference:
             self.pixel_weights[light],
         )
         motion = displacement - self.offset(deformed)
-        bring_back(*images, *self._geometry(), motion, difference, weight, moments)
+        warp(*images, *self._geometry(), motion, difference, weight, moments)
 
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray

@@ -1,18 +1,25 @@
-"""What the two states differ by at a displacement: f - g(x + u) of every light at the owned pixels."""
+"""What the two states differ by at a displacement: f - g(x + u) of every light at the owned pixels.
+
+Grey-level correction: the reference brought to the brightness and contrast of the deformed images.
+
+How bright each light is in a state, against the reference: lamps flicker, shutters jitter, a light goes out.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from rgbmidic._kernels.correlation import element_squares, subtract_quadratic
+from rgbmidic._kernels.correlation import element_squares, element_vector, interpolate_nodal, subtract_quadratic
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.mesh.tri3 import with_data
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Residual", "curved_deviation"]
+__all__ = ["Residual", "brightness_change", "corrected_values", "curved_deviation"]
 
 _ROUNDING = 2e-7
 """Share of the sum of squares below which their sum beyond the mean is that of rounding, in single precision."""
@@ -51,7 +58,7 @@ class Residual:
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
             out = difference[light], weights[light], moments[light]
-            reference.bring_back(deformed, light, values[light], displacement, *out)
+            reference.warp(deformed, light, values[light], displacement, *out)
         return cls(reference=reference, values=values, weights=weights, difference=difference, moments=moments)
 
     @property
@@ -113,3 +120,127 @@ def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArra
     deviation = sag.transpose(0, 2, 1) @ products
     deviation[..., :3] -= carried[first].transpose(0, 2, 1) @ barycentric
     return np.asarray(deviation, dtype=np.float32)
+
+
+_LEAST_GAIN = 0.05
+"""Least gain of the local correction: a light that has lost 95 % of its contrast is not amplified any further."""
+_SMOOTHNESS = 1e-3
+"""Weight of the smoothness of gain and offset over the mean entry of their matrix: carries them over what is unseen."""
+
+
+def corrected_values(residual: Residual, kind: Literal["none", "global", "local"]) -> FloatImage:
+    """Reference grey levels (k, P) brought to the brightness and contrast of the deformed images.
+
+    ``"global"``: one gain and offset per light. ``"local"``: gain and offset as linear shape functions on the mesh
+    (grey-level correction, paper, section 2.2). In both, f is taken as ``a g + b``; what is returned is ``(f - b) / a``
+    of the uncorrected reference. ``"none"``: that itself.
+    """
+    reference = residual.reference
+    if kind == "none":
+        return reference.values
+    lights = zip(reference.values, residual.warped, residual.weights, strict=True)
+    if kind == "global":
+        return np.stack([_one_gain(f, g, weight.astype(np.float64)) for f, g, weight in lights])
+    return np.stack([_gain_field(reference, f, g, weight) for f, g, weight in lights])
+
+
+def _one_gain(f: FloatImage, g: FloatImage, weight: FloatArray) -> FloatImage:
+    total = weight.sum()
+    if not total:
+        return f
+    mean_f, mean_g = (weight * f).sum() / total, (weight * g).sum() / total
+    # both images carry the same noise: the ratio of the deviations is not attenuated by it
+    spread_f, spread_g = (float((weight * (i - m) ** 2).sum()) for i, m in ((f, mean_f), (g, mean_g)))
+    gain = np.sqrt(spread_f / spread_g) if spread_f > 0 and spread_g > 0 else 1.0
+    return np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32)
+
+
+def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: FloatImage) -> FloatImage:
+    if not weight.any():
+        return f
+    pixels, assembly = reference.pixels, reference.assembly
+    scale = float(np.sqrt((weight * g * g).sum() / weight.sum())) or 1.0
+    g = g / np.float32(scale)
+    system = assembly.matrix(reference.blocks(weight, g, np.ones_like(g)))
+    smooth = _SMOOTHNESS * system.diagonal().mean() * assembly.smoothness.data
+    parts = np.zeros((len(reference.mesh.elements), 3, 2))
+    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+    element_vector(weight, f, g, np.ones_like(g), *geometry, parts)
+    nodal = assembly.factorise(with_data(system, system.data + smooth))(assembly.vector(parts)).reshape(-1, 2)
+    fields = np.empty((2, f.size), dtype=np.float32)
+    interpolate_nodal(nodal, reference.mesh.elements, *geometry, fields)
+    gain = np.maximum(fields[0] / np.float32(scale), np.float32(_LEAST_GAIN))
+    return np.asarray((f - fields[1]) / gain, dtype=np.float32)
+
+
+_LEAST = 12
+"""Pixels of an element that must be known in both states."""
+_ENOUGH = 36
+"""Pixels of an element that are looked at, about."""
+_MANY = 400
+"""Elements that are looked at, about: the median over them is known to 6 % of their scatter."""
+
+
+def brightness_change(
+    first: FloatImage,
+    second: FloatImage,
+    reference: Reference,
+    displacement: FloatArray,
+) -> FloatArray:
+    """Gain and offset of every light, ``second = gain first + offset``, as the median over the elements.
+
+    The gain is the ratio of the speckle's contrasts (what the lamp gives), which noise that is alike in both states
+    changes little; the offset is what the mean has beyond that (reflections, stray light).
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (k, H, W)
+        Images of the two states in grey levels, before any normalisation, of one size or not; NaN where unknown.
+    reference
+        Mesh and pixels of the reference state.
+    displacement : ndarray, shape (N, 2)
+        Of the nodes in px, from their place in the first images to that in the second; elements with a node that is NaN
+        are left out.
+
+    Returns
+    -------
+    ndarray, shape (k, 2)
+        Gain and offset (grey levels); NaN where no element is seen in both states.
+    """
+    mesh, pixels = reference.mesh, reference.pixels
+    chosen = np.arange(0, len(mesh.elements), max(1, len(mesh.elements) // _MANY))
+    motion, size = displacement[mesh.elements[chosen]].mean(axis=1), np.diff(pixels.offsets)[chosen]
+    seen = np.isfinite(motion).all(axis=1) & (size >= _LEAST)
+    chosen, step, size = chosen[seen], np.round(motion[seen]).astype(np.int64), size[seen]
+    slots = pixels.offsets[chosen, None] + np.arange(_ENOUGH) * size[:, None] // _ENOUGH
+    columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[chosen, :1]
+    rows = pixels.local_y[slots].astype(np.int64) + pixels.origin[chosen, 1:]
+    height, width = second.shape[1:]
+    across, down = columns + step[:, :1], rows + step[:, 1:]
+    inside = (down >= 0) & (down < height) & (across >= 0) & (across < width)
+    there = np.clip(down, 0, height - 1) * width + np.clip(across, 0, width - 1)
+    f, g = (
+        np.take(images.reshape(len(images), -1), at, axis=1)
+        for images, at in ((first, rows * first.shape[2] + columns), (second, there))
+    )
+    return np.array([_gain_and_offset(*pair, inside) for pair in zip(f, g, strict=True)])
+
+
+def _gain_and_offset(f: FloatImage, g: FloatImage, inside: BoolArray) -> tuple[float, float]:
+    """From the samples (E, n) of elements."""
+    known = inside & np.isfinite(f) & np.isfinite(g)
+    known &= known.sum(axis=1, keepdims=True) >= _LEAST
+    seen = np.asarray(known.any(axis=1))
+    known, number = known[seen], known[seen].sum(axis=1)
+
+    def moments(values: FloatImage) -> tuple[FloatArray, FloatArray]:
+        exact = np.where(known, values[seen], 0).astype(np.float64)
+        mean = exact.sum(axis=1) / number
+        return mean, np.maximum((exact**2).sum(axis=1) / number - mean**2, 0)
+
+    (mean_f, contrast_f), (mean_g, contrast_g) = moments(f), moments(g)
+    textured = contrast_f > 0.05 * np.median(contrast_f) if seen.any() else seen[:0]
+    if not textured.any():
+        return float("nan"), float("nan")
+    gain = float(np.median(np.sqrt(contrast_g[textured] / contrast_f[textured])))
+    return gain, float(np.median(mean_g[textured] - gain * mean_f[textured]))

@@ -1,17 +1,26 @@
-"""What the solve gives: a displacement field with its uncertainty, and how it was reached."""
+"""What the solve gives: a displacement field with its uncertainty, and how it was reached.
+
+Nodes that no light sees, filled from those around by a smooth field, for users who ask for it.
+
+The field minimises the squared graph Laplacian over the unmeasured nodes after a quadratic trend of the measured ones
+is taken off (a thin plate that bends as little as it can). The uncertainty is that of the nearest measured node plus
+what neighbouring nodes differ from that trend by, growing with the square root of the number of elements crossed, like
+a random walk.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NO_MATCH", "NodeStatus", "Solution", "Status"]
+__all__ = ["NO_MATCH", "NodeStatus", "Solution", "Status", "fill"]
 
 NO_MATCH = "the images do not match anywhere in the region"
 """Reason of a frame in which nothing was found."""
@@ -56,7 +65,7 @@ class Solution:
         nodes around; NaN where the node or a neighbour is not measured.
     node_status : ndarray, shape (N,), uint8
         See `NodeStatus`.
-    light_share : ndarray, shape (N, k), float64
+    light_fraction : ndarray, shape (N, k), float64
         Share of each light in what determines the node.
     misfit : ndarray, shape (N,), float64
         Weighted rms residual around the node over its median: 1 is ordinary; well above it the result is suspicious.
@@ -69,7 +78,7 @@ class Solution:
     residual : ndarray, shape (k,), float64
         Weighted rms of ``f - g(x + u)`` of each light, in grey levels of the filtered images; NaN where a light has
         no weight.
-    weight_share : ndarray, shape (k,), float64
+    weight_fraction : ndarray, shape (k,), float64
         Mean over the pixels of the region of each light's share in the sum of the weights; adds up to the part of the
         region that any light sees.
     history : ndarray, shape (iterations,), float64
@@ -83,13 +92,13 @@ class Solution:
     strain: FloatArray
     strain_std: FloatArray
     node_status: npt.NDArray[np.uint8]
-    light_share: FloatArray
+    light_fraction: FloatArray
     misfit: FloatArray
     status: Status
     reason: str
     rigid: FloatArray
     residual: FloatArray
-    weight_share: FloatArray
+    weight_fraction: FloatArray
     history: FloatArray
 
     @classmethod
@@ -104,13 +113,13 @@ class Solution:
             strain=np.full((count, 3), np.nan),
             strain_std=np.full((count, 3), np.nan),
             node_status=np.full(count, NodeStatus.NOT_SEEN, dtype=np.uint8),
-            light_share=np.zeros((count, lights)),
+            light_fraction=np.zeros((count, lights)),
             misfit=np.full(count, np.nan),
             status=Status.FAILED,
             reason=reason,
             rigid=np.zeros((lights, 0)),
             residual=np.full(lights, np.nan),
-            weight_share=np.zeros(lights),
+            weight_fraction=np.zeros(lights),
             history=history,
         )
 
@@ -125,6 +134,65 @@ class Solution:
         return np.asarray(self.node_status == NodeStatus.MEASURED)
 
     @property
-    def unmeasured_share(self) -> float:
+    def unmeasured_fraction(self) -> float:
         """Share of the nodes that are not measured."""
         return float((self.node_status != NodeStatus.MEASURED).mean())
+
+
+def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
+    """Fill the displacement of unmeasured nodes within `longest` px of a measured one.
+
+    Filled nodes get `NodeStatus.FILLED` and a larger `displacement_std`; strains are left as they are.
+    """
+    measured = solution.measured
+    if measured.all() or measured.sum() < 6:
+        return solution
+    distance, nearest = mesh.nearest(measured)
+    filled = ~measured & (distance <= longest)
+    if not filled.any():
+        return solution
+    trend, rest = _quadratic_trend(mesh.nodes, solution.displacement, measured)
+    step = _step_between_neighbours(mesh, rest, measured)
+    size = float(np.sqrt(2 * mesh.areas.mean()))
+    std = np.hypot(solution.displacement_std[nearest], step * np.sqrt(np.minimum(distance, longest) / size)[:, None])
+    displacement = trend + _smooth(mesh, rest, measured)
+    return replace(
+        solution,
+        displacement=np.where(filled[:, None], displacement, solution.displacement),
+        displacement_std=np.where(filled[:, None], std, solution.displacement_std),
+        node_status=np.where(filled, np.uint8(NodeStatus.FILLED), solution.node_status),
+    )
+
+
+def _quadratic_trend(nodes: FloatArray, displacement: FloatArray, measured: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Quadratic least-squares fit at all nodes (N, 2), and what the measured ones leave (0 elsewhere)."""
+    scaled = (nodes - nodes.mean(axis=0)) / np.ptp(nodes, axis=0).max()
+    x, y = scaled.T
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    trend = basis @ np.linalg.lstsq(basis[measured], displacement[measured], rcond=1e-9)[0]
+    return trend, np.where(measured[:, None], displacement - trend, 0.0)
+
+
+def _step_between_neighbours(mesh: Tri3Mesh, rest: FloatArray, measured: BoolArray) -> FloatArray:
+    """Rms difference (2,) of neighbouring measured nodes."""
+    i, j = mesh.neighbours.T
+    both = measured[i] & measured[j]
+    return np.asarray(np.sqrt(np.mean((rest[i[both]] - rest[j[both]]) ** 2, axis=0)) if both.any() else np.zeros(2))
+
+
+def _smooth(mesh: Tri3Mesh, rest: FloatArray, measured: BoolArray) -> FloatArray:
+    """`rest` (N, 2) at the measured nodes, and the field of least squared Laplacian through them elsewhere."""
+    from scipy.sparse.linalg import spsolve
+
+    count = len(mesh.nodes)
+    i, j = mesh.neighbours.T
+    adjacency = sp.csr_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
+    adjacency = adjacency + adjacency.T
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    laplacian = sp.eye(count, format="csr") - sp.diags(1 / np.maximum(degree, 1)) @ adjacency
+    energy = sp.csc_matrix(laplacian.T @ laplacian + 1e-8 * sp.eye(count))
+    free, known = np.flatnonzero(~measured), np.flatnonzero(measured)
+    out = rest.copy()
+    right = -(energy[free][:, known] @ rest[known])
+    out[free] = np.asarray(spsolve(energy[free][:, free].tocsc(), right)).reshape(-1, 2)
+    return out

@@ -15,9 +15,8 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.covariance import NodalCovariance
-from rgbmidic.fields.locate import Places
 from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
+from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 

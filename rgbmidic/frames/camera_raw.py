@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.complaints import complaints
 from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import StoredFrame, check_size, damaged
+from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
 from rgbmidic.frames.tiff_pages import RawStructure
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray, FloatArray

@@ -1,4 +1,9 @@
-"""Phantom movies (.cine): frames as the sensor gave them, each read by itself.
+"""What the header of a Phantom movie (.cine) tells, checked before anything large is read.
+
+Offsets are those of the structures CINEFILEHEADER, BITMAPINFOHEADER and SETUP of Vision Research's format; SETUP has
+grown over the years, and of it only what a file stores is read.
+
+Phantom movies (.cine): frames as the sensor gave them, each read by itself.
 
 The format is Vision Research's ("The Cine File Format"). Samples come as 8 bit, as 8 to 16 bit in 16-bit containers, or
 packed: 12 bit, or 10 bit in a code that is not linear.
@@ -6,20 +11,317 @@ packed: 12 bit, or 10 bit in a code that is not linear.
 
 from __future__ import annotations
 
+import math
+import os
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.cine_header import CineHeader, read_header
-from rgbmidic.frames.recording import Recording
+from rgbmidic.frames.data import Recording
 from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import StoredFrame, damaged
+from rgbmidic.frames.stored import StoredFrame, check_size, damaged
+from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray
 
-__all__ = ["CINE_ENDINGS", "CineFile"]
+__all__ = ["CINE_ENDINGS", "CineFile", "CineHeader", "read_header"]
+
+_FILE, _BITMAP = struct.Struct("<2s3HiIi4IQ"), struct.Struct("<I2i2H6I")
+_SETUP = {
+    "frame_rate_16": (0, "H"),
+    "shutter_us_16": (2, "H"),
+    "flip_horizontally": (756, "I"),
+    "flip_vertically": (760, "I"),
+    "frame_rate_32": (768, "I"),
+    "shutter_us": (772, "I"),
+    "cfa": (808, "I"),
+    "rotate": (884, "i"),
+    "bits": (896, "I"),
+    "shutter_ns": (1568, "I"),
+    "black": (5732, "i"),
+    "white": (5736, "i"),
+    "frame_rate": (10400, "d"),
+}
+"""Place and type of the fields of SETUP that are read."""
+_MARK, _LENGTH = 140, 142
+_TIMES, _EXPOSURES = 1002, 1003
+_STAMPS = {_TIMES: "<u8", _EXPOSURES: "<u4"}
+_MOST_BLOCKS, _MOST_FRAMES = 100, 2**25
+"""What no file of a camera has: Phantom's own have five blocks, and the largest memories hold some million frames."""
+
+_LEAD, _UNINTERPOLATED = 1, 2
+_BITS = {256: 10, 1024: 12}
+"""Bits of a sample that each code of packed frames means."""
+_PATTERNS = {3: "GBRG", 4: "RGGB"}
+_OLD_PATTERNS = (1, 2)
+_GREY_HEADS = 0xF0000000
+_SECOND = 10**9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CineHeader:
+    """What a movie's header tells.
+
+    Attributes
+    ----------
+    shape
+        Rows and columns.
+    bits
+        Bits that a sample is stored in: 8, 16, or packed 10 or 12.
+    bottom_up
+        Whether the last row is stored first.
+    kind, cfa
+        Pattern of the frame's first pixels; None where the header does not tell.
+    black_level, white_level
+        Grey levels as the header tells them; no black level where that cannot be.
+    recording
+        How the frames were recorded.
+    pointers : ndarray, shape (count,), int64
+        Where each frame begins in the file.
+    first_byte
+        Where the first frame can begin.
+    size
+        Bytes of the file.
+    """
+
+    shape: tuple[int, int]
+    bits: int
+    bottom_up: bool
+    kind: FrameKind | None
+    cfa: str | None
+    black_level: int | None
+    white_level: int
+    recording: Recording
+    pointers: npt.NDArray[np.int64]
+    first_byte: int
+    size: int
+
+    @property
+    def coded(self) -> bool:
+        """Whether samples are stored in the code of packed 10 bit, which is not linear."""
+        return self.bits == 10
+
+    @property
+    def last_whole(self) -> int:
+        """Index of the last frame before the first that the file does not hold whole; -1 where it holds none."""
+        begun = (self.pointers >= self.first_byte) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
+        return int(np.argmin(np.append(begun, False))) - 1
+
+    def lines(self, size: int) -> tuple[int, int] | None:
+        """Number and bytes of the lines that a frame of `size` bytes is stored in; None where its size cannot be."""
+        rows, columns = self.shape
+        if size == _needed(self.shape, self.bits):
+            return (rows, size // rows) if self.bits in (8, 16) else (1, size)
+        line = math.ceil(columns * self.bits / 32) * 4  # as in Windows bitmaps
+        return (rows, line) if size == rows * line else None
+
+
+def read_header(path: Path) -> CineHeader:
+    """Read the header of a movie.
+
+    Raises
+    ------
+    FrameError
+        It is damaged, or announces what no camera records or what is not the sensor's samples.
+    """
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        mark, _, compression, version, _, _, first, count, *places, trigger = _unpacked(path, file, _FILE, 0)
+        if mark != b"CI":
+            raise FrameError(f"{path} is no Phantom movie: it does not begin as one")
+        if not 0 < count <= _MOST_FRAMES:
+            raise damaged(path, f"its header announces {count} frames")
+        _, columns, height, _, bit_count, packing, _, _, _, _, levels = _unpacked(path, file, _BITMAP, places[0])
+        setup, end = _setup(path, file, places[1])
+        kind, cfa = _colours(path, compression, bit_count, setup.get("cfa", 0))
+        bits, shape = _bits(path, bit_count, packing), (abs(height), columns)
+        if min(shape) < 1:
+            raise damaged(path, f"its header announces {shape[0]} rows of {shape[1]} pixels")
+        check_size(path, needed=2 * math.prod(shape), stored=_needed(shape, bits))
+        depth = _depth(bits, setup.get("bits", 0), levels)
+        black, white, doubt = _levels(setup, depth)
+        pointers = _pointers(path, file, version, count, places[2])
+        times, exposures = _stamps(path, file, (end, places[2]), count)
+    return CineHeader(
+        shape=shape,
+        bits=bits,
+        bottom_up=height > 0 and bits in (8, 16),
+        kind=kind,
+        cfa=cfa,
+        black_level=black,
+        white_level=white,
+        recording=Recording(
+            count=count,
+            bit_depth=depth,
+            frame_rate=_frame_rate(setup),
+            exposure_ns=_exposure(setup, exposures),
+            trigger=-first,
+            times_ns=None if times is None else _since(times, trigger),
+            remarks=(*doubt, *_viewer(setup)),
+        ),
+        pointers=pointers,
+        first_byte=_FILE.size,
+        size=size,
+    )
+
+
+def _needed(shape: tuple[int, int], bits: int) -> int:
+    """Bytes of a frame."""
+    return -(-math.prod(shape) * bits // 8)
+
+
+def _piece(path: Path, file: BinaryIO, start: int, length: int) -> bytes:
+    file.seek(start)
+    piece = file.read(length)
+    if len(piece) < length:
+        raise damaged(path, f"its header goes on to byte {start + length}, the file has {start + len(piece)} or less")
+    return piece
+
+
+def _unpacked(path: Path, file: BinaryIO, layout: struct.Struct, start: int) -> tuple[Any, ...]:
+    return layout.unpack(_piece(path, file, start, layout.size))
+
+
+def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]:
+    """The fields that the camera's settings store, and where these end."""
+    head = _piece(path, file, start, _LENGTH + 2)
+    length = int.from_bytes(head[_LENGTH:], "little")
+    if head[_MARK:_LENGTH] != b"ST" or length < len(head):
+        raise damaged(path, "the camera's settings in its header are not where they should be")
+    stored = _piece(path, file, start, length)
+    layouts = {name: (place, struct.Struct("<" + kind)) for name, (place, kind) in _SETUP.items()}
+    fields = {
+        name: layout.unpack_from(stored, place)[0]
+        for name, (place, layout) in layouts.items()
+        if place + layout.size <= length
+    }
+    return fields, start + length
+
+
+def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[FrameKind | None, str | None]:
+    """Kind and pattern; a colour camera's picture that was made grey is neither, nor is one of an unknown code.
+
+    Raises
+    ------
+    FrameError
+        The samples are not the sensor's, or the pattern is no Bayer pattern.
+    """
+    if compression == _LEAD:
+        _refuse(path, "compressed (JPEG)")
+    if bit_count > 16:
+        _refuse(path, "processed (interpolated) colour")
+    if compression not in (0, _UNINTERPOLATED):
+        raise damaged(path, f"its header announces the kind of compression {compression}, which is unknown")
+    if code & _GREY_HEADS:
+        raise FrameError(f"{path} joins the pictures of grey and colour heads (code {code:#x}), which is not read")
+    if compression == _UNINTERPOLATED and code in _OLD_PATTERNS:
+        raise FrameError(f"{path} has the colour filter array {code} of old cameras, which is no Bayer pattern")
+    if compression == _UNINTERPOLATED and code in _PATTERNS:
+        return "bayer", _PATTERNS[code]
+    return ("monochrome" if code == compression == 0 else None), None
+
+
+def _refuse(path: Path, what: str) -> NoReturn:
+    raise FrameError(
+        f"{path} is {what}: its samples are no longer the sensor's; save it as raw .cine from the camera's software"
+    )
+
+
+def _bits(path: Path, bit_count: int, packing: int) -> int:
+    if packing in _BITS:
+        return _BITS[packing]
+    if packing == 0 and bit_count in (8, 16):
+        return bit_count
+    raise damaged(
+        path, f"its header announces samples of {bit_count} bit, packed in the way {packing}, which is unknown"
+    )
+
+
+def _depth(bits: int, real: int, levels: int) -> int:
+    """Bits of a sample, packed 10 bit being a code for 12: the header's number, else as its number of levels needs."""
+    if bits in (10, 12):
+        return 12
+    return next((told for told in (real, (levels - 1).bit_length()) if 8 <= told <= bits), bits)
+
+
+def _levels(setup: Mapping[str, int], depth: int) -> tuple[int | None, int, tuple[str, ...]]:
+    """Black and white level, and what is wrong with those of the header: some cameras store none, or those of 8 bit."""
+    largest = 2**depth - 1
+    black, white = setup.get("black", 0), setup.get("white", 0)
+    if 0 <= black < white <= largest and (white > 255 or depth == 8):
+        return black, white, ()
+    told = f"black level {black} and white level {white} of its header do not fit samples of {depth} bit: not used"
+    return None, largest, (told,) if black or white else ()
+
+
+def _pointers(path: Path, file: BinaryIO, version: int, count: int, start: int) -> npt.NDArray[np.int64]:
+    """Where each frame begins: 64 bit, in files of the first version 32."""
+    if version not in (0, 1):
+        raise damaged(path, f"its header announces the version {version} of the format; known are 0 and 1")
+    stored = np.dtype("<i8" if version else "<u4")
+    return _array(path, file, stored, count, start).astype(np.int64)
+
+
+def _array(path: Path, file: BinaryIO, stored: np.dtype[Any], count: int, start: int) -> npt.NDArray[Any]:
+    size = os.fstat(file.fileno()).st_size
+    if start + count * stored.itemsize > size:
+        raise damaged(path, f"a table of its {count} frames ends behind the end of the file, at byte {size}")
+    return np.frombuffer(_piece(path, file, start, count * stored.itemsize), dtype=stored)
+
+
+def _stamps(
+    path: Path, file: BinaryIO, between: tuple[int, int], count: int
+) -> tuple[npt.NDArray[np.uint64] | None, npt.NDArray[np.uint32] | None]:
+    """Times and exposures (count,) of the frames, as they are stored in tagged blocks; None where there are none."""
+    found: dict[int, npt.NDArray[Any]] = {}
+    place, end = between
+    for _ in range(_MOST_BLOCKS):
+        if place + 8 > end:
+            break
+        length, kind = struct.unpack("<IH", _piece(path, file, place, 6))
+        if kind in _STAMPS:
+            stored = np.dtype(_STAMPS[kind])
+            if length - 8 < count * stored.itemsize:
+                raise damaged(path, f"block {kind} of its header has {length} bytes, too few for {count} frames")
+            found[kind] = _array(path, file, stored, count, place + 8)
+        if length < 8:
+            break
+        place += length
+    return found.get(_TIMES), found.get(_EXPOSURES)
+
+
+def _since(times: npt.NDArray[np.uint64], trigger: int) -> npt.NDArray[np.int64]:
+    """Times in ns from the trigger; both are seconds in fixed point 32.32, whose last two bits tell something else."""
+    flags = np.uint64(3)
+    ticks = ((times & ~flags) - (np.uint64(trigger) & ~flags)).astype(np.int64)
+    return np.asarray((ticks >> 32) * _SECOND + (((ticks & 0xFFFFFFFF) * _SECOND + 2**31) >> 32))
+
+
+def _frame_rate(setup: Mapping[str, float]) -> float | None:
+    rates = (setup.get(name, 0.0) for name in ("frame_rate", "frame_rate_32", "frame_rate_16"))
+    return next((float(rate) for rate in rates if math.isfinite(rate) and rate > 0), None)
+
+
+def _exposure(setup: Mapping[str, int], exposures: npt.NDArray[np.uint32] | None) -> int | None:
+    """Exposure in ns: as stamped (0.32 fixed point seconds), else as it was set."""
+    stamped = 0 if exposures is None else (int(np.sort(exposures)[len(exposures) // 2]) * _SECOND + 2**31) >> 32
+    us = setup.get("shutter_us", 0) or setup.get("shutter_us_16", 0)
+    return stamped or setup.get("shutter_ns", 0) or 1000 * us or None
+
+
+def _viewer(setup: Mapping[str, int]) -> tuple[str, ...]:
+    """What the camera's viewer does with the picture, which the samples know nothing of."""
+    names = ("flip_horizontally", "flip_vertically", "rotate")
+    done = [name.replace("_", " ") for name in names if setup.get(name, 0)]
+    return (
+        (f"the viewer's settings are left out ({', '.join(done)}): frames are as the sensor gave them",) if done else ()
+    )
+
 
 CINE_ENDINGS = (".cine", ".cin", ".cci")
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.formats import reader_name
+from rgbmidic.frames.images import write_tiff
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.frames.writers import write_tiff
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import FloatArray
 

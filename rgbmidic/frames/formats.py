@@ -11,13 +11,10 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
 from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.hdf5 import HDF5_ENDINGS, Hdf5File, split_dataset
-from rgbmidic.frames.headerless import HeaderlessFile, is_headerless
-from rgbmidic.frames.mraw import MRAW_ENDINGS, MrawFile
-from rgbmidic.frames.npy import NpyFile
-from rgbmidic.frames.png import PngFile
-from rgbmidic.frames.seq import SeqFile
+from rgbmidic.frames.images import HeaderlessFile, PngFile, is_headerless
+from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
+from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
 from rgbmidic.frames.stored import Camera
 from rgbmidic.frames.tiff import TiffFile
 from rgbmidic.frames.tiff_pages import is_dng

@@ -16,11 +16,10 @@ from itertools import accumulate
 from pathlib import Path
 
 from rgbmidic.errors import FrameError, disk_reason, legible
-from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import FRAME_ENDINGS, advice, open_source
-from rgbmidic.frames.hdf5 import split_dataset
-from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.source import FrameSource, file_fingerprint
+from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
 from rgbmidic.settings import FrameSettings
 

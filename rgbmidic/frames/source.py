@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from rgbmidic.errors import FrameError, disk_reason, legible
-from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
-from rgbmidic.frames.recording import Recording
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings, regular
 

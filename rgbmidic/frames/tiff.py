@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.opencv import decode
+from rgbmidic.frames.images import decode
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import CHECKED_FROM, StoredFrame, check_size, damaged
 from rgbmidic.frames.tiff_pages import cfa_pattern, is_stored_as_is, missing_data, tag, tiff_pages

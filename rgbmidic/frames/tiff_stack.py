@@ -15,10 +15,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.layout import Layout, check_count
-from rgbmidic.frames.recording import Integers, Recording, even_times
+from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import StoredFrame, damaged
+from rgbmidic.frames.stored import Layout, StoredFrame, check_count, damaged
 from rgbmidic.frames.tiff import checked_page, page_frame, page_rows
 from rgbmidic.frames.tiff_pages import HEADERS as _HEADERS
 from rgbmidic.frames.tiff_pages import is_stored_as_is, tiff_page

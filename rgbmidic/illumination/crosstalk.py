@@ -3,19 +3,26 @@
 A varies over the field where the light falls on the colour filters at an angle (wide lenses, microlenses). It is then
 ``A(x, y) = matrix + sum of coefficients x Legendre products``: the products average to zero over the field, so `matrix`
 stays the mean and whoever ignores the variation makes the smallest error.
+
+Spectra of lights and cameras, and the crosstalk that follows: A[c, l] = sum over wavelengths of S_c E_l.
 """
 
 from __future__ import annotations
 
+import csv
+import json
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import CalibrationError
+from rgbmidic.errors import CalibrationError, InputError
+from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
-__all__ = ["Crosstalk", "CrosstalkField", "legendre_products"]
+__all__ = ["Crosstalk", "CrosstalkField", "Led", "Sensitivities", "legendre_products", "spectral_response"]
 
 
 def legendre_products(points: npt.ArrayLike, shape: tuple[int, int], order: int) -> FloatArray:
@@ -209,3 +216,112 @@ class Crosstalk:
         blocks = self.covariance.reshape(channels, lights, channels, lights)
         variance = np.einsum("ic,cjdj,id->ij", self.unmixing, blocks, self.unmixing)
         return np.asarray(np.sqrt(np.maximum(variance, 0)))
+
+
+HALF_MAXIMUM = 0.921823
+"""Full width at half maximum of Ohno's model over its width parameter: twice the x where (g + 2 g^5)/3 is 1/2 for
+g = exp(-x^2)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Led:
+    """A light-emitting diode, by the model of Ohno (Optical Engineering 44, 111302, 2005).
+
+    Attributes
+    ----------
+    centre
+        Wavelength of the peak (nm).
+    width
+        Full width at half maximum (nm), as data sheets state it.
+    """
+
+    centre: float
+    width: float = 25.0
+
+    def __post_init__(self) -> None:
+        if not (200 < self.centre < 1200 and 0 < self.width < 300):
+            raise InputError(f"an LED has its centre in 200 to 1200 nm and its width in 0 to 300 nm, not {self}")
+
+    def power(self, wavelengths: FloatArray) -> FloatArray:
+        """Spectral power at the wavelengths (nm), of unit sum: equal spacing is assumed."""
+        g = np.exp(-(((wavelengths - self.centre) * HALF_MAXIMUM / self.width) ** 2))
+        shape = (g + 2 * g**5) / 3
+        if not shape.sum() > 0:
+            raise InputError(f"{self} emits nothing within {wavelengths[0]} to {wavelengths[-1]} nm")
+        return np.asarray(shape / shape.sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensitivities:
+    """Spectral sensitivities of a colour camera.
+
+    Attributes
+    ----------
+    wavelengths : ndarray, shape (n,)
+        Equally spaced (nm).
+    values : ndarray, shape (3, n)
+        Rows R, G, B; any common unit.
+    """
+
+    wavelengths: FloatArray
+    values: FloatArray
+
+    def __post_init__(self) -> None:
+        wavelengths, values = np.asarray(self.wavelengths, dtype=float), np.asarray(self.values, dtype=float)
+        if wavelengths.ndim != 1 or values.shape != (3, wavelengths.size) or wavelengths.size < 2:
+            raise InputError(
+                f"sensitivities are 3 rows over n wavelengths, not {values.shape} over {wavelengths.shape}"
+            )
+        if not (np.isfinite(values).all() and values.min() >= 0 and np.allclose(np.diff(wavelengths, 2), 0)):
+            raise InputError("sensitivities must be finite, not negative, and given at equally spaced wavelengths")
+        object.__setattr__(self, "wavelengths", wavelengths)
+        object.__setattr__(self, "values", values)
+
+    @classmethod
+    def from_colour(cls, name: str) -> Sensitivities:
+        """A camera of colour-science (``colour.MSDS_CAMERA_SENSITIVITIES``), such as "Nikon 5100 (NPL)"."""
+        import colour
+
+        known = colour.MSDS_CAMERA_SENSITIVITIES
+        if name not in known:
+            raise InputError(f"unknown camera {name!r}; colour-science has {', '.join(sorted(known))}")
+        camera = known[name]
+        return cls(wavelengths=camera.wavelengths, values=np.maximum(camera.values.T, 0))
+
+    @classmethod
+    def read(cls, path: Path | str) -> Sensitivities:
+        """Read a camera file: the JSON of rawtoaces, or a CSV with wavelength, R, G, B in its first four columns.
+
+        Raises
+        ------
+        InputError
+            The file is missing or not of this kind.
+        """
+        path = Path(path)
+        try:
+            rows = _read_json(path) if path.suffix.lower() == ".json" else _read_csv(path)
+            table = np.array(rows, dtype=float)
+            return cls(wavelengths=table[:, 0], values=table[:, 1:4].T)
+        except FileNotFoundError:
+            raise InputError(f"sensitivities file not found: {path}") from None
+        except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
+            raise InputError(f"{path} is not a file of camera sensitivities: {error}") from None
+
+
+def spectral_response(sensitivities: Sensitivities, lights: tuple[Led, ...]) -> FloatArray:
+    """Response of each camera channel to each light of equal power, shape (3, k): sum of S_c E_l over wavelengths."""
+    power = np.stack([light.power(sensitivities.wavelengths) for light in lights], axis=1)
+    return sensitivities.values @ power
+
+
+def _read_json(path: Path) -> list[list[float]]:
+    document: Any = json.loads(regular(path).read_text(encoding="utf-8"))
+    spectra = document["spectral_data"]["data"]["main"]
+    return [[float(wavelength), *values] for wavelength, values in sorted(spectra.items(), key=lambda i: float(i[0]))]
+
+
+def _read_csv(path: Path) -> list[list[float]]:
+    with regular(path).open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.reader(stream) if row]
+    start = 0 if rows[0][0].replace(".", "", 1).isdigit() else 1
+    return [[float(value) for value in row[:4]] for row in rows[start:]]

@@ -1,16 +1,23 @@
-"""Grey levels proportional to light: black level subtracted, saturated samples marked."""
+"""Grey levels proportional to light: black level subtracted, saturated samples marked.
+
+What the photon transfer method finds out about a camera, per colour plane, each figure with its uncertainty.
+
+Names and definitions follow EMVA standard 1288 (release 4.0): gain is 1/K, full well is the saturation capacity.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.typing import BoolArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["LinearChannels", "LinearMosaic", "NoiseModel", "linearise"]
+__all__ = ["QUANTISATION", "CameraNoise", "LinearChannels", "LinearMosaic", "NoiseModel", "Quantity", "linearise"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,3 +102,138 @@ def linearise(frame: Mosaic | ChannelFrame, noise: NoiseModel | None = None) -> 
     for row, black in enumerate(frame.black_level.astype(np.float32)):
         values[row::2] -= np.tile(black, -(-values.shape[1] // 2))[: values.shape[1]]
     return LinearMosaic(values=values, saturated=saturated, cfa=frame.cfa, full_scale=full_scale, noise=noise)
+
+
+QUANTISATION = 1 / 12
+"""Variance (DN squared) of rounding to whole grey levels."""
+
+DEFECTS = ("hot", "dead")
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A figure per colour plane and its standard uncertainty, both (P,); NaN where it was not measured."""
+
+    value: FloatArray
+    std: FloatArray
+
+    def __post_init__(self) -> None:
+        value = np.array(self.value, dtype=np.float64, ndmin=1)
+        std = np.array(self.std, dtype=np.float64, ndmin=1)
+        if value.ndim != 1 or value.shape != std.shape or (std < 0).any():
+            raise CalibrationError(
+                f"a figure per plane needs as many uncertainties, none negative: {value.shape}, {std.shape}"
+            )
+        object.__setattr__(self, "value", value)
+        object.__setattr__(self, "std", std)
+
+    @classmethod
+    def unknown(cls, count: int) -> Quantity:
+        """Not measured, for `count` planes."""
+        return cls(np.full(count, np.nan), np.full(count, np.nan))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraNoise:
+    """The camera's noise, per colour plane (R, G1, G2, B of a mosaic; R, G, B of a 3-CCD camera; M).
+
+    Attributes
+    ----------
+    planes : tuple of str, length P
+    gain : Quantity
+        1/K in e-/DN.
+    read_noise : Quantity
+        Temporal dark noise in DN, rounding to grey levels included (what one sample shows).
+    black_level : Quantity
+        Mean dark level in DN.
+    saturation : Quantity
+        Grey level (DN above black) at which samples saturate.
+    linearity_error : Quantity
+        Mean deviation from a straight line in exposure time, in % (EMVA 1288 LE); NaN without exposure times.
+    dsnu : Quantity
+        Spatial standard deviation of the dark level in DN, temporal noise taken out.
+    prnu : Quantity
+        Spatial standard deviation of the response in %, shading and temporal noise taken out; NaN on a textured target.
+    defects : tuple of (int, int, str)
+        Row, column and kind (``"hot"``, ``"dead"``) of pixels to distrust.
+    """
+
+    planes: tuple[str, ...]
+    gain: Quantity
+    read_noise: Quantity
+    black_level: Quantity
+    saturation: Quantity
+    linearity_error: Quantity
+    dsnu: Quantity
+    prnu: Quantity
+    defects: tuple[tuple[int, int, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            quantity = getattr(self, entry.name)
+            if isinstance(quantity, Quantity) and len(quantity.value) != len(self.planes):
+                raise CalibrationError(
+                    f"noise figure {entry.name} has {len(quantity.value)} values for the planes {' '.join(self.planes)}"
+                )
+        for name in ("gain", "read_noise"):
+            value = getattr(self, name).value
+            if not (np.isfinite(value) & (value > 0)).all():
+                raise CalibrationError(f"noise figure {name} must be positive in every plane, not {value.tolist()}")
+        if any(kind not in DEFECTS for _, _, kind in self.defects):
+            raise CalibrationError(f"a defect is one of {', '.join(DEFECTS)}")
+
+    @property
+    def model(self) -> NoiseModel:
+        """One gain and one read noise for all planes: the mean gain, the root mean square read noise."""
+        read = float(np.sqrt((self.read_noise.value**2).mean()))
+        return NoiseModel(gain=float(self.gain.value.mean()), read_noise=read)
+
+    @property
+    def dark_noise(self) -> Quantity:
+        """Temporal dark noise in e-, without the rounding to grey levels (EMVA 1288 sigma_d)."""
+        plain = np.sqrt(np.maximum(self.read_noise.value**2 - QUANTISATION, 0))
+        relative = self.read_noise.value * self.read_noise.std / np.maximum(plain, 1e-9) ** 2
+        return _product(plain, self.gain, relative)
+
+    @property
+    def full_well(self) -> Quantity:
+        """Saturation capacity in e-."""
+        return _product(self.saturation.value, self.gain, self.saturation.std / self.saturation.value)
+
+    @property
+    def dynamic_range(self) -> FloatArray:
+        """Saturation capacity over dark noise, in dB."""
+        return np.asarray(20 * np.log10(self.full_well.value / np.maximum(self.dark_noise.value, 1e-9)))
+
+    def to_document(self) -> dict[str, Any]:
+        """Plain dictionaries, lists and numbers; NaN becomes null."""
+        document: dict[str, Any] = {"planes": list(self.planes)}
+        for entry in fields(self):
+            if isinstance(quantity := getattr(self, entry.name), Quantity):
+                document[entry.name] = {"value": _listed(quantity.value), "std": _listed(quantity.std)}
+        document["defects"] = [list(defect) for defect in self.defects]
+        return document
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any]) -> CameraNoise:
+        """From what `to_document` gave; KeyError, TypeError or ValueError where it is damaged."""
+        quantities = {
+            entry.name: _quantity(document[entry.name])
+            for entry in fields(cls)
+            if entry.name not in ("planes", "defects")
+        }
+        defects = tuple((int(row), int(column), str(kind)) for row, column, kind in document.get("defects", []))
+        return cls(planes=tuple(document["planes"]), defects=defects, **quantities)
+
+
+def _product(value: FloatArray, gain: Quantity, relative: FloatArray) -> Quantity:
+    result = value * gain.value
+    return Quantity(result, result * np.hypot(relative, gain.std / gain.value))
+
+
+def _listed(values: FloatArray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def _quantity(section: dict[str, Any]) -> Quantity:
+    return Quantity(*(np.array([np.nan if v is None else v for v in section[key]]) for key in ("value", "std")))

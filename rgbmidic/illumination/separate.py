@@ -10,13 +10,13 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaic import (
+    SMALLEST_FRAME,
     Demosaicer,
     MalvarDemosaicer,
     NormalisedMosaic,
     Reconstruction,
     ReflectionAwareDemosaicer,
 )
-from rgbmidic.illumination.demosaic.reflection_aware import SMALLEST_FRAME
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linearise import LinearMosaic
 from rgbmidic.illumination.texture import TextureModel

@@ -1,13 +1,17 @@
-"""The demonstration: a virtual test made, calibrated, measured and compared with its exact truth.
+"""What a report of the laboratory writes into its folder: a JSON document, and nothing over what is there.
+
+The demonstration: a virtual test made, calibrated, measured and compared with its exact truth.
 
 It goes the way a laboratory goes: raw frames and calibration captures on disk, the two commands, the result folder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,14 +20,47 @@ from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.rehearsal import rehearsed
+from rgbmidic.lab.planning.plan import rehearsed
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Separation, measure
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["DemoRow", "run_demo"]
+__all__ = ["DemoRow", "check_folder", "run_demo", "write_document"]
+
+
+def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
+    """Refuse a folder in which one of the files would be overwritten.
+
+    Raises
+    ------
+    ResultError
+        `out` is a file, or holds one of the files and `overwrite` is False.
+    """
+    if out.exists() and not out.is_dir():
+        raise ResultError(f"{out} is a file; state a folder")
+    taken = [name for name in files if (out / name).exists()]
+    if taken and not overwrite:
+        raise ResultError(
+            f"{out / taken[0]} is already there; choose another folder, or overwrite it (overwrite=True, --overwrite)"
+        )
+
+
+def write_document(document: Mapping[str, Any], path: Path) -> None:
+    """Write a document as JSON; its folder is made where it does not exist.
+
+    Raises
+    ------
+    ResultError
+        The file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
+
 
 Say = Callable[[str], None]
 

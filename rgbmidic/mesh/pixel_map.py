@@ -1,21 +1,29 @@
-"""The pixel map: each pixel of the region is owned by exactly one element, and stored with its element."""
+"""The pixel map: each pixel of the region is owned by exactly one element, and stored with its element.
+
+A quadratic polynomial fitted to the nodal values around each node: value, slope and curvature at the node.
+
+The recovery of Zhang and Naga (SIAM J. Sci. Comput. 26, 2005), with weights that fall with the distance.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
-from rgbmidic._kernels.grid import block_sums, from_grid, from_image, to_image
+from rgbmidic._kernels.interpolation import block_sums, from_grid, from_image, to_image
 from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
-from rgbmidic.mesh.tri3 import Tri3Mesh
+from rgbmidic.mesh.tri3 import Tri3Mesh, with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["PixelMap"]
+__all__ = ["TERMS", "PixelMap", "blended", "quadratic_fit"]
 
 _RIM = 3.0
 """Farthest (px) that a pixel of the region may lie from the element that owns it."""
@@ -200,3 +208,125 @@ def _shape_functions(corners: FloatArray) -> FloatArray:
     (x1, y1), (x2, y2) = (np.moveaxis(np.roll(corners, turn, axis=1), 2, 0) for turn in (-1, 1))
     areas = np.stack([x1 * y2 - x2 * y1, y1 - y2, x2 - x1], axis=2)
     return np.asarray(areas / areas[..., 0].sum(axis=1)[:, None, None])
+
+
+Index = npt.NDArray[np.intp]
+
+TERMS = ("value", "x", "y", "xx", "xy", "yy")
+"""What the operators of `quadratic_fit` give: the value, its first and its second derivatives."""
+_WIDTH = 0.58
+"""Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements then
+have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear fit's; with
+.45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and at 45 degrees).
+Its square goes with the inverse of the angle that the mesh fills: with .58 everywhere corners scattered 2 times as much
+as the linear fit's, and waves at an edge were seen no better."""
+_TIP = 0.8
+"""Share of the full angle from which a corner of the mesh counts as a crack's tip: an opening of 70 degrees."""
+_RIDGE = np.array([1e-9, 1e-9, 1e-6, 1e-6, 1e-6])
+"""Weight with which slopes and curvatures are held at 0, where too few nodes tell them."""
+
+
+def quadratic_fit(
+    mesh: Tri3Mesh,
+    used: BoolArray,
+    *,
+    information: FloatArray | None = None,
+    offset: FloatArray | None = None,
+) -> tuple[sp.csr_matrix, ...]:
+    """Linear operators (N, N), one for each of `TERMS`, from nodal values to those of the polynomial at each node.
+
+    The polynomial is fitted to the nodes within two edges, reached over `used` elements only: not across a crack or a
+    hole. Quadratic fields are reproduced, at edges too; what too few nodes tell is 0.
+
+    Parameters
+    ----------
+    mesh
+        N nodes, E elements.
+    used : ndarray, shape (E,), bool
+    information : ndarray, shape (N,), optional
+        How well each node is known (inverse variance, any unit): one that is known badly counts little elsewhere.
+    offset : ndarray, shape (N, 3), optional
+        What the given values have beyond a field whose second derivative xx, xy or yy is 1, square px; 0 without.
+    """
+    other, known, weight, structure = _window(mesh, used.tobytes())
+    basis = _basis(mesh, used.tobytes(), None if offset is None else offset.tobytes())
+    if information is not None:
+        own, theirs = np.broadcast_to(information[:, None], other.shape), information[other]
+        weight = weight * np.divide(theirs, own + theirs, out=np.full(other.shape, 0.5), where=own + theirs > 0)
+    weighted = weight[:, None] * basis
+    normal = weighted @ basis.transpose(0, 2, 1)
+    normal[:, range(1, 6), range(1, 6)] += _RIDGE
+    fits = (np.linalg.inv(normal) / mesh.size ** np.array([0, 1, 1, 2, 2, 2])[:, None]) @ weighted
+    return tuple(with_data(structure, fits[:, term].ravel()[known]) for term in range(6))
+
+
+def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray]) -> FloatImage:
+    """The nodes' polynomials at the owned pixels, each counting as its shape function does; continuous, (C, P).
+
+    `polynomials` are the values (N, C) of each of `TERMS`.
+    """
+    value, x, y, xx, xy, yy = polynomials
+    element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
+    out = np.zeros((value.shape[1], pixels.local_x.size), dtype=np.float32)
+    for corner in range(3):
+        node = mesh.elements[element, corner]
+        constant, slope_x, slope_y = pixels.barycentric[element, corner].T
+        share = constant + slope_x * pixels.local_x + slope_y * pixels.local_y
+        dx, dy = pixels.columns - mesh.nodes[node, 0], pixels.rows - mesh.nodes[node, 1]
+        for c in range(len(out)):
+            bent = xx[node, c] * dx * dx / 2 + xy[node, c] * dx * dy + yy[node, c] * dy * dy / 2
+            out[c] += share * (value[node, c] + x[node, c] * dx + y[node, c] * dy + bent)
+    return out
+
+
+@lru_cache(maxsize=1)
+def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
+    """The nodes around each, itself where a row has fewer, (N, W); the places of those that are no such filling; their
+    weights (N, W); and the matrix of these nodes. Kept, for most frames use all elements."""
+    elements = np.frombuffer(used, dtype=bool)
+    share = _surrounded(mesh, elements)
+    reach = _reached(mesh, elements, share)
+    number = np.diff(reach.indptr)
+    known = np.arange(number.max()) < number[:, None]
+    other = np.repeat(np.arange(number.size)[:, None], known.shape[1], axis=1)
+    other[known] = reach.indices
+    square = sum((axis[other] - axis[:, None]) ** 2 for axis in mesh.nodes.T) / mesh.size**2
+    # at an edge the window holds as much of the mesh as inside
+    weight = np.where(known, np.exp(-square * share[:, None] / (2 * _WIDTH**2)), 0.0)
+    return other, np.flatnonzero(known), weight, reach
+
+
+def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
+    """Share (N,) of the full angle around each node that `used` elements fill; 1 where there are none."""
+    corners = mesh.nodes[mesh.elements]
+    ahead, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    across = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
+    angle = np.arctan2(across, (ahead * back).sum(axis=-1)) * used[:, None]
+    share = np.bincount(mesh.elements.ravel(), weights=angle.ravel(), minlength=len(mesh.nodes)) / (2 * np.pi)
+    return np.asarray(np.where(share > 0, share, 1.0))
+
+
+@lru_cache(maxsize=1)
+def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
+    """The polynomials 1, x, y, xx/2, xy, yy/2 about each node at those around, in sides of an element: (N, 6, W)."""
+    other = _window(mesh, used)[0]
+    x, y = ((axis[other] - axis[:, None]) / mesh.size for axis in mesh.nodes.T)
+    basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)
+    if offset is not None:
+        for term, beyond in enumerate(np.frombuffer(offset).reshape(-1, 3).T / mesh.size**2):
+            basis[:, 3 + term] += beyond[other]
+    return basis
+
+
+def _reached(mesh: Tri3Mesh, used: BoolArray, share: FloatArray) -> sp.csr_matrix:
+    """The nodes at most two edges of `used` elements away from each, itself with them, as the entries of its row. No
+    way leads round the tip of a crack to its other side."""
+    corners, itself = mesh.elements[used], np.arange(len(mesh.nodes))
+    rows = np.concatenate([np.repeat(corners, 3, axis=1).ravel(), itself])
+    columns = np.concatenate([np.tile(corners, 3).ravel(), itself])
+    beside = sp.csr_matrix((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(itself.size, itself.size))
+    row = np.repeat(itself, np.diff(beside.indptr))
+    through = with_data(beside, (~(mesh.on_boundary & (share > _TIP)))[row] | (beside.indices == row))
+    reached = sp.csr_matrix(beside @ through)
+    reached.sort_indices()  # or scipy might, later, in one of the matrices that share them
+    return reached

@@ -1,23 +1,26 @@
-"""TRI3 mesh: three-node triangles with linear shape functions, over a region of interest."""
+"""TRI3 mesh: three-node triangles with linear shape functions, over a region of interest.
+
+Sparse matrices of one structure with different entries.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.cracks import edge_keys
-from rgbmidic.mesh.outline import outline_mesh
-from rgbmidic.mesh.region import Region
+from rgbmidic.mesh.region import Region, edge_keys, outline_mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Tri3Mesh"]
+__all__ = ["Tri3Mesh", "with_data"]
 
 logger = logging.getLogger(__name__)
 
@@ -238,3 +241,13 @@ def _rectangle_mesh(
     second = np.where(even, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     elements = np.stack([first, second], 1).reshape(-1, 3).astype(np.int32)
     return np.stack([x.ravel(), y.ravel()], 1), elements
+
+
+Matrix = TypeVar("Matrix", sp.csr_matrix, sp.csc_matrix)
+
+
+def with_data(structure: Matrix, data: FloatArray) -> Matrix:
+    """A matrix with the structure of another, shared with it and not looked through again, and its own `data`."""
+    matrix = copy(structure)
+    matrix.data = data
+    return matrix

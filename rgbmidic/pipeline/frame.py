@@ -16,13 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.correlation import Deformed, Solution, Start, Status, fill
-from rgbmidic.correlation.light_levels import brightness_change
-from rgbmidic.correlation.renewal import Renewal
+from rgbmidic.correlation.reference_update import ReferenceUpdate
+from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.raw_samples import exposure_fault, too_small
+from rgbmidic.pipeline.plan import Plan, exposure_fault, too_small
 from rgbmidic.pipeline.separation import RawState, correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
@@ -38,7 +37,7 @@ _DARK = 0.3
 """Share of its light in the reference under which a light is told to be failing."""
 
 
-def measure_frame(plan: Plan, index: int, start: Start, renewed: Sequence[tuple[int, Solution]] = ()) -> FrameRecord:
+def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[int, Solution]] = ()) -> FrameRecord:
     """Measure one frame of a test.
 
     A frame that cannot be read or measured gives a record with the reason, an error that is not one of rgbmidic's own
@@ -52,12 +51,12 @@ def measure_frame(plan: Plan, index: int, start: Start, renewed: Sequence[tuple[
         Which frame of the series.
     start
         From where its displacement is looked for; a frame of the reference starts from rest.
-    renewed
-        Index and solution of the last two of ``start.renewals``: all that the reference depends on that they make.
+    updated
+        Index and solution of the last two of ``start.reference_updates``: all that the reference they make depends on.
     """
     try:
         with timed(plan.timings) as seconds:
-            values = _measure(plan, index, start, _renewal(plan, renewed))
+            values = _measure(plan, index, start, _renewal(plan, updated))
         return FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
@@ -103,12 +102,12 @@ def read_state(
         raise _UnreadError(str(error)) from error
 
 
-def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str, Any]:
+def _measure(plan: Plan, index: int, start: Start, reference_update: ReferenceUpdate) -> dict[str, Any]:
     """What `FrameRecord.from_solution` is given."""
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
-    window = plan.window_of(start.displacement, renewal.displacement)
+    window = plan.window_of(start.displacement, reference_update.displacement)
     here = plan.window.part_of(window)
     with stage("reading"):
         state, inputs = read_state(plan, index, window)
@@ -120,7 +119,7 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
         weights, ready = plan.weights.deformed(images, index), correlated(images, settings.illumination)
         deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter, origin=window.origin)
     statistics = settings.weights.method == "statistics"
-    solution = renewal.track(deformed, start, settings.solver, statistics=statistics)
+    solution = reference_update.track(deformed, start, settings.solver, statistics=statistics)
     if solution.status is not Status.CONVERGED:
         there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
         causes = _causes(plan, there, images, reference.offset(deformed), solution)
@@ -131,7 +130,7 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
     moved = solution.displacement - reference.offset(deformed)
     brightness = brightness_change(plan.images.values, images.values, reference, moved)
     _tell_dark(name, images.names, brightness)
-    match, best, renewals = _compared(plan, index, start, renewal, deformed, solution)
+    match, best, reference_updates = _compared(plan, index, start, reference_update, deformed, solution)
     step = -(-max(plan.window.shape) // _THUMBNAIL)
     reflection = images.reflection_index(step, here)
     return {
@@ -141,7 +140,7 @@ def _measure(plan: Plan, index: int, start: Start, renewal: Renewal) -> dict[str
         "brightness": brightness,
         "match": match,
         "best_match": best,
-        "renewals": renewals,
+        "reference_updates": reference_updates,
         "weights_thumbnail": _in_bytes(weights[:, *here][:, ::step, ::step]),
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": inputs,
@@ -172,35 +171,35 @@ def _causes(
     return causes
 
 
-def _renewal(plan: Plan, renewed: Sequence[tuple[int, Solution]]) -> Renewal:
-    """The reference that the frames `renewed` make in turn."""
+def _renewal(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUpdate:
+    """The reference that the frames `updated` make in turn."""
 
-    def make() -> Renewal:
-        renewal = Renewal.none(plan.reference)
-        for index, solution in renewed:
+    def make() -> ReferenceUpdate:
+        reference_update = ReferenceUpdate.none(plan.reference)
+        for index, solution in updated:
             window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
             images = plan.separation(read_state(plan, index, window)[0], window)
             weights = plan.weights.deformed(images, index)
             ready = correlated(images, plan.settings.illumination)
-            renewal = renewal.renewed(solution, ready, weights, window.origin)
-        return renewal
+            reference_update = reference_update.updated(solution, ready, weights, window.origin)
+        return reference_update
 
-    return plan.updates.get(tuple(index for index, _ in renewed), make)
+    return plan.updates.get(tuple(index for index, _ in updated), make)
 
 
 def _compared(
-    plan: Plan, index: int, start: Start, renewal: Renewal, deformed: Deformed, solution: Solution
+    plan: Plan, index: int, start: Start, reference_update: ReferenceUpdate, deformed: Deformed, solution: Solution
 ) -> tuple[float, float, tuple[int, ...]]:
     """How well a frame matches its reference, the best match of the frames on it, and who follows as the reference."""
-    if not (plan.settings.frames.renew and solution.measured.any()):
-        return float("nan"), start.best_match, start.renewals
-    match = renewal.match(deformed, solution)
+    if not (plan.settings.frames.update_reference and solution.measured.any()):
+        return float("nan"), start.best_match, start.reference_updates
+    match = reference_update.match(deformed, solution)
     median = float(np.nanmedian(match)) if np.isfinite(match).any() else float("nan")
     best = float(np.fmax(start.best_match, np.float32(median)))
-    if index in plan.settings.frames.reference or not renewal.is_due(match, best):
-        return median, best, start.renewals
+    if index in plan.settings.frames.reference or not reference_update.is_due(match, best):
+        return median, best, start.reference_updates
     logger.warning("frame %d (%s) becomes the reference of those after it", index, plan.series.name(index))
-    return median, 0.0, (*start.renewals, plan.series.chosen.index(index))
+    return median, 0.0, (*start.reference_updates, plan.series.chosen.index(index))
 
 
 def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> None:

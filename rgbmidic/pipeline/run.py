@@ -13,9 +13,8 @@ from rgbmidic._kernels import are_compiled
 from rgbmidic.correlation import Status
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.pipeline.frame import read_state
-from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.schedule import Schedule
+from rgbmidic.pipeline.schedule import Schedule, dependants
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance

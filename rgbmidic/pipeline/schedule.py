@@ -1,9 +1,16 @@
-"""Which frame is measured next, from where it starts, and what becomes of a frame whose worker dies."""
+"""Which frame is measured next, from where it starts, and what becomes of a frame whose worker dies.
+
+In which order frames can be measured: each starts from an earlier one, whatever the number of workers.
+
+The frames are the leaves of a tree of base `STRIDE`: a frame starts from the one before it, every 16th from the 16th
+before, every 256th from the 256th before, and so on, so that chunks of consecutive frames can be measured side by side
+once their key frame is, and any range of frames needs only some key frames of those before it.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import replace
 from heapq import heappop, heappush
@@ -15,13 +22,12 @@ from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
-from rgbmidic.pipeline.order import children, is_key, lineage, parent
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Renewed, Workers
+from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Updated, Workers
 from rgbmidic.results import FrameRecord, ResultStore
 from rgbmidic.typing import FloatArray
 
-__all__ = ["Schedule"]
+__all__ = ["STRIDE", "Schedule", "children", "dependants", "is_key", "lineage", "parent"]
 
 logger = logging.getLogger("rgbmidic.pipeline.frame")
 
@@ -32,7 +38,7 @@ _TRIES = 3
 """Times that a worker may die over a frame, all but the first with that frame alone, before the frame is what kills
 them: two may be chance (memory that another program took)."""
 
-_KEPT = ("u", "v", "node_status", "renewals", "best_match")
+_KEPT = ("u", "v", "node_status", "reference_updates", "best_match")
 _STRAIN = ("exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std")
 _MEASURED = ("u", "v", "u_std", "v_std", *_STRAIN, "node_status", "rigid")
 """Quantities of a frame that the next one starts from, and that it makes a reference with."""
@@ -43,7 +49,7 @@ Progress = Callable[[int, int, str], None]
 class Schedule:
     """The frames of a test that are still to be measured.
 
-    A frame starts from its parent in the tree of `rgbmidic.pipeline.order`, or, where that one failed, from where it
+    A frame starts from its parent in the tree of `rgbmidic.pipeline.schedule`, or, where that one failed, from where it
     started. A key frame that is not measured well from there is measured once more from the frame just before it, and
     the better of both is kept.
     """
@@ -106,7 +112,7 @@ class Schedule:
     def _submit(self, workers: Workers, position: int, start: Start) -> None:
         # a key frame looks for what has been lost; those between follow what there is
         given = replace(start, unmeasured=0.0) if is_key(position) else start
-        future = workers.submit(self._index(position), given, self._renewed(start.renewals))
+        future = workers.submit(self._index(position), given, self._renewed(start.reference_updates))
         self._running[future] = position, start
 
     def _index(self, position: int) -> int:
@@ -189,14 +195,16 @@ class Schedule:
         if not measured.any():
             return start
         after = start.after(self._plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
-        return replace(after, renewals=tuple(kept["renewals"].tolist()), best_match=float(kept["best_match"]))
+        return replace(
+            after, reference_updates=tuple(kept["reference_updates"].tolist()), best_match=float(kept["best_match"])
+        )
 
-    def _renewed(self, renewals: tuple[int, ...]) -> Renewed:
+    def _renewed(self, reference_updates: tuple[int, ...]) -> Updated:
         """Index and solution of the last two frames that became the reference."""
-        if not renewals:
+        if not reference_updates:
             return ()
         mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
-        last = renewals[-2:]
+        last = reference_updates[-2:]
         solutions = (_solution(mesh, lights, kept) for kept in self._store.table().each(_MEASURED, last))
         return list(zip(map(self._index, last), solutions, strict=True))
 
@@ -241,3 +249,59 @@ def _line(name: str, record: FrameRecord) -> str:
         measured = float((record.node_status == NodeStatus.MEASURED).mean())
         return f"{name}: converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
     return f"{name}: {status.name.lower().replace('_', ' ')}: {record.reason}"
+
+
+STRIDE = 16
+"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
+
+
+def parent(position: int) -> int | None:
+    """The frame that a frame starts from; None for the first."""
+    return position - _step(position) if position else None
+
+
+def is_key(position: int) -> bool:
+    """Whether a frame starts from one that is not just before it."""
+    return position > 0 and _step(position) > 1
+
+
+def children(position: int, count: int) -> Iterator[int]:
+    """The frames among `count` that start from a frame."""
+    step = 1
+    while position + step < count:
+        if parent(position + step) == position:
+            yield position + step
+        step *= STRIDE
+
+
+def lineage(position: int) -> Iterator[int]:
+    """A frame, its parent, the parent of that, and so on to the first."""
+    following: int | None = position
+    while following is not None:
+        yield following
+        following = parent(following)
+
+
+def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:
+    """The frames that depend on some, directly or through others, of a test with as many frames as `tries`.
+
+    A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
+    """
+    found: set[int] = set()
+    ahead = list(places)
+    while ahead:
+        place = ahead.pop()
+        after = set(children(place, len(tries)))
+        if place + 1 < len(tries) and tries[place + 1] > 1:
+            after.add(place + 1)
+        ahead += after - found
+        found |= after
+    return found
+
+
+def _step(position: int) -> int:
+    """The largest power of `STRIDE` that divides the position of a frame after the first."""
+    step = 1
+    while position % (step * STRIDE) == 0:
+        step *= STRIDE
+    return step

@@ -9,14 +9,12 @@ import numpy as np
 
 from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
-from rgbmidic.illumination.align import align
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
-from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
-from rgbmidic.illumination.normalise import normalise
 from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmix import unmix
+from rgbmidic.illumination.unmix import align, unmix
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import FloatImage
 

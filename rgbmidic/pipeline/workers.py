@@ -36,7 +36,7 @@ one that gets no memory for its threads never answers."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RGBMIDIC_THREADS")
 """What libraries read, when they start, for the number of their threads."""
 
-Renewed = Sequence[tuple[int, Solution]]
+Updated = Sequence[tuple[int, Solution]]
 """Index and solution of frames that became the reference, see `measure_frame`."""
 
 
@@ -54,7 +54,7 @@ class Workers(ABC):
     slots: int
 
     @abstractmethod
-    def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
+    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
         """Have one frame measured."""
 
     def restart(self) -> None:  # noqa: B027 most have nothing to do
@@ -78,10 +78,10 @@ class Here(Workers):
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
 
-    def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
+    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
         """Measure the frame at once."""
         done: Future[Measured] = Future()
-        done.set_result(Measured(record=measure_frame(self._plan, index, start, renewed), messages=()))
+        done.set_result(Measured(record=measure_frame(self._plan, index, start, updated), messages=()))
         return done
 
 
@@ -116,10 +116,10 @@ class Processes(Workers):
         self._processes = set(multiprocessing.active_children()) - others
         return pool
 
-    def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
+    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
         """Have one frame measured by the next free process."""
         try:
-            return self._executor.submit(_measure_given, index, start, renewed)
+            return self._executor.submit(_measure_given, index, start, updated)
         except BrokenExecutor as error:
             broken: Future[Measured] = Future()
             broken.set_exception(error)
@@ -168,10 +168,10 @@ class Cluster(Workers):
         with _answering():
             return max(sum(map(int, self._client.nthreads().values())), 1)
 
-    def submit(self, index: int, start: Start, renewed: Renewed = ()) -> Future[Measured]:
+    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
         """Have one frame measured by some worker."""
         with _answering():
-            future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, renewed, 1)
+            future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, updated, 1)
         return future
 
     def close(self) -> None:
@@ -219,13 +219,13 @@ class _Messages(logging.Handler):
             self.kept.append((record.levelno, self.format(record)))
 
 
-def _measure_elsewhere(plan: Plan, index: int, start: Start, renewed: Renewed, threads: int) -> Measured:
+def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated, threads: int) -> Measured:
     """Measure a frame in another process, whose log nobody reads."""
     _use_threads(threads)
     logger, handler = logging.getLogger("rgbmidic"), _Messages()
     logger.addHandler(handler)
     try:
-        return Measured(record=measure_frame(plan, index, start, renewed), messages=tuple(handler.kept))
+        return Measured(record=measure_frame(plan, index, start, updated), messages=tuple(handler.kept))
     finally:
         logger.removeHandler(handler)
 
@@ -258,10 +258,10 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _measure_given(index: int, start: Start, renewed: Renewed) -> Measured:
+def _measure_given(index: int, start: Start, updated: Updated) -> Measured:
     assert _given is not None
     plan, threads = _given
-    return _measure_elsewhere(plan, index, start, renewed, threads)
+    return _measure_elsewhere(plan, index, start, updated, threads)
 
 
 def _use_threads(threads: int) -> None:

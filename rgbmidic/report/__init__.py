@@ -1,19 +1,18 @@
 """What is made of a finished result: figures, the pictures beside it, pages of text and pictures."""
 
-from rgbmidic.report.document import write_report
+from rgbmidic.report.curves import history_figure
+from rgbmidic.report.document import Page, write_report
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
     convergence_figure,
+    fraction_figure,
     map_figure,
     mask_figure,
     reflection_figure,
     residual_figure,
-    share_figure,
 )
 from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures
-from rgbmidic.report.histories import history_figure
-from rgbmidic.report.page import Page
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [
@@ -24,6 +23,7 @@ __all__ = [
     "brightness_figure",
     "convergence_figure",
     "finish_plot",
+    "fraction_figure",
     "history_figure",
     "map_figure",
     "mask_figure",
@@ -32,7 +32,6 @@ __all__ = [
     "remove_report",
     "residual_figure",
     "save_figure",
-    "share_figure",
     "write_figures",
     "write_report",
 ]

@@ -1,7 +1,12 @@
-"""The report of a test: one HTML page that needs no other file and no network."""
+"""The report of a test: one HTML page that needs no other file and no network.
+
+A page of text, tables and pictures, written as Markdown and as HTML at once.
+"""
 
 from __future__ import annotations
 
+import html
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +14,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rgbmidic.errors import legible
 from rgbmidic.report import figures
-from rgbmidic.report.courses import course_figure, status_figure, uncertainty_figure
-from rgbmidic.report.facts import Course, NoiseFloor, noise_floor
-from rgbmidic.report.histories import history_figure
-from rgbmidic.report.page import Page
-from rgbmidic.report.setup import analysis_rows, hardware_rows, noise_words, reference_words, settings_rows
+from rgbmidic.report.curves import course_figure, history_figure, status_figure, uncertainty_figure
+from rgbmidic.report.setup import (
+    Course,
+    NoiseFloor,
+    analysis_rows,
+    hardware_rows,
+    noise_floor,
+    noise_words,
+    reference_words,
+    settings_rows,
+)
 from rgbmidic.report.style import embedded, time_unit
 from rgbmidic.results import QUANTITIES, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete
@@ -25,7 +37,7 @@ if TYPE_CHECKING:
 
     from rgbmidic.results.physical import Physical
 
-__all__ = ["write_report"]
+__all__ = ["Page", "write_report"]
 
 _MOST = 200
 """Frames that the course of a test is drawn from at most: more lie closer than the dots of a page."""
@@ -197,7 +209,7 @@ class _Report:
         """What the probes of the settings read."""
         if not self.probes.places:
             return
-        from rgbmidic.results.probing import read_histories
+        from rgbmidic.results.histories import read_histories
 
         page.heading("Probes")
         page.table(("probe", "place in px"), [(kind, _numbers(place)) for kind, place in self.probes.places])
@@ -240,7 +252,7 @@ class _Report:
         self._show(page, figures.residual_figure(result), "residual of each light, and its share in what is measured")
         if len(result.lights) > 1:
             caption = f"share of each light in what determines the nodes, {self._when(frame)}"
-            self._show(page, figures.share_figure(result, frame), caption)
+            self._show(page, figures.fraction_figure(result, frame), caption)
         reflections = {"reflection index of each light": figures.reflection_figure(result, frame)}
         reflections["what the weights exclude of each light"] = figures.mask_figure(result, frame)
         for words, figure in reflections.items():
@@ -293,3 +305,79 @@ class _Report:
 
 def _numbers(place: Sequence[float]) -> str:
     return ", ".join(f"{number:g}" for number in place)
+
+
+_STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
+h1{line-height:1.2}h2{margin-top:2.2rem;border-bottom:1px solid #ccc}
+.table{overflow-x:auto}table{border-collapse:collapse;font-size:13px;margin:1rem 0}
+td,th{border:1px solid #ccc;padding:.25rem .5rem;text-align:left;vertical-align:top;overflow-wrap:anywhere}
+td:first-child,th{overflow-wrap:normal}th{background:#f3f3f3}
+img{max-width:100%;max-height:54rem}figcaption{color:#555;font-size:13px}figure{margin:1rem 0}
+@media print{@page{size:A4;margin:14mm}body{font-size:10pt;max-width:none;margin:0;padding:0}table{font-size:8.5pt}
+figure,tr,li{break-inside:avoid}h1,h2{break-after:avoid}thead{display:table-header-group}
+img{max-height:112mm}.table{overflow:visible}}"""
+
+
+class Page:
+    """Collects blocks in order; `write` puts them into a folder as ``report.md`` and ``report.html``."""
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self._markdown = [f"# {title}"]
+        self._html = [f"<h1>{html.escape(title)}</h1>"]
+
+    def heading(self, text: str) -> None:
+        """A section's heading."""
+        self._markdown.append(f"## {text}")
+        self._html.append(f"<h2>{html.escape(text)}</h2>")
+
+    def text(self, text: str) -> None:
+        """A paragraph; words between backquotes are code."""
+        self._markdown.append(text)
+        self._html.append(f"<p>{_inline(text)}</p>")
+
+    def bullets(self, texts: Sequence[str]) -> None:
+        """A list of texts; words between backquotes are code."""
+        self._markdown.append("\n".join(f"- {text}" for text in texts))
+        self._html.append("<ul>" + "".join(f"<li>{_inline(text)}</li>" for text in texts) + "</ul>")
+
+    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """A table of texts."""
+        lines = [header, ["---"] * len(header), *rows]
+        self._markdown.append(
+            "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines)
+        )
+        head = "".join(f"<th>{_inline(cell)}</th>" for cell in header)
+        body = "".join("<tr>" + "".join(f"<td>{_inline(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        self._html.append(
+            f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+        )
+
+    def picture(self, source: str, caption: str) -> None:
+        """A picture that lies in the page's folder, or is embedded (`rgbmidic.report.style.embedded`)."""
+        self._markdown.append(f"![{caption}]({source})\n\n*{caption}*")
+        cell = html.escape(caption)
+        self._html.append(
+            f'<figure><img src="{html.escape(source)}" alt="{cell}"><figcaption>{cell}</figcaption></figure>'
+        )
+
+    @property
+    def html(self) -> str:
+        """The page as HTML."""
+        title, body = html.escape(self.title), "\n".join(self._html)
+        return legible(
+            f'<!doctype html><html lang="en"><meta charset="utf-8">'
+            f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>'
+            f"<style>{_STYLE}</style>{body}</html>\n"
+        )
+
+    def write(self, folder: Path) -> tuple[Path, Path]:
+        """Write both pages; gives their paths."""
+        markdown, page = folder / "report.md", folder / "report.html"
+        markdown.write_text(legible("\n\n".join(self._markdown) + "\n"), encoding="utf-8")
+        page.write_text(self.html, encoding="utf-8")
+        return markdown, page
+
+
+def _inline(text: str) -> str:
+    return re.sub("`([^`]*)`", r"<code>\1</code>", html.escape(text))

@@ -37,12 +37,12 @@ __all__ = [
     "brightness_figure",
     "convergence_figure",
     "field_figure",
+    "fraction_figure",
     "map_figure",
     "mask_figure",
     "measured_frames",
     "reflection_figure",
     "residual_figure",
-    "share_figure",
     "shown_frames",
     "spread",
 ]
@@ -119,12 +119,12 @@ def field_figure(
     return _maps(result, maps, "plasma" if positive else "viridis", _frame_title(result, frame, result.frame(frame)))
 
 
-def share_figure(result: Result, frame: int) -> Figure:
+def fraction_figure(result: Result, frame: int) -> Figure:
     """Maps of each light's share in what determines the nodes of one frame; errors as `map_figure`."""
     from matplotlib.colors import Normalize
 
     record = result.frame(frame)
-    shares = np.where(record.light_share.sum(axis=1, keepdims=True) > 0, record.light_share, np.nan)
+    shares = np.where(record.light_fraction.sum(axis=1, keepdims=True) > 0, record.light_fraction, np.nan)
     maps = {
         literal(f"share of {light}"): (share, Normalize(0, 1))
         for light, share in zip(result.lights, shares.T, strict=True)
@@ -158,7 +158,7 @@ def brightness_figure(result: Result) -> Figure:
 
 def residual_figure(result: Result) -> Figure:
     """Weighted rms residual of every light, and its share in what determines the nodes, over the deformed frames."""
-    return _over_frames(result, {"residual": result.residual, "mean share in the nodes": result.mean_share})
+    return _over_frames(result, {"residual": result.residual, "mean share in the nodes": result.mean_light_fraction})
 
 
 def convergence_figure(result: Result) -> Figure:

@@ -17,12 +17,12 @@ from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
     convergence_figure,
+    fraction_figure,
     map_figure,
     mask_figure,
     measured_frames,
     reflection_figure,
     residual_figure,
-    share_figure,
     spread,
 )
 from rgbmidic.report.style import save_figure
@@ -45,7 +45,7 @@ _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
 }
 _OF_FRAME: Mapping[str, Callable[[Result, int], Figure | None]] = {
     **{kind: partial(map_figure, kind=kind) for kind in MAPS},
-    "shares": lambda result, frame: share_figure(result, frame) if len(result.lights) > 1 else None,
+    "shares": lambda result, frame: fraction_figure(result, frame) if len(result.lights) > 1 else None,
     "masks": mask_figure,
     "reflections": reflection_figure,
 }

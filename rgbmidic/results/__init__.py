@@ -2,11 +2,10 @@
 
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
-from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.histories import Histories, Told
-from rgbmidic.results.history_table import history_rows, write_histories
-from rgbmidic.results.measures import (
+from rgbmidic.results.histories import Histories, Told, history_rows, write_histories
+from rgbmidic.results.physical import (
+    Channels,
     exposure,
     frame_times,
     probes_of,
@@ -16,8 +15,7 @@ from rgbmidic.results.measures import (
     units_of,
 )
 from rgbmidic.results.provenance import Origin
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
-from rgbmidic.results.record import FrameRecord
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.store import ResultStore, finish_result
 

@@ -1,19 +1,35 @@
-"""What probes read off a result over the frames, in physical units."""
+"""What probes read off a result over the frames, in physical units.
+
+Histories as a table: a summary for people, all of it as a CSV file.
+
+Probes laid on a result: read frame by frame, told in physical units with rates and what was recorded beside.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.errors import InputError
+from rgbmidic.fields import EQUIVALENT, History, Nodal, NodalCovariance, Probe, RigidMotion, Units, make_probe, rates
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.physical import Channels, exposure, frame_times, reference_frames, scale_of, shared_part
+from rgbmidic.results.result import Result
+from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
-    from rgbmidic.fields.units import Units
+    from rgbmidic.fields.history import Units
 
-__all__ = ["Histories", "Told"]
+__all__ = ["Histories", "Told", "history_csv", "history_rows", "read_histories", "write_histories"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,7 +54,7 @@ class Told:
     @property
     def column(self) -> str:
         """Name of its column, with the unit."""
-        from rgbmidic.fields.units import column
+        from rgbmidic.fields.history import column
 
         return column(self.name, self.unit)
 
@@ -78,3 +94,266 @@ class Histories:
             if name in (told.name, told.column):
                 return told
         raise KeyError(name)
+
+
+def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
+    """Headings, and of every quantity its extremes, last value and median standard uncertainty, as texts."""
+    rows = []
+    for told in histories.quantities:
+        known = told.values[np.isfinite(told.values)]
+        std = np.array([]) if told.std is None else told.std[np.isfinite(told.std)]
+        ends = [f"{value:.5g}" for value in (known.min(), known.max(), known[-1])] if known.size else ["-"] * 3
+        spread = f"{np.median(std):.2g}" if std.size else "-"
+        rows.append([told.name, told.unit, *ends, spread, f"{known.size}"])
+    return ["quantity", "unit", "smallest", "largest", "last", "uncertainty", "frames"], rows
+
+
+def write_histories(histories: Histories, out: Path | str, *, overwrite: bool = False) -> None:
+    """Write `history_csv` into a file.
+
+    Raises
+    ------
+    ResultError
+        The file exists, its folder does not, or it cannot be written.
+    """
+    out = Path(out)
+    check_file(out, overwrite=overwrite)
+    write_complete(out, lambda file: history_csv(histories, file))
+
+
+def history_csv(histories: Histories, file: BinaryIO) -> None:
+    """Write histories as CSV: a header line whose names carry the units, then one row a frame; empty: no value."""
+    columns: dict[str, FloatArray] = {}
+    if histories.times is not None:
+        columns["time_s"] = histories.times
+    for told in histories.quantities:
+        columns[told.column] = told.values
+        if told.std is not None:
+            columns[f"{told.column}_std"] = told.std
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+    writer = csv.writer(text)
+    writer.writerow(["frame", "number", "status", *columns])
+    heads = np.stack([histories.frames, histories.numbers, histories.status], axis=1).tolist()
+    for head, row in zip(heads, np.column_stack([*columns.values()]).tolist(), strict=True):
+        writer.writerow([*head, *("" if value != value else f"{value:.9g}" for value in row)])
+    text.detach()  # leaves the file open for whoever opened it
+
+
+_BLURRED = 1.0
+"""Motion (px) within the exposure from which a frame is told to be blurred."""
+_FAST = 95
+"""Percentile of the nodes' speeds that stands for the fast ones."""
+
+
+def read_histories(
+    result: Result,
+    probes: ProbeSettings,
+    *,
+    scale: ScaleSettings | None = None,
+    channels: Channels | None = None,
+    offset: float = 0.0,
+    area: float | None = None,
+    force: str | None = None,
+) -> Histories:
+    """What probes read off a result.
+
+    The frames are read once, one after the other; only the nodes that the probes need are kept.
+
+    Parameters
+    ----------
+    result
+        The result.
+    probes
+        Where, and what.
+    scale
+        Units and frame rate in place of those that the result was measured with.
+    channels
+        Recorded beside the test.
+    offset
+        Seconds that are added to the times of the channels.
+    area
+        Cross-section of the specimen in square mm, for a stress.
+    force
+        Name of the channel with the force, where there are several.
+
+    Raises
+    ------
+    InputError
+        A probe is outside the region, or measured in no frame; a window longer than the test; channels without a time
+        of the frames, or none in common.
+    """
+    if not probes.places and probes.rigid_motion == "none":
+        raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
+    scale = scale_of(result) if scale is None else scale
+    times = frame_times(result, scale)
+    units = Units.of(scale, timed=times is not None)
+    there = np.flatnonzero(result.finished)
+    if not len(there):
+        raise InputError(f"no frame of {result.path} is measured yet")
+    if probes.window > len(there):
+        raise InputError(f"rates over a window of {probes.window} frames need as many; {len(there)} are measured")
+    times = None if times is None else times[there]
+    covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=result.nodes, elements=result.elements))
+    made = _made(covariance, probes)
+    clock = result.number[there].astype(np.float64) if times is None else times
+    nodal, rigid, speed = _read(result, there, covariance, made, probes.rigid_motion, clock)
+    own = {probe.name: _checked(probe, part, result) for probe, part in zip(made, nodal, strict=True)}
+    read = [*rigid, *(history for part in own.values() for history in part)]
+    references = reference_frames(result)[there]
+    quantities = [
+        told
+        for history in read
+        for told in _told(history, units, clock, probes.window, shared_part(result), references)
+    ]
+    beside = _channels(channels, times, offset)
+    stress = _stress(channels, beside, area, force)
+    strain = next((told.name for told in quantities if told.name.endswith(("_strain", "_e1"))), None)
+    return Histories(
+        frames=there,
+        numbers=result.number[there],
+        status=result.status[there],
+        times=times,
+        quantities=(*quantities, *beside, *stress),
+        stress_strain=(strain, stress[0].name) if stress and strain else None,
+        units=units,
+        remarks=tuple(_remarks(units, speed, exposure(result), there, own, beside)),
+    )
+
+
+def _made(covariance: NodalCovariance, probes: ProbeSettings) -> list[Probe]:
+    """The probes, those of a kind numbered from 1."""
+    counts: dict[str, int] = {}
+    made = []
+    for kind, place in probes.places:
+        counts[kind] = counts.get(kind, 0) + 1
+        made.append(make_probe(covariance, kind, counts[kind], place, probes.measure))
+    return made
+
+
+def _read(
+    result: Result,
+    frames: npt.NDArray[np.int64],
+    covariance: NodalCovariance,
+    probes: list[Probe],
+    rigid: str,
+    clock: FloatArray,
+) -> tuple[list[Nodal], list[History], FloatArray]:
+    """What each probe needs, the rigid motion where it is asked for, and the speed (T,) of the fast nodes."""
+    kept: list[list[FloatArray]] = [[] for _ in probes]
+    motions = np.full((len(frames), 3, 2), np.nan)
+    speed, before = np.full(len(frames), np.nan), np.full((2, len(result.nodes)), np.nan)
+    for row, values in enumerate(result.table.each(["u", "v", "u_std", "v_std"], frames.tolist())):
+        field = np.stack([values[name] for name in ("u", "v", "u_std", "v_std")]).astype(np.float64)
+        moved = np.hypot(*(field[:2] - before))
+        if row and np.isfinite(moved).any():
+            speed[row] = np.nanpercentile(moved, _FAST) / (clock[row] - clock[row - 1])
+        before = field[:2]
+        if rigid != "none" and np.isfinite(field).all(axis=0).sum() > 1:
+            motion = RigidMotion.of(covariance, *field)
+            motions[row] = [*zip(motion.shift, motion.shift_std, strict=True), (motion.rotation, motion.rotation_std)]
+            field = motion.removed(result.nodes, field) if rigid == "remove" else field
+        for own, probe in zip(kept, probes, strict=True):
+            own.append(field[:, probe.nodes])
+    stacked = [np.stack(own, axis=1) for own in kept]
+    nodal = [Nodal(u=part[0], v=part[1], u_std=part[2], v_std=part[3]) for part in stacked]
+    return nodal, _rigid(motions) if rigid != "none" else [], speed
+
+
+def _rigid(motions: FloatArray) -> list[History]:
+    """Histories of rigid motions (T, 3, 2): shift along x and y, rotation, each with its uncertainty."""
+    motions[:, 2] = np.degrees(motions[:, 2])
+    names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"}
+    return [
+        History(name=name, unit=unit, values=motions[:, place, 0], std=motions[:, place, 1])
+        for place, (name, unit) in enumerate(names.items())
+    ]
+
+
+def _checked(probe: Probe, nodal: Nodal, result: Result) -> list[History]:
+    """What a probe reads; an `InputError` where that is nothing."""
+    histories = probe.histories(nodal)
+    if not any(np.isfinite(history.values).any() for history in histories):
+        raise InputError(
+            f"{probe.name} is measured in no frame of {result.path}: the nodes around it are not measured (node_status "
+            "says why); place it elsewhere"
+        )
+    return histories
+
+
+def _told(
+    history: History, units: Units, clock: FloatArray, window: int, share: float, references: npt.NDArray[np.bool_]
+) -> Iterator[Told]:
+    """A history in the units of the reader, and its rates over a window of frames, at kinks those of both sides."""
+    length = history.unit == "px"
+    unit = units.length if length else history.unit
+    yield _in_units(history.name, unit, history.values, history.std, units if length else None)
+    if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
+        return
+    span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
+    found = rates(clock, history.values, history.std, window=span, share=share, references=references)
+    for power, name in enumerate(("velocity", "acceleration") if length else ("velocity",), start=1):
+        for side in ("", "_before", "_after"):
+            values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")
+            if side and not np.isfinite(values).any():
+                continue  # no kink
+            told = f"{history.name}_{name if length else 'rate'}{side}"
+            yield _in_units(told, units.per_time(unit, power), values, std, units if length else None)
+
+
+def _in_units(name: str, unit: str, values: FloatArray, std: FloatArray, lengths: Units | None) -> Told:
+    values, std = (values, std) if lengths is None else lengths.lengths(values, std)
+    return Told(name=name, unit=unit, values=values, std=std)
+
+
+def _channels(channels: Channels | None, times: FloatArray | None, offset: float) -> list[Told]:
+    """The channels at the times of the frames."""
+    if channels is None:
+        return []
+    if times is None:
+        raise InputError(
+            f"the channels {channels.path} cannot be brought to the frames, whose times are not known: state "
+            "frame_rate in [scale]"
+        )
+    return [Told(name=name, unit="", values=values, std=None) for name, values in channels.at(times, offset).items()]
+
+
+def _stress(channels: Channels | None, beside: list[Told], area: float | None, force: str | None) -> list[Told]:
+    """The stress, where a cross-section (square mm) is known."""
+    if area is None:
+        return []
+    if channels is None or not area > 0:
+        raise InputError(f"a stress needs channels with a force and an area above 0 mm², not {area:g}")
+    name, newtons = channels.force(force)
+    values = next(told.values for told in beside if told.name == name)
+    return [Told(name="stress", unit="MPa", values=values * newtons / area, std=None)]
+
+
+def _remarks(
+    units: Units,
+    speed: FloatArray,
+    exposed: float | None,
+    frames: npt.NDArray[np.int64],
+    read: Mapping[str, list[History]],
+    beside: list[Told],
+) -> Iterator[str]:
+    if units.mm_per_pixel is None:
+        yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"
+    if not units.timed:
+        yield "no time is known: the frame is the unit of time (frame_rate in [scale])"
+    blurred = np.nan_to_num(speed) * (exposed or 0.0) > _BLURRED if units.timed else np.zeros(len(frames), dtype=bool)
+    if exposed and blurred.any():
+        yield (
+            f"motion blur: within the exposure of {exposed:g} s the surface moves by up to "
+            f"{np.nanmax(speed) * exposed:.3g} px, by more than {_BLURRED:g} px in {int(blurred.sum())} frames from "
+            f"frame {frames[blurred][0]} on"
+        )
+    if any(history.name.endswith("_equivalent") for part in read.values() for history in part):
+        yield f"equivalent: {EQUIVALENT}"
+    for name, missing in _gaps({name: part[0].values for name, part in read.items()}).items():
+        yield f"{name} is not measured in {missing} of {len(frames)} frames"
+    for name, missing in _gaps({told.name: told.values for told in beside}).items():
+        yield f"the channel {name} has no value in {missing} of {len(frames)} frames"
+
+
+def _gaps(values: Mapping[str, FloatArray]) -> dict[str, int]:
+    return {name: missing for name, part in values.items() if (missing := int(np.isnan(part).sum()))}

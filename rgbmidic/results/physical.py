@@ -1,26 +1,168 @@
-"""A result as an engineer reads it: millimetres and seconds where they are known, finite strain over a stated gauge.
+"""Analog channels recorded beside a test, such as a force: a CSV file, brought to the times of the frames.
+
+A result as an engineer reads it: millimetres and seconds where they are known, finite strain over a stated gauge.
 
 What the files for other programs and the report hold is declared in the field table and here.
+
+In what units a result is told, and when its frames were taken: what its settings and the camera's files say.
 """
 
 from __future__ import annotations
 
+import csv
+import logging
+import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from rgbmidic.errors import InputError
 from rgbmidic.fields import EQUIVALENT, MEASURES, NodalCovariance, Strain, StrainGauges, Units, strain_of_gradient
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.measures import frame_times, scale_of, units_of
-from rgbmidic.results.quantities import QUANTITIES, Quantity
-from rgbmidic.results.record import FrameRecord
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
 from rgbmidic.results.result import Result
-from rgbmidic.settings import ScaleSettings
-from rgbmidic.typing import FloatArray
+from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section, regular
+from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Physical"]
+if TYPE_CHECKING:
+    from rgbmidic.fields.history import Units
+
+__all__ = [
+    "Channels",
+    "Physical",
+    "exposure",
+    "frame_times",
+    "probes_of",
+    "reference_frames",
+    "scale_of",
+    "shared_part",
+    "units_of",
+]
+
+logger = logging.getLogger(__name__)
+
+_TIME = re.compile(r"(?:time|t)(?:[\s_(\[]+(s|ms|us|µs)[)\]]?)?", re.IGNORECASE)
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+_NEWTONS = {"N": 1.0, "kN": 1e3}
+_UNIT = re.compile(r".*[\s_(\[](kN|N)[)\]]?")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Channels:
+    """What was recorded, each value at its time.
+
+    Attributes
+    ----------
+    path
+        The file.
+    times : ndarray, shape (n,)
+        In seconds, rising.
+    values
+        Name of each channel to its values (n,).
+    """
+
+    path: Path
+    times: FloatArray
+    values: Mapping[str, FloatArray]
+
+    @classmethod
+    def read(cls, path: Path | str) -> Self:
+        """Read a CSV file: a header line, then rows; the first column is ``time_s``, ``time_ms`` or ``time_us``.
+
+        Columns are parted by commas, semicolons (then a comma may be the decimal point) or tabs.
+
+        Raises
+        ------
+        InputError
+            The file is missing, has no such header, a field is no number, or the times do not rise.
+        """
+        path = Path(path)
+        try:
+            lines = regular(path).read_text(encoding="utf-8-sig").splitlines()
+        except OSError as error:
+            raise InputError(f"the channels {path} cannot be read: {error.strerror or error}") from None
+        except ValueError:
+            raise InputError(f"the channels {path} are not a text file") from None
+        lines = [line for line in lines if line.strip()]
+        parted = max(",;\t", key=(lines or [""])[0].count)
+        names = [name.strip() for name in next(csv.reader(lines[:1], delimiter=parted), [])]
+        unit = _TIME.fullmatch(names[0]) if len(names) > 1 else None
+        if unit is None:
+            raise InputError(
+                f'the channels {path} need a header line: "time_s" (or time_ms, time_us) and the name of each channel'
+            )
+        table = _numbers(path, lines[1:], parted, len(names))
+        times = table[:, 0] * _SECONDS[(unit[1] or "s").lower()]
+        if len(times) < 2 or not (np.diff(times) > 0).all():
+            raise InputError(f"the times of the channels {path} must rise from row to row, over two rows or more")
+        return cls(path=path, times=times, values=dict(zip(names[1:], table[:, 1:].T, strict=True)))
+
+    def at(self, times: FloatArray, offset: float = 0.0) -> dict[str, FloatArray]:
+        """Each channel at the times (T,) of the frames, linear between its values, NaN beyond them.
+
+        Parameters
+        ----------
+        times
+            In seconds.
+        offset
+            Seconds that are added to the times of the channels to make them those of the frames.
+
+        Raises
+        ------
+        InputError
+            No frame lies within the times of the channels.
+        """
+        own = self.times + offset
+        if not ((times >= own[0]) & (times <= own[-1])).any():
+            raise InputError(
+                f"the channels {self.path} span {own[0]:.9g} to {own[-1]:.9g} s (offset {offset:g} s included), the "
+                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state the --offset between both clocks"
+            )
+        return {name: np.interp(times, own, values, np.nan, np.nan) for name, values in self.values.items()}
+
+    def force(self, name: str | None = None) -> tuple[str, float]:
+        """Name of the channel with a force, and newtons for one of its unit.
+
+        Parameters
+        ----------
+        name
+            Of the channel; None: the only one whose name ends in N or kN.
+
+        Raises
+        ------
+        InputError
+            There is none, more than one, or its name does not end in its unit.
+        """
+        found = {own: _NEWTONS[unit[1]] for own in self.values if (unit := _UNIT.fullmatch(own))}
+        if name is None and len(found) == 1:
+            return next(iter(found.items()))
+        if name is None or name not in found:
+            what = "none is stated" if name is None else f'"{name}" is not one'
+            raise InputError(
+                f"a stress needs one channel of {self.path} with a force, whose name ends in _N or _kN; {what}, the "
+                f"channels are {', '.join(self.values)}"
+            )
+        return name, found[name]
+
+
+def _numbers(path: Path, lines: list[str], parted: str, count: int) -> FloatArray:
+    """Rows of numbers (n, count); an empty field is NaN."""
+    rows = []
+    for number, row in enumerate(csv.reader(lines, delimiter=parted), 2):
+        fields = [part.strip().replace(",", ".") if parted == ";" else part.strip() for part in row]
+        try:
+            rows.append([float(part) if part else math.nan for part in fields])
+        except ValueError:
+            raise InputError(f"row {number} of the channels {path} is not numbers: {row}") from None
+        if len(row) != count:
+            raise InputError(f"row {number} of the channels {path} has {len(row)} fields, the header {count}")
+    return np.array(rows, dtype=np.float64).reshape(-1, count)
+
 
 _NODE, _ELEMENT = ("node",), ("element",)
 _STRAIN = (
@@ -148,3 +290,78 @@ def _part(strain: Strain, entry: Quantity) -> FloatArray:
     attribute, _, column = entry.source.partition(".")
     values: FloatArray = getattr(strain, attribute)
     return values[:, int(column)] if column else values
+
+
+_DIFFERENT = 0.01
+"""Share by which a stated rate may differ from that of the frames' stamps before it is told."""
+
+
+def scale_of(result: Result) -> ScaleSettings:
+    """The ``[scale]`` that a result was measured with."""
+    return read_section(ScaleSettings, "scale", result.provenance.get("settings", {}).get("scale", {}))
+
+
+def probes_of(result: Result) -> ProbeSettings:
+    """The ``[probes]`` that a result was measured with."""
+    return read_section(ProbeSettings, "probes", result.provenance.get("settings", {}).get("probes", {}))
+
+
+def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
+    """The units of a result, with its own ``[scale]`` or another one in its place."""
+    from rgbmidic.fields.history import Units
+
+    scale = scale_of(result) if scale is None else scale
+    return Units.of(scale, timed=frame_times(result, scale) is not None)
+
+
+def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
+    """Time (T,) of each frame in seconds, from the trigger where the camera tells it; None where nobody knows.
+
+    What the files tell of every frame, else the number of the frame over `frame_rate`, that of ``[scale]`` before the
+    camera's. NaN for frames that are not measured yet.
+    """
+    scale = scale_of(result) if scale is None else scale
+    there = result.finished
+    stamps, numbers = result.time_ns[there], result.number[there]
+    if (stamps == UNKNOWN_TIME).any():
+        own = result.provenance.get("frame_rate")
+        rate = scale.frame_rate or own
+        seconds = numbers / rate if rate else None
+        if own:
+            _compare(own, scale.frame_rate, "the camera was set to %.6g: the former is taken")
+    else:
+        seconds = stamps * 1e-9
+        if len(seconds) > 1:
+            own = float(np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)))
+            _compare(own, scale.frame_rate, "the frames' own times %.6g: these are taken")
+    if seconds is None:
+        return None
+    times = np.full(len(result), np.nan)
+    times[there] = seconds
+    return times
+
+
+def _compare(own: float, stated: float | None, told: str) -> None:
+    """Tell where a stated frame rate is not that of the files."""
+    if stated and abs(own / stated - 1) > _DIFFERENT:
+        logger.warning(f"scale.frame_rate states %g frames per second, {told}", stated, own)
+
+
+def exposure(result: Result) -> float | None:
+    """Time in seconds that each frame collects light; None where the files do not tell it."""
+    told = result.provenance.get("exposure_ns")
+    return None if told is None else float(told) * 1e-9
+
+
+def reference_frames(result: Result) -> BoolArray:
+    """Which frames (T,) belong to the reference."""
+    chosen = np.zeros(len(result), dtype=bool)
+    chosen[list(result.provenance["references"])] = True
+    return chosen
+
+
+def shared_part(result: Result) -> float:
+    """Share of every frame's variance that the reference puts into all alike (`rgbmidic.fields.nodal`)."""
+    from rgbmidic.fields.nodal import reference_fraction
+
+    return reference_fraction(len(result.setting("frames", "reference", [0])))

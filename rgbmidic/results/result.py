@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results.provenance import fingerprint, read_provenance
-from rgbmidic.results.quantities import QUANTITIES
-from rgbmidic.results.record import FrameRecord
+from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.results.shards import FrameTable
 from rgbmidic.results.store import check_complete, listed, load_frames, read_mesh, read_names, read_reference
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
@@ -184,12 +183,14 @@ class Result:
         return {path: digest for pairs in self.each("inputs") for path, digest in pairs.tolist()}
 
     @cached_property
-    def mean_share(self) -> FloatArray:
-        """Mean of `light_share` over the measured nodes, shape (T, k); NaN where none is measured."""
+    def mean_light_fraction(self) -> FloatArray:
+        """Mean of `light_fraction` over the measured nodes, shape (T, k); NaN where none is measured."""
         shares = np.full((len(self), len(self.lights)), np.nan)
-        for row, values in zip(shares, self.table.each(["light_share", "node_status"], range(len(self))), strict=True):
+        for row, values in zip(
+            shares, self.table.each(["light_fraction", "node_status"], range(len(self))), strict=True
+        ):
             if (measured := values["node_status"] == 0).any():
-                row[:] = values["light_share"][measured].mean(axis=0, dtype=np.float64)
+                row[:] = values["light_fraction"][measured].mean(axis=0, dtype=np.float64)
         return shares
 
     @cached_property

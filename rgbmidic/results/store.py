@@ -17,9 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.files import read_arrays, read_json, write_arrays, write_json, write_new_json, writing
-from rgbmidic.results.layout import RecordLayout
-from rgbmidic.results.lock import ALL_FRAMES, Claim
+from rgbmidic.results.files import (
+    ALL_FRAMES,
+    Claim,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_json,
+    write_new_json,
+    writing,
+)
 from rgbmidic.results.provenance import (
     PROVENANCE,
     PUT_BACK,
@@ -32,9 +39,8 @@ from rgbmidic.results.provenance import (
     read_provenance,
     sealed,
 )
-from rgbmidic.results.quantities import SHARED
-from rgbmidic.results.record import FrameRecord
-from rgbmidic.results.shards import FrameTable, ShardWriter, discard, shard_files
+from rgbmidic.results.quantities import SHARED, FrameRecord
+from rgbmidic.results.shards import FrameTable, RecordLayout, ShardWriter, discard, shard_files
 from rgbmidic.typing import AnyArray, BoolArray, FloatImage
 
 __all__ = [

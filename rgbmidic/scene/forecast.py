@@ -23,12 +23,11 @@ from functools import cache
 import numpy as np
 
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
-from rgbmidic.illumination.camera_noise import QUANTISATION
+from rgbmidic.illumination.linearise import QUANTISATION
 from rgbmidic.illumination.unmix import NEGLIGIBLE
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.scene import Scene
-from rgbmidic.scene.speckle_patch import SpecklePatch, cross_spectra, mosaic_disturbances
-from rgbmidic.scene.speckle_spectrum import SpeckleSpectrum
+from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cross_spectra, mosaic_disturbances
 from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -72,7 +71,7 @@ class Forecast:
     bias : ndarray, shape (...)
         Root mean square, per component, of the displacement (px) that the droplets' domes feign: their lit sides change
         when a reflection moves.
-    weight_share : ndarray, shape (k, ...)
+    weight_fraction : ndarray, shape (k, ...)
         Share of each light in the information about the displacement.
     residual : ndarray, shape (k, ...)
         Standard deviation of the residual of each light, in units of its local mean.
@@ -80,7 +79,7 @@ class Forecast:
 
     std: FloatArray
     bias: FloatArray
-    weight_share: FloatArray
+    weight_fraction: FloatArray
     residual: FloatArray
 
 
@@ -210,7 +209,7 @@ class Instrument:
         return Forecast(
             std=np.where(sees, std, np.nan),
             bias=np.where(sees, bias, np.nan),
-            weight_share=np.where(sees, share, 0.0),
+            weight_fraction=np.where(sees, share, 0.0),
             residual=np.where(seen, np.sqrt(np.where(seen, residual, 0.0)), np.nan),
         )
 

@@ -1,12 +1,19 @@
-"""The plot that shows a window of the image: it tells when another part is in view, and takes marks."""
+"""The plot that shows a window of the image: it tells when another part is in view, and takes marks.
+
+Principal directions of the strain, as short lines on the field.
+
+Pictures of one frame side by side: raw, its separated lights, their reflection index.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 from bokeh.core.property.descriptors import UnsetValueError
 from bokeh.document import Document
 from bokeh.events import RangesUpdate
@@ -28,7 +35,7 @@ from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.address import Mark
 from rgbmidic.view.picture import Window
 
-__all__ = ["Canvas", "small"]
+__all__ = ["Canvas", "DirectionLayer", "Tiles", "small"]
 
 _MARGIN = 0.06
 _BAR = 80
@@ -174,3 +181,89 @@ class Canvas:
     def _come(self) -> None:
         self._coming = False
         self._redraw()
+
+
+_ACROSS = 24
+"""Lines across the view: enough to follow the directions, few enough to tell them apart."""
+_COLUMNS = ("x0", "y0", "x1", "y1")
+
+
+class DirectionLayer:
+    """Lines along the larger principal strain on a canvas."""
+
+    def __init__(self, canvas: Canvas) -> None:
+        self._canvas, self._lines = canvas, ColumnDataSource({name: [] for name in _COLUMNS}, name="directions")
+        for colour, width in (("#15181c", 3.0), ("#ffffff", 1.4)):
+            canvas.plot.segment(*_COLUMNS, source=self._lines, line_color=colour, line_width=width)
+
+    def hide(self) -> None:
+        """Show none."""
+        if len(self._lines.data["x0"]):
+            self._lines.data = {name: [] for name in _COLUMNS}
+
+    def show(self, nodes: FloatArray, degrees: FloatArray) -> None:
+        """Show the directions (N,), in degrees from x towards y, of nodes at (N, 2), evenly thinned out."""
+        window = self._canvas.window
+        cell = max(window.right - window.left, window.bottom - window.top) / _ACROSS
+        known = np.flatnonzero(np.isfinite(degrees) & np.isfinite(nodes).all(axis=1))
+        places = np.floor(nodes[known] / cell).astype(int)
+        kept = known[np.unique(places, axis=0, return_index=True)[1]]
+        angle = np.radians(degrees[kept])
+        half = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        ends = np.concatenate([nodes[kept] - half, nodes[kept] + half], axis=1)
+        self._lines.data = dict(zip(_COLUMNS, ends.T, strict=True))
+
+
+_WIDE = 260
+"""Columns of a small picture."""
+_STEP, _GAP = 1.06, 0.2
+"""From one to the next, and the room for a name over each, in widths of one."""
+_TILES_COLUMNS = ("image", "x", "y", "dw", "name")
+
+
+class Tiles:
+    """The plot of the pictures; hidden until there are some."""
+
+    def __init__(self) -> None:
+        self._shown = ColumnDataSource({name: [] for name in _TILES_COLUMNS}, name="tiles")
+        self.plot = figure(
+            sizing_mode="scale_width",
+            x_range=Range1d(0, 1),
+            y_range=Range1d(1, 0),
+            tools=[],
+            toolbar_location=None,
+            min_border=0,
+            visible=False,
+            background_fill_color=None,
+            border_fill_color=None,
+            outline_line_color=None,
+        )
+        self.plot.axis.visible = self.plot.grid.visible = False
+        greys = [f"#{level:02x}{level:02x}{level:02x}" for level in range(256)]
+        self._drawn = self.plot.image("image", "x", "y", "dw", 1, source=self._shown, palette=greys)
+        self._drawn.glyph.color_mapper.update(low=0, high=255)
+        letters = {"text_font_size": "11px", "text_color": "#808890", "text_baseline": "bottom", "y_offset": -1}
+        self.plot.text("x", "y", "name", source=self._shown, **letters)
+
+    def show(self, rows: Sequence[Mapping[str, npt.NDArray[np.uint8]]]) -> None:
+        """Show rows of pictures (H, W) of one size by their names, the ends of the rows one below the other."""
+        height, width = next(iter(rows[0].values())).shape
+        tall = height / width
+        across = max(map(len, rows))
+        places = [
+            (name, picture, x, y)
+            for y, row in enumerate(rows)
+            for x, (name, picture) in enumerate(row.items(), start=across - len(row))
+        ]
+        size = (_WIDE, max(1, round(_WIDE * tall)))
+        self._drawn.glyph.dh = tall
+        self._shown.data = {
+            "image": [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for _, picture, *_ in places],
+            "x": [x * _STEP for *_, x, _ in places],
+            "y": [y * (tall + _GAP) + _GAP for *_, y in places],
+            "dw": [1.0] * len(places),
+            "name": [name for name, *_ in places],
+        }
+        down = len(rows) * (tall + _GAP)
+        self.plot.x_range.end, self.plot.y_range.start = across * _STEP, down
+        self.plot.update(visible=True, aspect_ratio=across * _STEP / down)

@@ -1,19 +1,46 @@
-"""The nodal fields of a result that can be looked at: what the field table holds, and what follows from it."""
+"""The nodal fields of a result that can be looked at: what the field table holds, and what follows from it.
+
+The pictures that a field lies over: the reference that the result keeps, and the frames, where they still are.
+
+What a page says in words: of the frame in view, of the place under the pointer, of what went wrong.
+"""
 
 from __future__ import annotations
 
+import html
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, Self
 
 import numpy as np
+import numpy.typing as npt
+from bokeh.document import Document
 
-from rgbmidic.report.style import colour_range
-from rgbmidic.results import QUANTITIES, Result, scale_of
+from rgbmidic.errors import RgbmidicError
+from rgbmidic.frames.series import FrameSeries, open_series
+from rgbmidic.report.style import colour_range, time_unit
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Result, scale_of
 from rgbmidic.results.physical import Physical
+from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatArray
+from rgbmidic.view.picture import element_at, grey_picture
 
-__all__ = ["Field", "Fields", "Values", "robust_range"]
+__all__ = [
+    "Field",
+    "Fields",
+    "Pictures",
+    "Values",
+    "frame_words",
+    "guarded",
+    "pointed_words",
+    "robust_range",
+    "warning",
+    "watched",
+]
+
+logger = logging.getLogger(__name__)
 
 Kind = Literal["displacement", "strain", "positive", "share", "angle", "codes"]
 
@@ -126,7 +153,7 @@ class Fields:
                 kind = self._kind(name)
                 fields.append(Field(name=name, unit=entry.unit, meaning=meaning, kind=kind, codes=entry.codes))
         fields += [
-            Field(name=f"share of {light}", unit="", meaning=told["light_share"].meaning, kind="share")
+            Field(name=f"share of {light}", unit="", meaning=told["light_fraction"].meaning, kind="share")
             for light in self.result.lights
         ]
         order = ("u", "v", "magnitude", "exx", "eyy", "exy", "e1", "e2", "direction", "equivalent")
@@ -144,7 +171,7 @@ class Fields:
 
     def read(self, name: str, frame: int) -> Values:
         """A field in one frame; errors as `Result.frame`."""
-        more = {"share": ("light_share", "node_status")}.get(self.all[name].kind, ())
+        more = {"share": ("light_fraction", "node_status")}.get(self.all[name].kind, ())
         own = (name,) if name in QUANTITIES and name not in _MOVED and not self.physical.is_strain(name) else ()
         read = next(self.result.table.each([*_MOVED, *own, *more], [frame]))
         u, v, u_std, v_std = (np.asarray(read[part], dtype=np.float64) for part in _MOVED)
@@ -161,7 +188,7 @@ class Fields:
             values, std = strain[name], strain.get(f"{name}_std", nothing)
         elif more:
             light = self.result.lights.index(name.removeprefix("share of "))
-            values, std = np.where(read["node_status"] == 0, read["light_share"][:, light], np.nan), nothing
+            values, std = np.where(read["node_status"] == 0, read["light_fraction"][:, light], np.nan), nothing
         else:
             values, std = np.asarray(read[name], dtype=np.float64), nothing
         return Values(values=np.ascontiguousarray(values, dtype=np.float64), std=std, moved=moved)
@@ -192,3 +219,105 @@ def _length(u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) 
     with np.errstate(divide="ignore", invalid="ignore"):
         std = np.where(length > 0, np.hypot(u * u_std, v * v_std) / length, np.hypot(u_std, v_std))
     return length, std
+
+
+Picture = npt.NDArray[np.uint8]
+_KEPT = 8
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pictures:
+    """The pictures of a result.
+
+    Attributes
+    ----------
+    result
+        The result.
+    """
+
+    result: Result
+
+    @cached_property
+    def reference(self) -> Picture:
+        """Mean of the lights' reference images, plain beside the part of the frames that was read; plain where none was
+        kept."""
+        kept, (left, top) = self.result.reference, self.result.reference_origin
+        columns, rows = np.ceil(self.result.nodes.max(axis=0) + 1).astype(int)
+        picture = np.full(self.result.frame_shape or (rows, columns), 60, dtype=np.uint8)
+        if kept is not None:
+            picture[top : top + kept.shape[1], left : left + kept.shape[2]] = kept.mean(axis=0)
+        return picture
+
+    def frame(self, place: int) -> tuple[Picture, str]:
+        """The raw frame of a place in the result; the reference, and why, where it cannot be read."""
+        try:
+            return self._read(place), ""
+        except (RgbmidicError, OSError, IndexError, KeyError) as error:
+            return self.reference, f"the raw frame cannot be shown ({error}): this is the reference image"
+
+    @cached_property
+    def _read(self) -> Callable[[int], Picture]:
+        return lru_cache(_KEPT)(lambda place: grey_picture(self._series.read(self._series.chosen[place])[0]))
+
+    @cached_property
+    def _series(self) -> FrameSeries:
+        provenance = self.result.provenance
+        settings = TestSettings.from_mapping(provenance["settings"], provenance["base"])
+        return open_series(settings.frames, settings.base)
+
+
+_FAILED = 2
+
+
+def warning(text: str) -> str:
+    """A remark that is to be seen, as HTML."""
+    return f'<b style="color:var(--warn)">{html.escape(text)}</b>'
+
+
+def guarded(act: Callable[[], None], complain: Callable[[str], None]) -> None:
+    """Do something; what goes wrong is told in one line, and the page goes on."""
+    try:
+        act()
+    except (RgbmidicError, OSError) as error:
+        complain(str(error))
+    except Exception as error:  # the last resort of a page
+        logger.exception("the page failed")
+        complain(f"{type(error).__name__}: {error}")
+
+
+def watched(document: Document) -> bool:
+    """Whether a browser shows the page: one that was left lives on for a while, and does nothing more."""
+    session = document.session_context.session if document.session_context else None
+    return session is None or session.connection_count > 0
+
+
+def frame_words(result: Result, place: int, field: Field, values: Values, remark: str) -> str:
+    """What is in view, as HTML: the frame, how it ended, the field and what there is to remark."""
+    read = next(result.table.each(["status", "reason", "iterations", "node_status", "time_ns"], [place]))
+    missing = float(np.mean(read["node_status"] != 0))
+    measured = bool(result.finished[place])
+    end = QUANTITIES["status"].codes[read["status"]] if measured else "not measured yet"
+    seconds = read["time_ns"] * 1e-9
+    factor, unit = time_unit(np.array([seconds]))
+    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {factor * seconds:.6g} {unit}"
+    lost = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
+    lines = [f"Frame {place} of {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{lost}"]
+    if read["reason"] and measured:
+        lines[1] = warning(f"{end}: {read['reason']}")
+    if not np.isfinite(values.values).any():
+        lines.append("Nothing is measured here: choose another frame below.")
+    lines.append(f"<b>{html.escape(field.label)}</b>: {html.escape(field.meaning.partition(':')[0])}")
+    return "<br>".join([*lines, *([html.escape(remark)] if remark else [])])
+
+
+def pointed_words(
+    field: Field, values: Values, nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
+) -> str:
+    """The value at a place of the image, as HTML."""
+    found = element_at(nodes, elements, x, y)
+    if found is None:
+        return f"x {x:.1f}, y {y:.1f} px: outside the mesh"
+    corners, weights = found
+    weights = np.eye(3)[weights.argmax()] if field.stepped else weights
+    value, std = (float(weights @ part[corners]) for part in (values.values, values.std))
+    return f"x {x:.1f}, y {y:.1f} px: <b>{html.escape(f'{field.name} = {field.text(value, std)}')}</b>"

@@ -17,17 +17,21 @@ from rgbmidic.fields.strain import shortest_gauge
 from rgbmidic.results import Result
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import KINDS, OVER, Look
-from rgbmidic.view.canvas import Canvas
-from rgbmidic.view.curve_panel import CurvePanel
-from rgbmidic.view.curves import as_csv
-from rgbmidic.view.directions import DirectionLayer
-from rgbmidic.view.fields import Fields, Values, robust_range
-from rgbmidic.view.frames import Pictures
-from rgbmidic.view.marks import MarkLayer
-from rgbmidic.view.models import Asked, controls, wire
+from rgbmidic.view.canvas import Canvas, DirectionLayer
+from rgbmidic.view.curves import Course, CurvePanel, TimeLine, as_csv, places
+from rgbmidic.view.fields import (
+    Fields,
+    Pictures,
+    Values,
+    frame_words,
+    guarded,
+    pointed_words,
+    robust_range,
+    warning,
+    watched,
+)
+from rgbmidic.view.models import Asked, MarkLayer, controls, wire
 from rgbmidic.view.picture import AROUND, paint, palette, palette_name
-from rgbmidic.view.timeline import Course, TimeLine, places
-from rgbmidic.view.words import frame_words, guarded, pointed_words, warning, watched
 
 __all__ = ["ResultPage"]
 

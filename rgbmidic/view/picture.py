@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.picture import paint_field
+from rgbmidic._kernels.interpolation import paint_field
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.typing import AnyArray, FloatArray
 

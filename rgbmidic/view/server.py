@@ -32,10 +32,10 @@ from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.results import Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.view.address import Look
+from rgbmidic.view.curves import Course
 from rgbmidic.view.fields import Fields
 from rgbmidic.view.page import ResultPage
-from rgbmidic.view.runner import Run
-from rgbmidic.view.timeline import Course
+from rgbmidic.view.setup_panel import Run
 
 __all__ = ["serve", "start"]
 
@@ -137,7 +137,7 @@ def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
         return {"/": partial(_told, partial(_fill, path, courses))}
     from rgbmidic.view.draft import Draft
     from rgbmidic.view.setup import SetupPage
-    from rgbmidic.view.setup_frames import Footage
+    from rgbmidic.view.setup_panel import Footage
 
     Footage.of(Draft.of(path))
     runs: list[Run] = []

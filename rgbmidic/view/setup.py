@@ -20,17 +20,12 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.settings import RegionSettings, read_section
-from rgbmidic.view.canvas import Canvas
-from rgbmidic.view.draft import Draft
+from rgbmidic.view.canvas import Canvas, Tiles
+from rgbmidic.view.draft import HOLES, OUTLINES, Draft, Sketch, marks_of
+from rgbmidic.view.fields import guarded, warning, watched
 from rgbmidic.view.models import TOOL, Asked, pump
-from rgbmidic.view.outline import HOLES, OUTLINES, marks_of
 from rgbmidic.view.picture import AROUND, paint, palette
-from rgbmidic.view.runner import Run
-from rgbmidic.view.setup_controls import setup_controls
-from rgbmidic.view.setup_frames import RAW, Footage, inspected, pictures, side_by_side
-from rgbmidic.view.sketch import Sketch
-from rgbmidic.view.tiles import Tiles
-from rgbmidic.view.words import guarded, warning, watched
+from rgbmidic.view.setup_panel import RAW, Footage, Run, inspected, pictures, setup_controls, side_by_side
 
 __all__ = ["SetupPage"]
 

@@ -1,8 +1,14 @@
 """How much each light counts at each pixel."""
 
-from rgbmidic.weights.disturbed_zone import DisturbedZone, SetUpThreshold, disturbed_zone, set_up_threshold
 from rgbmidic.weights.light_weights import LightWeights, prepare_weights
-from rgbmidic.weights.threshold import blurred, threshold_weights
+from rgbmidic.weights.threshold import (
+    DisturbedZone,
+    SetUpThreshold,
+    blurred,
+    disturbed_zone,
+    set_up_threshold,
+    threshold_weights,
+)
 
 __all__ = [
     "DisturbedZone",

@@ -13,11 +13,9 @@ import numpy as np
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.scene.forecast import Instrument
-from rgbmidic.scene.projection import material_points
 from rgbmidic.scene.reflection import angle_weights, surface_from_heights
-from rgbmidic.scene.scene import Scene, State
-from rgbmidic.scene.scenefile import read_scene
-from rgbmidic.scene.zones import Zones, predict_zones, zones_on_surface
+from rgbmidic.scene.scene import Scene, State, read_scene
+from rgbmidic.scene.zones import Zones, material_points, predict_zones, zones_on_surface
 from rgbmidic.settings import TestSettings, regular
 from rgbmidic.typing import FloatArray, FloatImage
 

@@ -16,9 +16,8 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatImage
-from rgbmidic.weights.automatic import automatic_weights
 from rgbmidic.weights.geometry import GeometryWeights
-from rgbmidic.weights.threshold import ThresholdWeights
+from rgbmidic.weights.threshold import ThresholdWeights, automatic_weights
 
 __all__ = ["LightWeights", "ValidPixels", "prepare_weights"]
 

@@ -9,7 +9,7 @@ import pytest
 from small_tests import grey_frame
 from viewer import MISSING, Page, chromium, click, serving
 
-from rgbmidic.frames.writers import write_tiff
+from rgbmidic.frames.images import write_tiff
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.plan import read_region
 from rgbmidic.results import Result

@@ -11,7 +11,7 @@ from results import NODES, make_origin, make_result, smooth_record
 from viewer import MISSING, Page, chromium, click, serving
 
 from rgbmidic.results import FrameRecord, Result, ResultStore
-from rgbmidic.results.probing import read_histories
+from rgbmidic.results.histories import read_histories
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.view.fields import Fields, robust_range
 from rgbmidic.view.picture import element_at

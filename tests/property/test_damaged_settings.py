@@ -13,10 +13,10 @@ import pytest
 
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.camera_noise import CameraNoise, Quantity
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
+from rgbmidic.illumination.linearise import CameraNoise, Quantity
 from rgbmidic.illumination.registration import Registration, frame_geometry
-from rgbmidic.scene.scenefile import read_scene
+from rgbmidic.scene.scene import read_scene
 from rgbmidic.settings import TestSettings, read_test
 
 COPIES = 1000

@@ -117,7 +117,7 @@ def test_an_excluded_light_has_no_say():
     weights = np.stack([np.ones(SHAPE), np.zeros(SHAPE)])
     both = measured(np.stack([reference, nonsense]), np.stack([deformed, nonsense]), weights=weights)
     np.testing.assert_allclose(both.displacement, measured(reference, deformed).displacement, atol=SAME)
-    assert both.weight_share[1] == 0
+    assert both.weight_fraction[1] == 0
     assert np.isnan(both.residual[1])
 
 

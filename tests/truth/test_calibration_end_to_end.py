@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic.frames.writers import write_dng
+from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
-from rgbmidic.lab.virtual.capture import dark_frames, target_scene
+from rgbmidic.lab.virtual.dataset import dark_frames, target_scene
 from rgbmidic.pipeline import measure
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
-from rgbmidic_calibration.blocks import block_means
+from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
 from rgbmidic_calibration.noise import photon_transfer
+from rgbmidic_calibration.ratio import block_means
 from rgbmidic_calibration.registration import estimate_registration
-from rgbmidic_calibration.stacks import stack_frames
 
 SIZE = 224
 ABERRATION = (-2e-4, 0.0, 3e-4)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from calibration_scene import BLACK, GAIN, READ, expose, speckle_target, white_target
 
+from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.noise import photon_transfer
-from rgbmidic_calibration.stacks import stack_frames
 
 COLUMN = np.array([0.6, 1.0, 0.5])
 LEVELS = (200, 600, 1200, 1800, 2400, 3000, 3600)

@@ -6,8 +6,8 @@ import numpy as np
 from calibration_scene import MATRICES, expose, registered_pictures
 
 from rgbmidic.illumination.registration import Registration, frame_geometry
+from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.registration import estimate_registration
-from rgbmidic_calibration.stacks import stack_frames
 
 ACCURACY = 0.01
 LIGHTS = ("red", "green", "blue")

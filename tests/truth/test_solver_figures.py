@@ -314,8 +314,8 @@ def test_one_blind_light_costs_nothing_where_the_other_sees():
     assert found.status is Status.CONVERGED
     assert found.measured.all()
     assert rms(error(found)) <= AFFINE_RMS
-    assert 0.3 < found.weight_share[0] < 0.55
-    assert 0.5 < found.weight_share[1] < 0.7
+    assert 0.3 < found.weight_fraction[0] < 0.55
+    assert 0.5 < found.weight_fraction[1] < 0.7
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.01, 0.1])

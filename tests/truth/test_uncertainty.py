@@ -244,7 +244,7 @@ def test_what_is_spoiled_is_flagged_and_spoils_nothing_else(sphere: Sphere, kind
     assert sphere.ratio(solution, 1.0, ~near) < SPOILED
     if spoil is _saturated:  # the other two lights see on
         blinded = x < SIZE / 3 - 15
-        assert solution.light_share[blinded, 1].max() < 0.5 * np.median(solution.light_share[~blinded, 1])
+        assert solution.light_fraction[blinded, 1].max() < 0.5 * np.median(solution.light_fraction[~blinded, 1])
         assert sphere.ratio(solution, 1.0, blinded) < SPOILED
     if spoil in (_fragment, _glare):
         assert (~solution.measured[near]).any()
@@ -308,7 +308,7 @@ def test_beside_a_saturated_channel_the_other_lights_see_on(sphere: Sphere, kind
     solution = sphere.measure_raw(spoil, kind)
     inside = solution.nodes[:, 0] < SIZE / 3 - 30
     assert solution.measured.all()
-    assert solution.light_share[inside, 0].max() < 0.05
+    assert solution.light_fraction[inside, 0].max() < 0.05
     for place in (inside, ~inside):
         assert sphere.ratio(solution, 1.0, place) < SPOILED
 

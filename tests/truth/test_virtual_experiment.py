@@ -22,7 +22,7 @@ from rgbmidic.lab.virtual import (
     truth,
     turned,
 )
-from rgbmidic.lab.virtual.scenes import paint
+from rgbmidic.lab.virtual.rendering import paint
 
 FRONT = (0.0, 0.0, 600.0)
 SIZE = 144

@@ -14,7 +14,8 @@ import tifffile
 from small_tests import REGION, SHAPE, colour_test, grey_frame, toml
 
 from rgbmidic import Calibration, NodeStatus, Result, Status, measure, read_frame, read_test
-from rgbmidic.correlation import Start, renewal
+from rgbmidic.correlation import Start
+from rgbmidic.correlation import reference_update as reference_update
 from rgbmidic.errors import (
     CalibrationError,
     ConfigurationError,
@@ -25,8 +26,8 @@ from rgbmidic.errors import (
     RgbmidicError,
 )
 from rgbmidic.frames import FrameSeries, file_hash
-from rgbmidic.frames.writers import write_dng, write_tiff
-from rgbmidic.illumination.demosaic import reflection_aware
+from rgbmidic.frames.images import write_dng, write_tiff
+from rgbmidic.illumination import demosaic as reflection_aware
 from rgbmidic.pipeline import Plan, measure_frame, separation
 
 BAYER_RMS = 0.015
@@ -76,7 +77,7 @@ def test_raw_bayer_frames_give_the_true_displacement(bayer, bayer_result):
     error = bayer.error(bayer_result.nodes, bayer_result.u, bayer_result.v)
     assert rms(error[0]) < 1e-3
     assert rms(error) < BAYER_RMS
-    assert (bayer_result.weight_share > 0).all()
+    assert (bayer_result.weight_fraction > 0).all()
 
 
 def test_the_result_tells_where_it_comes_from(bayer, bayer_result):
@@ -134,7 +135,7 @@ def test_a_wholly_saturated_frame_is_recorded_and_the_rest_goes_on(bayer, copy, 
     assert result.status.tolist() == [Status.CONVERGED, Status.FAILED, Status.CONVERGED]
     assert "no light sees" in result.reasons[1]
     assert np.isnan(result.v[1]).all()
-    np.testing.assert_array_equal(result.weight_share[1], 0)
+    np.testing.assert_array_equal(result.weight_fraction[1], 0)
 
 
 def test_a_saturated_spot_is_left_out_and_the_rest_measured(bayer, copy, tmp_path):
@@ -399,7 +400,7 @@ def test_the_reference_is_read_linearised_and_modelled_once(bayer, monkeypatch):
 
 
 def test_an_unexpected_error_in_one_frame_is_recorded_and_the_rest_goes_on(bayer, tmp_path, monkeypatch, caplog):
-    original = renewal.track
+    original = reference_update.track
 
     def faulty(reference, deformed, start, *arguments, **options):
         if faulty.calls.pop():
@@ -407,7 +408,7 @@ def test_an_unexpected_error_in_one_frame_is_recorded_and_the_rest_goes_on(bayer
         return original(reference, deformed, start, *arguments, **options)
 
     faulty.calls = [False, True, False]
-    monkeypatch.setattr(renewal, "track", faulty)
+    monkeypatch.setattr(reference_update, "track", faulty)
     with caplog.at_level(logging.ERROR, logger="rgbmidic.pipeline"):
         result = measure(bayer.settings(), tmp_path / "result")
     assert result.status.tolist() == [Status.CONVERGED, Status.FAILED, Status.CONVERGED]
@@ -422,7 +423,7 @@ def test_an_interruption_ends_the_run(bayer, tmp_path, monkeypatch):
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(renewal, "track", interrupted)
+    monkeypatch.setattr(reference_update, "track", interrupted)
     with pytest.raises(KeyboardInterrupt):
         measure(bayer.settings(), tmp_path / "result")
 

@@ -1,13 +1,13 @@
 """What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect."""
 
 from rgbmidic.lab.inspection.inspect import inspect_files, inspect_frame, state_frames
-from rgbmidic.lab.inspection.results import ChannelFacts, Finding, Inspection, LightFacts, Spread
+from rgbmidic.lab.inspection.results import ChannelSummary, Finding, Inspection, LightSummary, Spread
 
 __all__ = [
-    "ChannelFacts",
+    "ChannelSummary",
     "Finding",
     "Inspection",
-    "LightFacts",
+    "LightSummary",
     "Spread",
     "inspect_files",
     "inspect_frame",

@@ -18,12 +18,11 @@ import scipy.sparse as sp
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.equations import SEEN
 from rgbmidic.correlation.images import PREFILTERS, apply_prefilter
-from rgbmidic.correlation.node_status import LOST
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
-from rgbmidic.correlation.uncertainty.propagation import NodeColouring, functional_std
-from rgbmidic.illumination.normalise import local_mean
+from rgbmidic.correlation.nodes import LOST
+from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset
+from rgbmidic.illumination.images import local_mean
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.lab.inspection.disturbances import Disturbances
+from rgbmidic.lab.inspection.samples import Disturbances
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
+from rgbmidic.lab.demo import check_folder, write_document
 from rgbmidic.lab.inspection import Inspection, Spread
-from rgbmidic.lab.output import check_folder, write_document
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, save_figure
 from rgbmidic.typing import AnyArray, BoolArray
 
@@ -105,7 +105,7 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         else {
             "diameter_px": _number(texture.diameter),
             "agreement_of_colours": texture.correlation,
-            "private_share": texture.private,
+            "channel_specific_fraction": texture.private,
         },
         "reflects_from_index": REFLECTING,
         "channels": [_plain(channel) for channel in inspection.channels],

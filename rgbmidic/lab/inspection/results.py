@@ -14,7 +14,7 @@ from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["TOO_FINE", "ChannelFacts", "Finding", "Inspection", "LightFacts", "Spread", "findings"]
+__all__ = ["TOO_FINE", "ChannelSummary", "Finding", "Inspection", "LightSummary", "Spread", "findings"]
 
 
 BLIND = 0.5
@@ -45,7 +45,7 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ChannelFacts:
+class ChannelSummary:
     """The samples of one camera channel in the region.
 
     Attributes
@@ -73,7 +73,7 @@ class ChannelFacts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LightFacts:
+class LightSummary:
     """The separated image of one light in the region.
 
     Attributes
@@ -166,8 +166,8 @@ class Inspection:
 
     name: str
     kind: str
-    channels: tuple[ChannelFacts, ...]
-    lights: tuple[LightFacts, ...]
+    channels: tuple[ChannelSummary, ...]
+    lights: tuple[LightSummary, ...]
     frame_shape: tuple[int, int]
     origin: tuple[int, int]
     images: IlluminationImages

@@ -15,11 +15,10 @@ from itertools import permutations
 import numpy as np
 
 from rgbmidic.lab.planning.plan import Plan
+from rgbmidic.scene.camera import Light
 from rgbmidic.scene.forecast import Instrument
-from rgbmidic.scene.light import Light
-from rgbmidic.scene.projection import material_points
 from rgbmidic.scene.scene import Scene, State
-from rgbmidic.scene.zones import Zones, predict_zones
+from rgbmidic.scene.zones import Zones, material_points, predict_zones
 from rgbmidic.typing import FloatArray
 
 __all__ = ["Proposal", "propose_colours", "propose_lamps"]

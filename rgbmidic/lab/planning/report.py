@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic._version import __version__
-from rgbmidic.lab.output import check_folder, write_document
+from rgbmidic.lab.demo import check_folder, write_document
 from rgbmidic.lab.planning.lamps import Proposal
 from rgbmidic.lab.planning.plan import Outlook, Plan
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal, save_figure
-from rgbmidic.scene.light import Light
+from rgbmidic.scene.camera import Light
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS, Zones
 from rgbmidic.typing import FloatArray

@@ -1,15 +1,20 @@
 """Virtual experiments: ray-traced painted bodies under coloured lights, seen by a colour camera, with exact truth."""
 
-from rgbmidic.illumination.spectra import Led, Sensitivities
-from rgbmidic.lab.virtual.recording import record
-from rgbmidic.lab.virtual.rendering import render
-from rgbmidic.lab.virtual.scenes import expose, paper_scene, plate_scene, sphere_scene, strained_plate, turned
-from rgbmidic.scene.camera import Camera, reference_camera
-from rgbmidic.scene.in_plane import AffineField, MeshField
-from rgbmidic.scene.light import Light
-from rgbmidic.scene.projection import material_points, truth
+from rgbmidic.illumination.crosstalk import Led, Sensitivities
+from rgbmidic.lab.virtual.dataset import record
+from rgbmidic.lab.virtual.rendering import (
+    expose,
+    paper_scene,
+    plate_scene,
+    render,
+    sphere_scene,
+    strained_plate,
+    turned,
+)
+from rgbmidic.scene.camera import Camera, Light, reference_camera
 from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
-from rgbmidic.scene.surface import Finish, Surface, height_map
+from rgbmidic.scene.surface import AffineField, Finish, MeshField, Surface, height_map
+from rgbmidic.scene.zones import material_points, truth
 
 __all__ = [
     "AffineField",

@@ -1,11 +1,17 @@
-"""A virtual test on disk: raw frames, calibration captures, the exact truth, and settings that `rgbmidic run` takes."""
+"""A virtual test on disk: raw frames, calibration captures, the exact truth, and settings that `rgbmidic run` takes.
+
+What a laboratory records beside the test: one light at a time on a target, dark frames, a white card, checks.
+
+What the camera of a scene records: colour filter array, shot and read noise, quantisation, saturation.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +19,27 @@ import numpy.typing as npt
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.writers import write_dng, write_tiff
+from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.virtual.capture import check_frames, dark_frames, flat_frames, single_light_frames
-from rgbmidic.lab.virtual.recording import record
 from rgbmidic.lab.virtual.rendering import render
-from rgbmidic.scene.camera import Camera
-from rgbmidic.scene.projection import truth
-from rgbmidic.scene.scene import Scene, State
-from rgbmidic.scene.scenefile import DatasetSettings, Experiment, read_scene
+from rgbmidic.scene.camera import Camera, Light
+from rgbmidic.scene.scene import DatasetSettings, Experiment, Plate, Scene, State, Target, read_scene
+from rgbmidic.scene.surface import Finish, Surface
+from rgbmidic.scene.zones import truth
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["true_calibration", "write_dataset", "write_experiment"]
+__all__ = [
+    "check_frames",
+    "dark_frames",
+    "flat_frames",
+    "record",
+    "single_light_frames",
+    "target_scene",
+    "true_calibration",
+    "write_dataset",
+    "write_experiment",
+]
 
 Frame = Mosaic | ChannelFrame
 Progress = Callable[[int, int, str], None]
@@ -45,7 +59,7 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
     Parameters
     ----------
     scene_toml
-        The scene (`rgbmidic.scene.scenefile.read_scene`).
+        The scene (`rgbmidic.scene.scene.read_scene`).
     out
         Folder; it must be empty or not exist.
     progress
@@ -213,3 +227,164 @@ def _save(path: Path, **arrays: npt.ArrayLike) -> None:
     path.parent.mkdir(exist_ok=True)
     with path.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
+
+
+EXPOSURES = tuple(0.13 * time for time in (0.5, 1, 2, 4, 6, 10))
+"""Share of the full scale that the brightest sample of a white card reaches, .13 per ms of the exposure times that
+calibration/README.md states; in the last it saturates."""
+_NO_LIGHT = Light(name="off", position=(0.0, 0.0, 0.0), power=0.0)
+
+
+def target_scene(scene: Scene, target: Target = "white") -> Scene:
+    """The same lights and camera before a flat mat target that fills the field at the body's front point."""
+    if target not in ("white", "speckled"):
+        raise InputError(f"unknown target {target!r}; allowed are white, speckled")
+    mat = Finish(albedo=0.8, gloss=0.0, slope_deg=0.0)
+    paint = replace(scene.surface, white=mat, black=replace(mat, albedo=0.1), dome=0.0)
+    if target == "white":
+        paint = Surface(white=mat, black=mat, coverage=0.0)
+    return replace(scene, body=Plate(width=1e5, height=1e5, centre=scene.body.front), surface=paint)
+
+
+def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Target = "white") -> dict[str, list[Frame]]:
+    """Frames with one light on at a time, dimmed from frame to frame.
+
+    Parameters
+    ----------
+    scene
+        The lights and the camera are its own; body and paint are exchanged for a flat mat target.
+    count
+        Frames per light; the last has the full power, the others equal parts of it.
+    seed
+        Of the noise.
+    target
+        Plain white or speckled.
+
+    Returns
+    -------
+    dict
+        Light name to its frames.
+    """
+    images = render(target_scene(scene, target))
+    generator = np.random.SeedSequence(seed)
+    frames: dict[str, list[Frame]] = {light.name: [] for light in scene.lights}
+    for name, taken in frames.items():
+        for step, child in enumerate(generator.spawn(count)):
+            dimmed = images * np.float32((step + 1) / count)
+            taken.append(record(dimmed, scene.camera, scene.lights, seed=int(child.generate_state(1)[0]), on=(name,)))
+    return frames
+
+
+def dark_frames(camera: Camera, *, count: int = 3, seed: int) -> list[Frame]:
+    """Frames with all lights off."""
+    darkness = np.zeros((1, *camera.shape), dtype=np.float32)
+    lightless = replace(camera, crosstalk=np.ones((camera.channels, 1)))
+    seeds = np.random.SeedSequence(seed).generate_state(count)
+    return [record(darkness, lightless, (_NO_LIGHT,), seed=int(s)) for s in seeds]
+
+
+def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]:
+    """Frames of a white card under all lights together: `count` at each of the `EXPOSURES`."""
+    images = render(target_scene(scene, "white"))
+    brightest = float(np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images).max())
+    steps = np.random.SeedSequence(seed).spawn(len(EXPOSURES))
+    taken = []
+    for share, step in zip(EXPOSURES, steps, strict=True):
+        exposed = images * np.float32(share * scene.camera.full_scale / brightest)
+        taken.append([record(exposed, scene.camera, scene.lights, seed=int(s)) for s in step.generate_state(count)])
+    return taken
+
+
+def check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
+    """Frames of the specimen at rest: each light alone, all together ("all"), and "dark".
+
+    Parameters
+    ----------
+    scene
+        Its lights and camera.
+    images : ndarray, shape (k, H, W)
+        What each light alone gives.
+    count
+        Frames of each kind.
+    seed
+        Of the noise.
+    """
+    lit = {light.name: (light.name,) for light in scene.lights} | {"all": tuple(light.name for light in scene.lights)}
+    steps = np.random.SeedSequence(seed).spawn(len(lit) + 1)
+    frames = {"dark": dark_frames(scene.camera, count=count, seed=int(steps[-1].generate_state(1)[0]))}
+    for (name, on), step in zip(lit.items(), steps, strict=False):
+        frames[name] = [
+            record(images, scene.camera, scene.lights, seed=int(s), on=on) for s in step.generate_state(count)
+        ]
+    return frames
+
+
+def record(
+    images: npt.NDArray[np.floating],
+    camera: Camera,
+    lights: tuple[Light, ...],
+    *,
+    seed: int,
+    on: Collection[str] | None = None,
+) -> Mosaic | ChannelFrame:
+    """The raw frame that the camera takes.
+
+    Electrons = Poisson(gain x signal) + normal(read noise); DN = round(electrons/gain + black), clipped at saturation.
+
+    Parameters
+    ----------
+    images : (k, H, W)
+        What each light alone gives (`rgbmidic.lab.virtual.render`).
+    camera
+        The camera.
+    lights
+        The k lights of the images.
+    seed
+        Of the noise; the same seed gives the same frame.
+    on
+        Names of the lights that shine; None: all together, () a dark frame.
+
+    Returns
+    -------
+    Mosaic (Bayer camera) or ChannelFrame (3 channels, or 1 for a monochrome camera)
+    """
+    signal = _channel_signal(_lit(np.asarray(images), lights, on), camera, lights)
+    values = _expose(signal, camera, np.random.default_rng(seed))
+    black = np.array(float(camera.black_level))
+    if camera.kind == "bayer":
+        return Mosaic(values=values, cfa=camera.cfa, black_level=black, white_level=camera.white_level)
+    return ChannelFrame(values=values, black_level=black, white_level=camera.white_level)
+
+
+def _lit(
+    images: npt.NDArray[np.floating], lights: tuple[Light, ...], on: Collection[str] | None
+) -> npt.NDArray[np.floating]:
+    """The images with those of the lights that are off set to nothing."""
+    if images.ndim != 3 or len(images) != len(lights):
+        raise InputError(f"{len(lights)} lights give as many images (k, H, W), not an array of shape {images.shape}")
+    if on is None:
+        return images
+    names = [light.name for light in lights]
+    if unknown := set(on) - set(names):
+        raise InputError(f"no light {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+    return np.asarray(images * np.array([name in on for name in names], dtype=images.dtype)[:, None, None])
+
+
+def _channel_signal(images: npt.NDArray[np.floating], camera: Camera, lights: tuple[Light, ...]) -> FloatImage:
+    """Noise-free DN above black: (H, W) behind a colour filter array, else (C, H, W)."""
+    matrix = camera.mixing(lights)
+    channels: FloatImage = np.einsum("cl,lyx->cyx", matrix.astype(np.float32), images.astype(np.float32, copy=False))
+    if camera.kind != "bayer":
+        return channels
+    mosaic = np.empty(channels.shape[1:], dtype=np.float32)
+    for (row, column), channel in np.ndenumerate(cfa_channels(camera.cfa)):
+        mosaic[row::2, column::2] = channels[channel, row::2, column::2]
+    return mosaic
+
+
+def _expose(signal: FloatImage, camera: Camera, generator: np.random.Generator) -> npt.NDArray[np.uint16]:
+    electrons = generator.poisson(np.maximum(signal, 0) * camera.gain).astype(np.float64)
+    if camera.read_noise > 0:
+        electrons += generator.normal(scale=camera.read_noise, size=signal.shape)
+    levels = np.rint(electrons / camera.gain + camera.black_level)
+    return np.clip(levels, 0, camera.white_level).astype(np.uint16)

@@ -12,8 +12,8 @@ from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linearise import NoiseModel
 from rgbmidic.illumination.registration import Registration, frame_geometry
-from rgbmidic_calibration.blocks import block_means
-from rgbmidic_calibration.stacks import stack_frames
+from rgbmidic_calibration.captures import stack_frames
+from rgbmidic_calibration.ratio import block_means
 from rgbmidic_calibration.verdict import read_limits
 from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, registration_left
 

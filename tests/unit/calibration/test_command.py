@@ -10,7 +10,7 @@ import pytest
 from calibration_scene import MATRICES, captures, expose, speckle_target, white_target
 from tifffile import imread, imwrite
 
-from rgbmidic.frames.writers import write_dng, write_tiff
+from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic_calibration.cli import main
 

@@ -9,8 +9,8 @@ from calibration_scene import BLACK, MATRICES, WHITE, captures, expose, speckle_
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic_calibration.blocks import block_centres, block_means
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
+from rgbmidic_calibration.ratio import block_centres, block_means
 
 MATRIX = MATRICES[1.5]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
-from rgbmidic.illumination.spectra import HALF_MAXIMUM, Led, Sensitivities
+from rgbmidic.illumination.crosstalk import HALF_MAXIMUM, Led, Sensitivities
 from rgbmidic_calibration.design import MeasuredLamp, best_sets, design, draw_design, read_camera, read_lamp
 
 LEDS = {"red": Led(centre=630, width=18), "green": Led(centre=525, width=30), "blue": Led(centre=465, width=20)}

@@ -9,11 +9,11 @@ import pytest
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.camera_noise import CameraNoise, Quantity
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
+from rgbmidic.illumination.linearise import CameraNoise, Quantity
 from rgbmidic.illumination.registration import Registration
-from rgbmidic_calibration.merging import merge_files
-from rgbmidic_calibration.pictures import draw_calibration
+from rgbmidic_calibration.design import draw_calibration
+from rgbmidic_calibration.jobs import merge_files
 
 LIGHTS = ("red", "green", "blue")
 CAMERA = {"cfa": "RGGB", "black_level": 64.0, "white_level": 4095.0, "shape": (100, 120)}

@@ -9,8 +9,8 @@ from calibration_scene import BLACK, GAIN, READ, WHITE, expose, speckle_target, 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.noise import photon_transfer
-from rgbmidic_calibration.stacks import stack_frames
 
 COLUMN = np.array([0.6, 1.0, 0.5])
 LEVELS = (200, 700, 1300, 1900, 2500, 3100)

@@ -10,8 +10,8 @@ from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.registration import Registration, frame_geometry, registration_basis
+from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.registration import estimate_registration, jitter, light_picture
-from rgbmidic_calibration.stacks import stack_frames
 
 LIGHTS = ("red", "green", "blue")
 SHAPE = (220, 240)

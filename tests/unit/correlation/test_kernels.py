@@ -161,11 +161,11 @@ def test_what_is_brought_back_equals_the_naive_twins(motion):
 
 
 def compared(case, given, weight):
-    """What `bring_back` writes for a deformed weight (H, W) and a reference weight (P,)."""
+    """What `warp` writes for a deformed weight (H, W) and a reference weight (P,)."""
     difference, found = np.full((2, case.pixels.rows.size), 7, dtype=np.float32)
     moments = np.full((len(case.mesh.elements), 6), 7.0)
     images = case.coefficients, given, _partial_blocks(given), case.reference, weight
-    kernels.bring_back(*images, *moved(case), difference, found, moments)
+    kernels.warp(*images, *moved(case), difference, found, moments)
     return difference, found, moments
 
 

@@ -7,7 +7,7 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic.correlation import Reference
-from rgbmidic.correlation.light_levels import brightness_change
+from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.mesh import Region, Tri3Mesh
 
 SHAPE = (160, 200)

@@ -10,11 +10,10 @@ from textures import Affine, Texture
 
 from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference
+from rgbmidic.correlation.assembly import BLOCK
 from rgbmidic.correlation.equations import Equations
-from rgbmidic.correlation.recovery import Recovery
+from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.correlation.uncertainty.blocks import BLOCK
-from rgbmidic.correlation.uncertainty.propagation import NodeColouring, functional_std
 
 NOISE = 3.0
 """Standard deviation of the noise, 6 % of the texture's contrast."""
@@ -90,7 +89,7 @@ def test_the_smallest_element_beside_a_hole_is_told_by_the_common_way(monkeypatc
         columns.append(len(asked) * len(colouring.nearest))
         return functional_std(solve, covariance, colouring, asked)
 
-    monkeypatch.setattr("rgbmidic.correlation.uncertainty.nodal.functional_std", counted)
+    monkeypatch.setattr("rgbmidic.correlation.nodes.functional_std", counted)
     image = Texture.random(4, speckle=3).image((96, 96))
     first = noisy(image, 0)
     first[30:60, 35:60] = np.nan

@@ -29,7 +29,7 @@ def test_two_copies_of_a_light_count_nearly_as_one():
     a, noise = speckle(1), [white(n, 30) for n in range(4)]
     once = [a + noise[0], a + noise[0], a + noise[1]]
     then = [a + noise[2], a + noise[2], a + noise[3]]
-    share = measured(once, then).weight_share
+    share = measured(once, then).weight_fraction
     np.testing.assert_allclose(share, [0.25, 0.25, 0.5], atol=0.03)
 
 
@@ -44,7 +44,7 @@ def test_a_light_that_errs_alone_counts_little():
     a, noise = speckle(1), [white(n, 10) for n in range(6)]
     once = [a + n for n in noise[:3]]
     then = [a + noise[3], a + noise[4] + white(9, 150), a + noise[5]]
-    share = measured(once, then).weight_share
+    share = measured(once, then).weight_fraction
     assert share[1] < 0.1
     assert share[0] == pytest.approx(share[2], rel=0.15)
 

@@ -10,7 +10,7 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic import NodeStatus, Region, Tri3Mesh
-from rgbmidic.correlation import Deformed, Reference, Renewal, Start, Status, track
+from rgbmidic.correlation import Deformed, Reference, ReferenceUpdate, Start, Status, track
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
 
@@ -35,30 +35,33 @@ def prepared(image):
     return Deformed.prepare(stack(image), prefilter="binomial")
 
 
-def chained(images, renew):
-    """Solutions of the images after the first; `renew` tells, of frame, renewal, deformed and step, who follows."""
-    renewal = Renewal.none(first_reference(images[0]))
-    start, solutions, renewed = Start(displacement=np.zeros_like(renewal.displacement)), [], []
+def chained(images, update_reference):
+    """Solutions of the images after the first; `update_reference` says who follows, of frame, update, deformed and step."""
+    reference_update = ReferenceUpdate.none(first_reference(images[0]))
+    start, solutions, updated = Start(displacement=np.zeros_like(reference_update.displacement)), [], []
     for number, image in enumerate(images[1:], start=1):
         deformed = prepared(image)
         step = track(
-            renewal.reference, deformed, Start(displacement=start.displacement - renewal.displacement), OPTIONS
+            reference_update.reference,
+            deformed,
+            Start(displacement=start.displacement - reference_update.displacement),
+            OPTIONS,
         )
-        solutions.append(renewal.accumulated(step, deformed))
-        start = start.after(renewal.first.mesh, solutions[-1].displacement, solutions[-1].measured)
-        if solutions[-1].measured.any() and renew(number, renewal, deformed, step):
-            renewal = renewal.renewed(solutions[-1], stack(image))
-            renewed.append(number)
-    return solutions, renewed
+        solutions.append(reference_update.accumulated(step, deformed))
+        start = start.after(reference_update.first.mesh, solutions[-1].displacement, solutions[-1].measured)
+        if solutions[-1].measured.any() and update_reference(number, reference_update, deformed, step):
+            reference_update = reference_update.updated(solutions[-1], stack(image))
+            updated.append(number)
+    return solutions, updated
 
 
 def always(*_):
     return True
 
 
-def when_needed(_, renewal, deformed, step):
-    solution = renewal.accumulated(step, deformed)
-    return renewal.is_due(renewal.match(deformed, solution), best=1.0)
+def when_needed(_, reference_update, deformed, step):
+    solution = reference_update.accumulated(step, deformed)
+    return reference_update.is_due(reference_update.match(deformed, solution), best=1.0)
 
 
 def noisy(image, sigma, random):
@@ -80,7 +83,7 @@ def test_before_any_renewal_a_frame_is_measured_as_without():
         prepared(texture.image(SHAPE, Affine(shift=(1.3, 0.4)))),
     )
     start = Start(displacement=np.zeros_like(reference.mesh.nodes))
-    found = Renewal.none(reference).track(deformed, start, OPTIONS)
+    found = ReferenceUpdate.none(reference).track(deformed, start, OPTIONS)
     expected = track(reference, deformed, start, OPTIONS)
     np.testing.assert_array_equal(found.displacement, expected.displacement)
     np.testing.assert_array_equal(found.displacement_std, expected.displacement_std)
@@ -118,8 +121,8 @@ def test_the_uncertainty_of_the_total_covers_noise_that_cancels_and_paint_that_c
         ratios.append([error(s, m) / s.displacement_std for s, m in zip(solutions, motions[1:], strict=True)])
         stated.append([rms(s.displacement_std) for s in solutions])
     growth = np.mean(stated, axis=0)[3] / np.mean(stated, axis=0)[0]
-    for renewals in (1, 3):
-        assert RATIO[0] < rms(np.array(ratios)[:, renewals]) < RATIO[1]
+    for reference_updates in (1, 3):
+        assert RATIO[0] < rms(np.array(ratios)[:, reference_updates]) < RATIO[1]
     assert growth > 1.7 if changing else growth < 1.35  # 2 where four steps add up, 1 where their noise cancels
 
 
@@ -132,8 +135,8 @@ def test_paint_that_wears_off_is_followed_beyond_what_one_reference_matches():
         noisy(200 + a * (old.image(SHAPE, motion) - 200) + b * (new.image(SHAPE, motion) - 200), 2.0, random)
         for (a, b), motion in zip(parts, motions, strict=True)
     ]
-    solutions, renewed = chained(images, when_needed)
-    assert 2 <= len(renewed) <= 6
+    solutions, updated = chained(images, when_needed)
+    assert 2 <= len(updated) <= 6
     alone, _ = chained(images, lambda *_: False)
     assert alone[-1].status is Status.FAILED
     assert solutions[-1].measured.mean() > 0.6
@@ -167,9 +170,9 @@ def pair(motion, change=0.0, noise=2.0):
 )
 def test_a_reference_is_renewed_for_what_no_longer_matches_only(motion, change, noise, called):
     reference, deformed, solution = pair(motion, change, noise)
-    renewal = Renewal.none(reference)
-    match = renewal.match(deformed, solution)
-    assert renewal.is_due(match, best=np.nanmedian(match) if noise > 10 else 1.0) is called
+    reference_update = ReferenceUpdate.none(reference)
+    match = reference_update.match(deformed, solution)
+    assert reference_update.is_due(match, best=np.nanmedian(match) if noise > 10 else 1.0) is called
 
 
 def test_a_node_that_the_new_reference_did_not_measure_stays_unmeasured_on_it():
@@ -188,7 +191,7 @@ def test_a_node_that_the_new_reference_did_not_measure_stays_unmeasured_on_it():
 
 def test_a_renewal_from_stored_numbers_is_the_same_to_the_bit():
     texture = Texture.random(4)
-    first = Renewal.none(first_reference(texture.image(SHAPE)))
+    first = ReferenceUpdate.none(first_reference(texture.image(SHAPE)))
     image = texture.image(SHAPE, Affine(shift=(0.7, 0.2)))
     solution = first.track(prepared(image), Start(displacement=np.zeros_like(first.displacement)), OPTIONS)
     stored = replace(
@@ -197,7 +200,7 @@ def test_a_renewal_from_stored_numbers_is_the_same_to_the_bit():
     )
     one, other = (
         pickle.dumps(
-            first.renewed(kept, stack(image)).track(
+            first.updated(kept, stack(image)).track(
                 prepared(texture.image(SHAPE, Affine(shift=(1.1, 0.2)))),
                 Start(displacement=solution.displacement),
                 OPTIONS,
@@ -218,13 +221,13 @@ def test_both_sides_of_an_open_crack_are_followed_on_a_renewed_reference():
         image = np.where(y < middle, texture.at(x, y + half), texture.at(x, y - half))
         return np.where(np.abs(y - middle) < half, 60.0, image)
 
-    renewal = Renewal.none(first_reference(opened(0.0), [path]))
-    mesh = renewal.first.mesh
+    reference_update = ReferenceUpdate.none(first_reference(opened(0.0), [path]))
+    mesh = reference_update.first.mesh
     start = Start(displacement=np.zeros_like(mesh.nodes))
     for width in (4.0, 8.0):
-        solution = renewal.track(prepared(opened(width)), start, OPTIONS)
-        renewal = renewal.renewed(solution, stack(opened(width)))
-        start = start.after(renewal.first.mesh, solution.displacement, solution.measured)
+        solution = reference_update.track(prepared(opened(width)), start, OPTIONS)
+        reference_update = reference_update.updated(solution, stack(opened(width)))
+        start = start.after(reference_update.first.mesh, solution.displacement, solution.measured)
     half = 8.0 * np.clip(1 - mesh.nodes[:, 0] / 110, 0, None) / 2
     expected = np.where(mesh.places[:, 1] < middle, -half, half)
     assert solution.measured.all()
@@ -233,13 +236,13 @@ def test_both_sides_of_an_open_crack_are_followed_on_a_renewed_reference():
 
 def test_a_frame_in_which_nothing_is_measured_is_no_reference():
     texture = Texture.random(0)
-    first = Renewal.none(first_reference(texture.image(SHAPE)))
+    first = ReferenceUpdate.none(first_reference(texture.image(SHAPE)))
     solution = first.track(
         prepared(texture.image(SHAPE)), Start(displacement=np.zeros_like(first.displacement)), OPTIONS
     )
     lost = replace(solution, node_status=np.full_like(solution.node_status, NodeStatus.DECORRELATED))
     with pytest.raises(InputError, match="no element is measured"):
-        first.renewed(lost, stack(texture.image(SHAPE)))
+        first.updated(lost, stack(texture.image(SHAPE)))
 
 
 def test_a_light_that_moves_for_itself_calls_for_no_reference():
@@ -250,9 +253,9 @@ def test_a_light_that_moves_for_itself_calls_for_no_reference():
     weights = np.ones_like(first)
     weights[0, :, 90:] = weights[1, :, :60] = 0
     mesh = Tri3Mesh.from_region(region, 25)
-    renewal = Renewal.none(Reference.prepare(first, region, weights, mesh=mesh))
+    reference_update = ReferenceUpdate.none(Reference.prepare(first, region, weights, mesh=mesh))
     deformed = Deformed.prepare(then, weights)
     start = Start(displacement=np.full(mesh.nodes.shape, 0.2))
-    solution = renewal.track(deformed, start, replace(OPTIONS, rigid="translation", prefilter="none"))
+    solution = reference_update.track(deformed, start, replace(OPTIONS, rigid="translation", prefilter="none"))
     np.testing.assert_allclose(solution.rigid[1], (2.5, 0), atol=0.01)
-    assert np.nanmin(renewal.match(deformed, solution)) > 0.99
+    assert np.nanmin(reference_update.match(deformed, solution)) > 0.99

@@ -9,9 +9,8 @@ from textures import Affine, Texture
 
 from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Status
-from rgbmidic.correlation.assembly import Assembly
-from rgbmidic.correlation.rigid import RigidMotions, rigid_functions
-from rgbmidic.mesh.sparse import with_data
+from rgbmidic.correlation.assembly import Assembly, RigidMotions, rigid_functions
+from rgbmidic.mesh.tri3 import with_data
 
 SHAPE, REGION = (100, 200), (12, 12, 187, 87)
 Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]]

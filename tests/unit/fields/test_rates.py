@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import Rates, difference_std, frame_covariance, rates, reference_share
+from rgbmidic.fields import Rates, difference_std, frame_covariance, rates, reference_fraction
 
 TIMES = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, 30))
 FIRST = np.arange(30) == 0
@@ -50,7 +50,7 @@ def test_at_rest_the_stated_uncertainty_holds_the_noise_and_leaves_the_reference
     references = np.arange(30) < count
     errors = noise(600, count)
     std = np.where(references, np.sqrt(1 - 1 / count), np.sqrt(1 + 1 / count))
-    options = {"window": 7.0, "share": reference_share(count), "references": references}
+    options = {"window": 7.0, "share": reference_fraction(count), "references": references}
     drawn = rates(TIMES, errors, np.broadcast_to(std[:, None], errors.shape), **options)
     for name in ("value", *NAMES):
         square = (getattr(drawn, name) / np.maximum(getattr(drawn, f"{name}_std"), 1e-9)) ** 2
@@ -176,7 +176,7 @@ def evidence(times: np.ndarray, values: np.ndarray, degree: int) -> float:
 def test_what_frames_share_of_the_reference_cancels_in_a_difference():
     errors = noise(50_000, 1)
     std = np.sqrt(2.0)
-    assert difference_std(std, std, reference_share(1)) == pytest.approx((errors[7] - errors[20]).std(), rel=0.02)
+    assert difference_std(std, std, reference_fraction(1)) == pytest.approx((errors[7] - errors[20]).std(), rel=0.02)
     covariance = frame_covariance(np.array([0, std, std]), 0.5, [True, False, False])
     np.testing.assert_allclose(covariance, np.cov(errors[[0, 7, 20]]), atol=0.03)
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, NodalTest
 
-from rgbmidic.fields import MEASURES, Nodal, StrainGauges, make_probe, rates, reference_share
+from rgbmidic.fields import MEASURES, Nodal, StrainGauges, make_probe, rates, reference_fraction
 from rgbmidic.typing import FloatArray
 
 RIGHT, RATES = (0.9, 1.1), (0.7, 1.2)
 """rms(error / stated), the ranges that were asked for."""
-SHARE = reference_share(1)
+SHARE = reference_fraction(1)
 
 
 def tension(points: FloatArray, time: float) -> FloatArray:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rgbmidic.errors import FrameError
 from rgbmidic.frames import camera_raw, open_source, read_frame
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
-from rgbmidic.frames.writers import write_dng
+from rgbmidic.frames.images import write_dng
 from rgbmidic.settings import FrameSettings
 
 STATED = FrameSettings(path=("frame",))

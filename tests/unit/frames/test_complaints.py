@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from rgbmidic.frames.complaints import complaints
+from rgbmidic.frames.stored import complaints
 
 
 def test_lines_are_caught_by_their_start_and_the_others_pass(capfd: pytest.CaptureFixture[str]) -> None:

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from mraw_files import pack_bits, write_mraw
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames import FrameSeries, Mosaic, mraw, open_series, open_source
-from rgbmidic.frames.layout import unpack_bits
+from rgbmidic.frames import FrameSeries, Mosaic, open_series, open_source
+from rgbmidic.frames import movies as mraw
 from rgbmidic.frames.source import FrameSource
+from rgbmidic.frames.stored import unpack_bits
 from rgbmidic.settings import FrameSettings
 
 SHAPE = (12, 16)

@@ -22,8 +22,8 @@ from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.frames import FrameSeries, FrameSource, file_hash, formats, list_frames, open_series
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.formats import FrameFormat
+from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.frames.stored import StoredFrame
-from rgbmidic.frames.writers import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings, TestSettings
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from rgbmidic.errors import InputError
 from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
-from rgbmidic.frames.writers import MINIMUM_DNG_SIZE, write_dng, write_tiff
+from rgbmidic.frames.images import MINIMUM_DNG_SIZE, write_dng, write_tiff
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,11 @@ from small_tests import colour_test
 from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.frames import open_series
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
-from rgbmidic.frames.writers import write_dng
+from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.camera_noise import QUANTISATION
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.frame_check import check_state, mismatches, unevenness
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linearise import QUANTISATION, NoiseModel
 from rgbmidic.pipeline import measure
 
 BLACK, WHITE, SHAPE = 64, 4095, (288, 288)

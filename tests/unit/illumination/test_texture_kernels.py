@@ -4,10 +4,11 @@ import naive_texture
 import numpy as np
 import pytest
 
-from rgbmidic._kernels import kriging, texture
+from rgbmidic._kernels import mesh as kriging
+from rgbmidic._kernels import texture
 from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.colour_factors import colour_moments, of_mosaic, widened
-from rgbmidic.illumination.demosaic.base import red_position
+from rgbmidic.illumination.demosaic import red_position
 
 SHAPES = [(16, 24), (19, 21), (33, 18), (9, 531)]
 

@@ -6,7 +6,7 @@ import naive_picture
 import numpy as np
 import pytest
 
-from rgbmidic._kernels.picture import paint_field
+from rgbmidic._kernels.interpolation import paint_field
 from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.mesh import Region, Tri3Mesh
 

@@ -19,7 +19,7 @@ from rgbmidic.command import execute
 from rgbmidic.correlation import correlate
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.writers import write_dng, write_tiff
+from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import CrosstalkField
 from rgbmidic.illumination.linearise import NoiseModel, linearise
@@ -27,10 +27,9 @@ from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
-from rgbmidic.lab.inspection.disturbances import gaussian_field
 from rgbmidic.lab.inspection.prediction import expected_std
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
-from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
+from rgbmidic.lab.inspection.samples import Channel, channels_of, gaussian_field, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.forecast import node_constant
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rgbmidic.lab import rehearsal
+from rgbmidic.lab.planning import plan as rehearsal
 
 _REST = """
 import importlib, pkgutil, sys

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from bits import assert_same_on_threads
 
-from rgbmidic._kernels.grid import product_sums
-from rgbmidic._kernels.robust import scores
+from rgbmidic._kernels.interpolation import product_sums
+from rgbmidic._kernels.lights import scores
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 

@@ -12,7 +12,7 @@ from textures import Texture
 from rgbmidic import Calibration, Status, correlate, measure, read_frame, read_test
 from rgbmidic.errors import CalibrationError, FrameError
 from rgbmidic.frames.data import ChannelFrame
-from rgbmidic.frames.writers import write_tiff
+from rgbmidic.frames.images import write_tiff
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.lab.inspection import inspect_files

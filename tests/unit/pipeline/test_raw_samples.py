@@ -14,9 +14,9 @@ from textures import Texture
 from rgbmidic import Status, measure, read_frame, read_test
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.writers import write_dng, write_tiff
-from rgbmidic.illumination.normalise import local_mean
-from rgbmidic.pipeline.raw_samples import check_texture, exposure_fault, neighbour_correlation
+from rgbmidic.frames.images import write_dng, write_tiff
+from rgbmidic.illumination.images import local_mean
+from rgbmidic.pipeline.plan import check_texture, exposure_fault, neighbour_correlation
 
 INSIDE = np.zeros(SHAPE, dtype=bool)
 INSIDE[16:129, 16:129] = True

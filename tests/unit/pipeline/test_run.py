@@ -26,7 +26,7 @@ from rgbmidic.frames import read_frame, write_tiff
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import measure, run, schedule, workers
 from rgbmidic.pipeline.frame import measure_frame
-from rgbmidic.pipeline.plan import ReferenceUpdates
+from rgbmidic.pipeline.plan import UpdatedReferences
 from rgbmidic.results import Result, finish_result, scale_of
 from rgbmidic.settings import TestSettings
 
@@ -100,9 +100,9 @@ def test_a_frame_that_kills_every_worker_fails_and_the_rest_goes_on(
     movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Dying(workers.Here):
-        def submit(self, index: int, start: Start, renewed: Any = ()) -> Future[workers.Measured]:
+        def submit(self, index: int, start: Start, updated: Any = ()) -> Future[workers.Measured]:
             if index != 5:
-                return super().submit(index, start, renewed)
+                return super().submit(index, start, updated)
             dead: Future[workers.Measured] = Future()
             dead.set_exception(BrokenExecutor("killed"))
             return dead
@@ -121,9 +121,9 @@ def test_a_frame_that_kills_its_worker_takes_no_other_with_it(
 
         slots = 3
 
-        def submit(self, index: int, start: Start, renewed: Any = ()) -> Future[workers.Measured]:
+        def submit(self, index: int, start: Start, updated: Any = ()) -> Future[workers.Measured]:
             future: Future[workers.Measured] = Future()
-            running.append((index, future, super().submit(index, start, renewed)))
+            running.append((index, future, super().submit(index, start, updated)))
             return future
 
     def ended_together(futures: Any, **_: Any) -> Any:
@@ -178,7 +178,7 @@ def test_workers_that_do_not_start_are_ended_and_named(monkeypatch: pytest.Monke
 
 
 def test_threads_of_a_process_make_an_updated_reference_once() -> None:
-    updates, made = ReferenceUpdates(), list[object]()
+    updates, made = UpdatedReferences(), list[object]()
 
     def make() -> Any:
         time.sleep(0.05)
@@ -369,8 +369,8 @@ def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
 def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
     movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def failing(plan: Any, index: int, start: Start, renewed: Any) -> Any:
-        record = measure_frame(plan, index, start, renewed)
+    def failing(plan: Any, index: int, start: Start, updated: Any) -> Any:
+        record = measure_frame(plan, index, start, updated)
         return schedule.failed_frame(plan, index, "out of memory") if index == 33 else record
 
     with monkeypatch.context() as patched:
@@ -423,10 +423,10 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
 ) -> None:
     starts: list[tuple[int, float]] = []
 
-    def watched(plan: Any, index: int, start: Start, renewed: Any) -> Any:
+    def watched(plan: Any, index: int, start: Start, updated: Any) -> Any:
         moved = np.inf if start.displacement is None else float(start.displacement[:, 1].mean())
         starts.append((index, moved))
-        record = measure_frame(plan, index, start, renewed)
+        record = measure_frame(plan, index, start, updated)
         return schedule.failed_frame(plan, index, "lost") if index == 16 and len(starts) == 17 else record
 
     monkeypatch.setattr("rgbmidic.pipeline.workers.measure_frame", watched)
@@ -453,7 +453,7 @@ def renewing_test(folder: Path, motions: list[Affine], worn_deg: float, noise: f
         values = np.clip(np.round(image + rng.normal(0, noise, SHAPE)), 0, 255).astype(np.uint8)
         frame = ChannelFrame(values=values[None], black_level=0.0, white_level=255.0)
         write_tiff(folder / f"f{index:03d}.tif", frame)
-    document = {**settings(folder, renew=True).to_mapping(), "region": {"rectangle": [22, 18, 58, 54]}}
+    document = {**settings(folder, update_reference=True).to_mapping(), "region": {"rectangle": [22, 18, 58, 54]}}
     return TestSettings.from_mapping(document, folder)
 
 
@@ -468,7 +468,7 @@ def check_last(result: Result, motion: Affine, largest_rms: float) -> None:
 def test_a_rotation_is_followed_without_a_new_reference(tmp_path: Path) -> None:
     motions = [Affine.strain_and_rotation(0.0, 3.0 * index) for index in range(20)]
     result = measure(renewing_test(tmp_path, motions, 0.0, 1.0), tmp_path / "result")
-    assert len(result.frame(19).renewals) == 0
+    assert len(result.frame(19).reference_updates) == 0
     check_last(result, motions[-1], 0.1)
 
 
@@ -481,7 +481,7 @@ def test_paint_that_wears_off_is_followed_by_renewed_references_to_the_same_bits
             raise KeyboardInterrupt
 
     renewing = measure(chosen, tmp_path / "renewing")
-    assert len(renewing.frame(19).renewals) >= 1
+    assert len(renewing.frame(19).reference_updates) >= 1
     check_last(renewing, motions[-1], 1.0)  # a third of the paint is another one
     with pytest.raises(KeyboardInterrupt):
         measure(chosen, tmp_path / "resumed", progress=interrupt)

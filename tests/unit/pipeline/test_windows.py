@@ -111,9 +111,9 @@ def test_renewed_references_have_windows_of_their_own(tmp_path: Path, settings: 
             tmp_path / f"f{index}.tif", ChannelFrame(values=values, black_level=np.array([64.0]), white_level=4095)
         )
     parts, whole = both(settings('kind = "monochrome"\nrenew = true'))
-    renewals = [list(of) for of in parts.each("renewals")]
-    assert len(renewals[-1]) > 1
-    assert renewals == [list(of) for of in whole.each("renewals")]
+    reference_updates = [list(of) for of in parts.each("reference_updates")]
+    assert len(reference_updates[-1]) > 1
+    assert reference_updates == [list(of) for of in whole.each("reference_updates")]
     assert apart(parts, whole).max() < ROUNDING
 
 

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.report import document, facts, remove_report, style, write_report
+from rgbmidic.report import document, remove_report, style, write_report
+from rgbmidic.report import setup as facts
 from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SetupSettings, TestSettings

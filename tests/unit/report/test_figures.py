@@ -20,7 +20,7 @@ from rgbmidic.report import figures, gallery, remove_figures, save_figure, style
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import AnyArray
-from rgbmidic.view.frames import Pictures
+from rgbmidic.view.fields import Pictures
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 X, Y = MESH.nodes.T
@@ -205,7 +205,7 @@ NASTY = ("a$x^2$_1", "_hidden", "r$ed", "x\\alpha_{2}", "кадр", "写真", "n
 @pytest.mark.filterwarnings("error")  # of letters without a picture
 def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     origin = Origin(nodes=MESH.nodes, elements=MESH.elements, names=NASTY[:8], lights=NASTY[:3])
-    still = {"u": 0 * X, "v": 0 * X, "light_share": np.full((NODES, 3), 0.3), "history": [1.0, 0.1]}
+    still = {"u": 0 * X, "v": 0 * X, "light_fraction": np.full((NODES, 3), 0.3), "history": [1.0, 0.1]}
     store = ResultStore.create(tmp_path / "out", origin)
     for index in range(8):
         store.write_frame(index, FrameRecord.of(nodes=NODES, lights=3, status=0, residual=np.ones(3), **still))
@@ -214,7 +214,7 @@ def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     for figure, names in (
         (figures.convergence_figure(result), NASTY[1:5]),
         (figures.residual_figure(result), NASTY[:3]),
-        (figures.share_figure(result, 0), NASTY[:3]),
+        (figures.fraction_figure(result, 0), NASTY[:3]),
     ):
         figure.savefig(io.BytesIO(), format="png", dpi=30)
         texts = [text for text in figure.findobj(match=Text) if "mathdefault" not in text.get_text()]
@@ -243,7 +243,7 @@ def test_times_are_told_in_the_unit_that_suits_them(reach: float, unit: str) -> 
 @pytest.mark.parametrize("numbers", [range(4), range(10**8, 10**8 + 300), range(0, 10**7, 10**5)], ids=str)
 def test_numbers_along_an_axis_do_not_touch(tmp_path: Path, numbers: range) -> None:
     def record(index: int) -> FrameRecord:
-        known = {"node_status": np.zeros(NODES), "light_share": np.full((NODES, 3), 1 / 3)}
+        known = {"node_status": np.zeros(NODES), "light_fraction": np.full((NODES, 3), 1 / 3)}
         return FrameRecord.of(nodes=NODES, lights=3, residual=np.ones(3), number=numbers[index], **known)
 
     result = make_result(tmp_path / "out", frames=len(numbers), record=record)

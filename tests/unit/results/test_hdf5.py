@@ -16,7 +16,8 @@ import pytest
 from results import LIGHTS, MESH, NODES, make_origin, make_result
 
 from rgbmidic.errors import ResultError
-from rgbmidic.results import FrameRecord, Result, ResultStore, export_result, hdf5
+from rgbmidic.results import FrameRecord, Result, ResultStore, export_result
+from rgbmidic.results import export as hdf5
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import FloatArray
 
@@ -45,7 +46,7 @@ def linear_record(index: int) -> FrameRecord:
         u[0] = v[0] = std[0] = np.nan
         status[0] = 1
     shares = np.arange(NODES)[:, None] + np.arange(len(LIGHTS)) / 10
-    values = {"u": u, "v": v, "u_std": std, "v_std": std, "node_status": status, "light_share": shares}
+    values = {"u": u, "v": v, "u_std": std, "v_std": std, "node_status": status, "light_fraction": shares}
     return FrameRecord.of(nodes=NODES, lights=len(LIGHTS), number=10 + index, status=0, misfit=X + index, **values)
 
 
@@ -109,7 +110,7 @@ def test_every_axis_has_its_dimension_scale(file: h5py.File) -> None:
             assert axis[0].is_scale
             assert axis[0].shape == (size,)
         assert "units" in dataset.attrs
-    assert [axis[0].name for axis in file["light_share"].dims] == ["/time", "/node", "/light"]
+    assert [axis[0].name for axis in file["light_fraction"].dims] == ["/time", "/node", "/light"]
     assert file["light"].asstr()[:].tolist() == list(LIGHTS)
 
 
@@ -139,7 +140,7 @@ def test_the_group_of_vtk_shows_the_same_numbers_with_y_up(file: h5py.File) -> N
             sign = -1 if name in ("exy", "direction") else 1
             np.testing.assert_array_equal(rows, sign * file[name][:].reshape(rows.shape), err_msg=name)
             assert dataset.is_virtual == (sign == 1), "no copy of what is the same"
-    assert {"u_std", "exx", "e1", "equivalent", "misfit", "node_status", "light_share"} <= data.keys()
+    assert {"u_std", "exx", "e1", "equivalent", "misfit", "node_status", "light_fraction"} <= data.keys()
 
 
 def test_the_steps_share_one_mesh_of_triangles_seen_from_the_front(file: h5py.File) -> None:
@@ -236,6 +237,6 @@ def test_xarray_opens_it_with_coordinates(folder: Path, file: h5py.File, engine:
     with xarray.open_dataset(folder / "a.vtkhdf", engine=engine) as dataset:
         assert dataset.u.dims == ("time", "node")
         np.testing.assert_array_equal(dataset.u, file["u"])
-        green = dataset.light_share.sel(light="green").isel(time=0)
-        np.testing.assert_array_equal(green, file["light_share"][0, :, 1])
+        green = dataset.light_fraction.sel(light="green").isel(time=0)
+        np.testing.assert_array_equal(green, file["light_fraction"][0, :, 1])
         assert dataset.u.attrs["units"] == "mm"

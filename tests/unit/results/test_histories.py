@@ -26,7 +26,7 @@ from rgbmidic.results import (
     probes_of,
     write_histories,
 )
-from rgbmidic.results.probing import read_histories
+from rgbmidic.results.histories import read_histories
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
 
 NUMBERS = (0, 1, 2, 4, 5, 6, 7, 8)
@@ -76,7 +76,7 @@ def make(
                 number=number,
                 time_ns=round(number * 1e9 / RATE) + 2_000 if timed else UNKNOWN_TIME,
                 **{"u": u, "v": v, "u_std": std, "v_std": std},
-                light_share=np.ones((NODES, 1)),
+                light_fraction=np.ones((NODES, 1)),
             )
             store.write_frame(index, record)
         store.finish()

@@ -16,7 +16,7 @@ from results import make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import Result, ResultStore, finish_result
-from rgbmidic.results.lock import Claim
+from rgbmidic.results.files import Claim
 
 
 def _create(path: Path, *, overwrite: bool = False) -> ResultStore:

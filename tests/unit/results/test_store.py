@@ -299,13 +299,13 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
         strain=values.random((nodes, 3)),
         strain_std=values.random((nodes, 3)),
         node_status=np.arange(nodes).astype(np.uint8),
-        light_share=values.random((nodes, 2)),
+        light_fraction=values.random((nodes, 2)),
         misfit=values.random(nodes),
         status=Status.NOT_CONVERGED,
         reason="why",
         rigid=values.random((2, 3)),
         residual=values.random(2),
-        weight_share=values.random(2),
+        weight_fraction=values.random(2),
         history=values.random(6),
     )
     brightness = values.random((2, 2))
@@ -315,7 +315,7 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
     np.testing.assert_array_equal(np.stack([record.u_std, record.v_std], axis=1), single["displacement_std"])
     np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), single["strain"])
     np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), single["strain_std"])
-    for name in ("node_status", "light_share", "misfit", "rigid", "residual", "weight_share", "history"):
+    for name in ("node_status", "light_fraction", "misfit", "rigid", "residual", "weight_fraction", "history"):
         single = np.asarray(getattr(solution, name), dtype=QUANTITIES[name].dtype)
         np.testing.assert_array_equal(getattr(record, name), single, err_msg=name)
     assert (record.status, record.reason, record.iterations) == (1, "why", 6)

@@ -19,13 +19,11 @@ from rgbmidic.illumination.linearise import LinearMosaic, linearise
 from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.unmix import unmix
 from rgbmidic.lab.virtual import Scene, State, record, render, strained_plate, truth, turned
-from rgbmidic.lab.virtual.scenes import paint, plate_scene, sphere_scene
+from rgbmidic.lab.virtual.rendering import paint, plate_scene, sphere_scene
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.scene.forecast import Instrument, node_constant, pixel_size, trace_change
-from rgbmidic.scene.projection import material_points
-from rgbmidic.scene.speckle_patch import SpecklePatch
-from rgbmidic.scene.speckle_spectrum import SpeckleSpectrum, cover_covariance
-from rgbmidic.scene.zones import predict_zones
+from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cover_covariance
+from rgbmidic.scene.zones import material_points, predict_zones
 
 OVERSTATED = 1.45
 """Forecast over observed in reflections that move: 1.35 in this scene since the solve weights by covariance."""
@@ -137,7 +135,7 @@ def test_more_light_and_a_better_camera_measure_better():
 def test_green_is_the_best_colour_of_a_bayer_camera():
     made = instrument("bayer")
     zones = still(made.scene)
-    share = made.forecast(zones, zones, trace_change(np.full((2, 1, 2), 0.5))).weight_share[:, 0, 0]
+    share = made.forecast(zones, zones, trace_change(np.full((2, 1, 2), 0.5))).weight_fraction[:, 0, 0]
     assert share[1] > 1.5 * max(share[0], share[2])
 
 

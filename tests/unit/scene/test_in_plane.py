@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay
 
 from rgbmidic.errors import InputError
 from rgbmidic.lab.virtual import AffineField, MeshField, Plate, State, plate_scene, render, truth
-from rgbmidic.scene.in_plane import material_from_spatial
+from rgbmidic.scene.surface import material_from_spatial
 
 
 def irregular_mesh(rng, number=60, strain=0.02):

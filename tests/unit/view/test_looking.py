@@ -17,16 +17,14 @@ from hypothesis import strategies as st
 from results import LIGHTS, NODES, make_origin, make_result, random_record, smooth_record
 
 from rgbmidic.results import FrameRecord, Result, ResultStore
-from rgbmidic.results.history_table import write_histories
+from rgbmidic.results.histories import write_histories
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.view import curves
 from rgbmidic.view.address import KINDS, Look, Mark
-from rgbmidic.view.curve_panel import CurvePanel
-from rgbmidic.view.fields import Fields, Values, robust_range
+from rgbmidic.view.curves import Course, CurvePanel, TimeLine
+from rgbmidic.view.fields import Fields, Values, frame_words, pointed_words, robust_range, watched
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import Window, element_at, paint, palette, palette_name
-from rgbmidic.view.timeline import Course, TimeLine
-from rgbmidic.view.words import frame_words, pointed_words, watched
 
 NAMES = ("u", "v", "e1")
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))

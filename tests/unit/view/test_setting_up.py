@@ -11,8 +11,7 @@ from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
 from rgbmidic.settings import RegionSettings, read_section, read_test
 from rgbmidic.view.address import Mark
-from rgbmidic.view.draft import Draft
-from rgbmidic.view.outline import arranged, marks_of, region_of
+from rgbmidic.view.draft import Draft, arranged, marks_of, region_of
 
 TEXT = """# a test of the plate
 [frames]  # as recorded

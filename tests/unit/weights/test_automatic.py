@@ -14,8 +14,7 @@ from rgbmidic.illumination.linearise import linearise
 from rgbmidic.lab.virtual import Finish, Light, Scene, Sphere, State, Surface, expose, record, render
 from rgbmidic.mesh import Region
 from rgbmidic.scene.camera import reference_camera
-from rgbmidic.weights.automatic import automatic_threshold
-from rgbmidic.weights.threshold import threshold_weights
+from rgbmidic.weights.threshold import automatic_threshold, threshold_weights
 
 SIZE, SPOT = 300, (80.0, 150.0)
 

@@ -12,9 +12,8 @@ import pytest
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.virtual import State
-from rgbmidic.scene.projection import material_points, placed
-from rgbmidic.scene.scenefile import read_scene
-from rgbmidic.scene.zones import predict_zones
+from rgbmidic.scene.scene import read_scene
+from rgbmidic.scene.zones import material_points, placed, predict_zones
 from rgbmidic.settings import TestSettings
 from rgbmidic.weights.geometry import GeometryWeights
 

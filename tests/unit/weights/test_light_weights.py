@@ -13,7 +13,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
 from rgbmidic.weights import prepare_weights
-from rgbmidic.weights.automatic import FALLBACK
+from rgbmidic.weights.threshold import FALLBACK
 
 SHAPE = (60, 80)
 REGION = Region.from_rectangle((0, 0, 79, 59), SHAPE)

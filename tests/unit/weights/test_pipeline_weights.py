@@ -11,7 +11,7 @@ from rgbmidic import Result, Status, measure, read_test
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.lab.virtual.dataset import write_dataset
 from rgbmidic.settings import TestSettings
-from rgbmidic.weights.automatic import FALLBACK
+from rgbmidic.weights.threshold import FALLBACK
 
 SCENE = """
 [body]
@@ -78,7 +78,7 @@ def test_weights_by_geometry_find_their_scene_and_beat_no_weights(folder, tmp_pa
         assert (result.status == Status.CONVERGED).all()
     assert error(folder, soft) < 0.9 * error(folder, plain)
     # blue's reflection lies outside the field
-    assert binary.weight_share[-1].argmax() == 2
+    assert binary.weight_fraction[-1].argmax() == 2
     assert soft.provenance["settings"]["weights"]["geometry"].endswith("scene.toml")
 
 

@@ -11,10 +11,9 @@ from rgbmidic.errors import InputError
 from rgbmidic.lab.planning.lamps import APART, propose_colours, propose_lamps
 from rgbmidic.lab.planning.plan import Plan, make_plan
 from rgbmidic.lab.virtual import Cylinder, Light, Plate, Scene, State, turned
-from rgbmidic.lab.virtual.scenes import paint, sphere_scene
-from rgbmidic.scene.camera import reference_camera
-from rgbmidic.scene.light import three_lights
-from rgbmidic.scene.scenefile import DatasetSettings, Experiment
+from rgbmidic.lab.virtual.rendering import paint, sphere_scene
+from rgbmidic.scene.camera import reference_camera, three_lights
+from rgbmidic.scene.scene import DatasetSettings, Experiment
 from rgbmidic.scene.zones import REFLECTS, predict_zones
 
 

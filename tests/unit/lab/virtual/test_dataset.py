@@ -10,7 +10,7 @@ from rgbmidic.frames import read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual import AffineField, MeshField, Sphere, record, render, truth
 from rgbmidic.lab.virtual.dataset import write_dataset
-from rgbmidic.scene.scenefile import read_scene
+from rgbmidic.scene.scene import read_scene
 from rgbmidic.settings import read_test
 
 EXAMPLES = Path(__file__).parents[4] / "examples" / "scenes"

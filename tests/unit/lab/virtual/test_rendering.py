@@ -25,9 +25,8 @@ from rgbmidic.lab.virtual import (
     strained_plate,
     turned,
 )
-from rgbmidic.lab.virtual.rendering import _aperture, samples_needed
-from rgbmidic.lab.virtual.scenes import paint
-from rgbmidic.scene.light import NOMINAL_DISTANCE
+from rgbmidic.lab.virtual.rendering import _aperture, paint, samples_needed
+from rgbmidic.scene.camera import NOMINAL_DISTANCE
 
 FULL = 4095 - 64
 FRONT = (0.0, 0.0, 600.0)

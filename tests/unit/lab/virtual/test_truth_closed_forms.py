@@ -17,7 +17,7 @@ from rgbmidic.lab.virtual import (
     truth,
     turned,
 )
-from rgbmidic.lab.virtual.scenes import DISTANCE
+from rgbmidic.lab.virtual.rendering import DISTANCE
 from rgbmidic.scene.camera import PIXEL
 
 FOCAL = DISTANCE / PIXEL

@@ -1,0 +1,219 @@
+"""Compiled loop that turns camera channels into lights, pixel by pixel.
+
+Compiled loop that turns camera channels into lights with a matrix that varies slowly over the field.
+
+Compiled loops that turn one padded Bayer mosaic into three full channels.
+
+The mosaic comes padded by two pixels on every side, mirrored about the border pixel, which keeps the Bayer phase; a
+sample that must not be used is NaN there and spreads to all it takes part in. ``red_row, red_column`` are the position
+of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
+
+Compiled loops over the owned pixels that make weights and scores from the lights' residuals.
+"""
+
+import numpy as np
+
+from rgbmidic._kernels.interpolation import _FAST
+from rgbmidic._kernels.threads import compiled, helper, over_ranges
+
+__all__ = ["PAD", "best_mean", "malvar", "pad_mosaic", "robust_weights", "scores", "unmix", "unmix_field"]
+
+BLOCK = 4096
+"""Pixels at a time: what a core's fastest cache holds."""
+
+
+@over_ranges("out", axis=1, grain=BLOCK)
+@compiled()
+def unmix(start, stop, channels, valid, matrix, needed, out, out_valid):
+    """``out = matrix @ channels`` at every pixel; invalid, and NaN, where a `needed` channel is invalid.
+
+    channels, valid: (C, P); matrix, needed: (k, C); out, out_valid: (k, P). An invalid channel that is not needed
+    contributes the value it has, NaN nothing.
+    """
+    lights, colours = matrix.shape
+    for first in range(start, stop, BLOCK):
+        last = min(first + BLOCK, stop)
+        for light in range(lights):
+            values, ok = out[light, first:last], out_valid[light, first:last]
+            for p in range(last - first):
+                values[p], ok[p] = 0.0, True
+            for colour in range(colours):
+                factor, counts = matrix[light, colour], needed[light, colour]
+                given, known = channels[colour, first:last], valid[colour, first:last]
+                for p in range(last - first):
+                    values[p] += factor * given[p] if np.isfinite(given[p]) else np.float32(0.0)
+                if counts:
+                    for p in range(last - first):
+                        ok[p] &= known[p]
+            for p in range(last - first):
+                values[p] = values[p] if ok[p] else np.float32(np.nan)
+
+
+@over_ranges("out", axis=1)
+@compiled()
+def unmix_field(start, stop, channels, valid, grid, step, needed, out, out_valid):
+    """``out = matrix(x, y) @ channels`` with the matrix interpolated linearly between grid points `step` px apart.
+
+    channels, valid: (C, H, W); grid: (GY, GX, k, C) at x, y = 0, step, 2 step ... beyond the last pixel; needed:
+    (k, C); out, out_valid: (k, H, W). Invalid where a `needed` channel is; one not needed
+    contributes the value it has, NaN nothing.
+    """
+    colours, lights, width = channels.shape[0], out.shape[0], out.shape[2]
+    for y in range(start, stop):
+        gy = y // step
+        down = np.float32(y - gy * step) / np.float32(step)
+        for light in range(lights):
+            values, ok = out[light, y], out_valid[light, y]
+            for x in range(width):
+                values[x], ok[x] = 0.0, True
+            for colour in range(colours):
+                counts = needed[light, colour]
+                for gx in range((width + step - 1) // step):
+                    first, last = gx * step, min((gx + 1) * step, width)
+                    above, below = grid[gy, gx, light, colour], grid[gy + 1, gx, light, colour]
+                    left = above + (below - above) * down
+                    above, below = grid[gy, gx + 1, light, colour], grid[gy + 1, gx + 1, light, colour]
+                    slope = (above + (below - above) * down - left) / np.float32(step)
+                    for x in range(first, last):
+                        value = channels[colour, y, x]
+                        factor = left + slope * np.float32(x - first)
+                        values[x] += factor * value if np.isfinite(value) else np.float32(0.0)
+                        ok[x] &= valid[colour, y, x] or not counts
+            for x in range(width):
+                values[x] = values[x] if ok[x] else np.float32(np.nan)
+
+
+PAD = 2
+"""Pixels added on every side by `pad_mosaic`."""
+
+
+@helper()
+def _mirror(index, size):
+    period = 2 * (size - 1)
+    index = abs(index) % period
+    return min(index, period - index)
+
+
+@over_ranges("out")
+@compiled()
+def pad_mosaic(start, stop, values, invalid, out):
+    """Copy (H, W) `values` into (H + 4, W + 4) `out`, mirrored at the borders, NaN where `invalid`; H, W >= 2."""
+    rows, columns = values.shape
+    for i in range(start, stop):
+        source = _mirror(i - PAD, rows)
+        for j in range(columns):
+            out[i, j + PAD] = np.nan if invalid[source, j] else values[source, j]
+        for side in range(PAD):
+            left = _mirror(side - PAD, columns)
+            right = _mirror(columns + side, columns)
+            out[i, side] = np.nan if invalid[source, left] else values[source, left]
+            out[i, columns + PAD + side] = np.nan if invalid[source, right] else values[source, right]
+
+
+@over_ranges("out", axis=1)
+@compiled()
+def malvar(start, stop, padded, red_row, red_column, out):
+    """Bilinear average corrected by the Laplacian of the sampled channel (Malvar 2004); fills (3, H, W) `out`."""
+    columns = out.shape[2]
+    for i in range(start, stop):
+        above2, above, here, below, below2 = padded[i], padded[i + 1], padded[i + 2], padded[i + 3], padded[i + 4]
+        in_red_row = i % 2 == red_row
+        own = 0 if in_red_row else 2
+        own_start = red_column if in_red_row else 1 - red_column
+        own_out, green_out, other_out = out[own, i], out[1, i], out[2 - own, i]
+        for j in range(own_start, columns, 2):
+            c = j + PAD
+            centre = here[c]
+            cross = above[c] + below[c] + here[c - 1] + here[c + 1]
+            far = above2[c] + below2[c] + here[c - 2] + here[c + 2]
+            diagonal = above[c - 1] + above[c + 1] + below[c - 1] + below[c + 1]
+            own_out[j] = centre
+            green_out[j] = 0.125 * (4 * centre + 2 * cross - far)
+            other_out[j] = 0.125 * (6 * centre + 2 * diagonal - 1.5 * far)
+        for j in range(1 - own_start, columns, 2):
+            c = j + PAD
+            centre = here[c]
+            across, along = here[c - 1] + here[c + 1], above[c] + below[c]
+            across2, along2 = here[c - 2] + here[c + 2], above2[c] + below2[c]
+            diagonal = above[c - 1] + above[c + 1] + below[c - 1] + below[c + 1]
+            own_out[j] = 0.125 * (5 * centre + 4 * across - across2 - diagonal + 0.5 * along2)
+            green_out[j] = centre
+            other_out[j] = 0.125 * (5 * centre + 4 * along - along2 - diagonal + 0.5 * across2)
+
+
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
+_CHUNK = 4096
+"""Pixels at a time: what a core's fastest cache holds."""
+
+
+@over_ranges("share", axis=1, grain=_CHUNK)
+@compiled(fastmath=_FAST)
+def best_mean(start, stop, share, weights, difference, mean, used):
+    """Turn `share` (k, P) into the shares of the lights in a mean: none below 0 or without weight, their sum 1.
+
+    `mean` (P,) receives that of `difference` (k, P), `used` (P,) 1 where a light has a share and else 0.
+    """
+    for first in range(start, stop, _CHUNK):
+        chunk = slice(first, min(first + _CHUNK, stop))
+        total, result = used[chunk], mean[chunk]
+        total[:] = 0
+        result[:] = 0
+        for light in range(len(share)):
+            own, weight = share[light, chunk], weights[light, chunk]
+            for i in range(np.uint64(total.size)):
+                own[i] = max(own[i], _ZERO) if weight[i] > _ZERO else _ZERO
+                total[i] += own[i]
+        for light in range(len(share)):
+            own, value = share[light, chunk], difference[light, chunk]
+            for i in range(np.uint64(total.size)):
+                own[i] = own[i] / total[i] if total[i] > _ZERO else _ZERO
+                result[i] += own[i] * value[i]
+        for i in range(np.uint64(total.size)):
+            total[i] = _ONE if total[i] > _ZERO else _ZERO
+
+
+@over_ranges("share", axis=1, grain=_CHUNK)
+@compiled(fastmath=_FAST)
+def robust_weights(start, stop, mean, variance, trusted, unit, freedom, share, bend):
+    """Multiply `share` (k, P) by the robust weight of the lights' `mean` residual (P,); the loss's `bend` (P,).
+
+    Its `variance` (P,) is that around the pixel, `trusted` (P,) the part of it that counts, in units of `unit`; the
+    weight is its inverse to the power .75 times that of a Student distribution of so many degrees of `freedom`.
+    """
+    factor = np.empty(_CHUNK, dtype=np.float32)
+    for first in range(start, stop, _CHUNK):
+        chunk = slice(first, min(first + _CHUNK, stop))
+        value, around, reliable, curved = mean[chunk], variance[chunk], trusted[chunk], bend[chunk]
+        for i in range(np.uint64(value.size)):
+            ratio = value[i] * value[i] / around[i]
+            precision = unit / reliable[i]
+            curved[i] = (freedom - ratio) / (freedom + ratio)
+            factor[i] = np.sqrt(precision * np.sqrt(precision)) * (freedom + _ONE) / (freedom + ratio)
+        for light in range(len(share)):
+            own = share[light, chunk]
+            for i in range(np.uint64(own.size)):
+                own[i] *= factor[i]
+
+
+@over_ranges("out", axis=1, grain=_CHUNK)
+@compiled(fastmath=_FAST)
+def scores(start, stop, residual, weights, gradient_x, gradient_y, out):
+    """Sums over the lights of ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)``, and 1 where one of them has weight,
+    else 0: ``out`` (4, P) from fields (k, P)."""
+    for first in range(start, stop, _CHUNK):
+        chunk = slice(first, min(first + _CHUNK, stop))
+        x, y, information, used = out[0, chunk], out[1, chunk], out[2, chunk], out[3, chunk]
+        out[:, chunk] = 0
+        for light in range(len(weights)):
+            r, w = residual[light, chunk], weights[light, chunk]
+            gx, gy = gradient_x[light, chunk], gradient_y[light, chunk]
+            # loops that write to one place each: a loop over many arrays is not vectorised
+            for i in range(np.uint64(x.size)):
+                x[i] += w[i] * r[i] * gx[i]
+            for i in range(np.uint64(x.size)):
+                y[i] += w[i] * r[i] * gy[i]
+            for i in range(np.uint64(x.size)):
+                information[i] += w[i] * (gx[i] * gx[i] + gy[i] * gy[i])
+            for i in range(np.uint64(x.size)):
+                used[i] = max(used[i], _ONE if w[i] > _ZERO else _ZERO)

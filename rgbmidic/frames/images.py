@@ -1,0 +1,237 @@
+"""Pictures decoded by OpenCV.
+
+PNG files: grey or RGB, 8 or 16 bit.
+
+Files that hold nothing but the samples of one frame, row by row.
+
+Frames out: uncompressed Bayer DNG that LibRaw reads back bit by bit, and plain 16-bit TIFF.
+
+The DNG tags follow the Adobe DNG specification 1.4, chapter 4.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rgbmidic.errors import FrameError, InputError
+from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.source import FrameSource
+from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
+from rgbmidic.settings import FrameSettings
+from rgbmidic.typing import AnyArray
+
+__all__ = ["MINIMUM_DNG_SIZE", "HeaderlessFile", "PngFile", "decode", "is_headerless", "write_dng", "write_tiff"]
+
+_PLACE = re.compile(r"^\[ERROR\S*\] global \S+ \S+ ")
+"""Where in OpenCV a line of its log comes from."""
+
+
+def decode(content: bytes, path: Path) -> AnyArray:
+    """Samples as stored, (H, W) or (H, W, C), three channels in the order R, G, B; `path` is for messages.
+
+    Raises
+    ------
+    FrameError
+        OpenCV cannot decode them.
+    """
+    import cv2
+
+    previous = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    try:
+        with complaints(b"libpng error", b"libpng warning", b"[ERROR", b"> ") as told:
+            # OpenCV opens no non-ASCII names on Windows, hence decoding from memory
+            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    finally:
+        cv2.utils.logging.setLogLevel(previous)
+    errors = [line for line in told if not line.startswith("libpng warning")]  # of parts that are not used
+    if image is None or errors:  # libtiff's errors do not always keep OpenCV from giving a picture
+        raise damaged(path, _PLACE.sub("", errors[0]) if errors else "its image data cannot be decoded")
+    return image[..., ::-1] if image.ndim == 3 and image.shape[2] == 3 else image
+
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_CHANNELS = {0: 1, 2: 3}
+"""Channels of the colour types that are read: grey and RGB."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PngFile(FrameSource):
+    """A PNG file; every chunk's checksum is verified."""
+
+    def _shape(self) -> tuple[int, int]:
+        with self.path.open("rb") as file:
+            head = file.read(33)
+        if len(head) < 33 or head[:8] != _SIGNATURE or head[12:16] != b"IHDR":
+            raise damaged(self.path, "it has no PNG header")
+        columns, rows, bits, colour = struct.unpack(">IIBB", head[16:26])
+        if bits not in (8, 16) or colour not in _CHANNELS:
+            raise FrameError(
+                f"{self.path} is not a plain image; allowed are grey or RGB PNGs of 8 or 16 bit without alpha"
+            )
+        needed = rows * columns * _CHANNELS[colour] * bits // 8
+        check_size(self.path, needed=needed, stored=self.path.stat().st_size)
+        return rows, columns
+
+    def _stored(self, index: int) -> StoredFrame:
+        self._shape()
+        content = self.path.read_bytes()
+        _check_chunks(content, self.path)
+        return StoredFrame.plain(decode(content, self.path), self.path)
+
+
+def _check_chunks(content: bytes, path: Path) -> None:
+    """An error where a checksum up to IEND is wrong, or the file ends before it."""
+    start, name, whole = len(_SIGNATURE), b"", memoryview(content)
+    while name != b"IEND":
+        if start + 12 > len(content):
+            raise damaged(path, "it ends before its end mark")
+        length, name = struct.unpack(">I4s", whole[start : start + 8])
+        end = start + 8 + length
+        if end + 4 > len(content):
+            raise damaged(path, "it ends before its end mark")
+        if zlib.crc32(whole[start + 4 : end]) != int.from_bytes(whole[end : end + 4], "big"):
+            raise damaged(path, f"the checksum of its {name.decode(errors='replace')} part is wrong")
+        start = end + 4
+
+
+def is_headerless(path: Path, stated: FrameSettings) -> bool:
+    """Whether the name, or for ``.raw`` a stated shape, says so: cameras of several makers write .raw with a header."""
+    return path.suffix.lower() == ".bin" or (path.suffix.lower() == ".raw" and stated.shape is not None)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeaderlessFile(FrameSource):
+    """A file without a header: shape and sample type are stated."""
+
+    def _shape(self) -> tuple[int, int]:
+        if self.stated.shape is None or self.stated.dtype is None:
+            raise FrameError(f"{self.path} has no header: both its shape (rows, columns) and its dtype must be stated")
+        return self.stated.shape
+
+    def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        shape, dtype = self._shape(), np.dtype("<u2" if self.stated.dtype == "uint16" else self.stated.dtype)
+        channels = 3 if self.stated.kind == "rgb" else 1
+        needed, size = math.prod(shape) * channels * dtype.itemsize, self.path.stat().st_size
+        if size != needed:
+            raise FrameError(
+                f"{self.path} has {size} bytes; {shape[0]} rows of {shape[1]} {self.stated.dtype} samples with "
+                f"{channels} channel(s) need {needed}"
+            )
+        row = shape[1] * channels
+        values = np.fromfile(self.path, dtype=dtype, count=len(rows) * row, offset=rows.start * row * dtype.itemsize)
+        return StoredFrame.plain(values.reshape(len(rows), shape[1], channels), self.path)
+
+
+MINIMUM_DNG_SIZE = 22
+"""Rows and columns below which LibRaw refuses a raw image."""
+
+_XYZ_TO_SRGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
+_ILLUMINANT_D65 = 21
+_PHOTOMETRIC_CFA = 32803
+
+
+def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float] | None = None) -> None:
+    """Write a raw Bayer frame as an uncompressed DNG.
+
+    Values, pattern, black level of each position of the cell and white level come back from LibRaw exactly as given.
+    An existing file is replaced, once the new one is complete.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    mosaic
+        Frame with at least 22 rows and columns; black and white levels are whole numbers.
+    white_balance
+        Factors that make a white surface grey, for R, G and B: only viewers use them. None: all 1.
+
+    Raises
+    ------
+    InputError
+        The frame is too small, a level is not a whole number, or a factor is not positive.
+    """
+    if min(mosaic.values.shape) < MINIMUM_DNG_SIZE:
+        raise InputError(
+            f"a DNG needs at least {MINIMUM_DNG_SIZE} rows and columns (LibRaw refuses smaller ones), "
+            f"not {mosaic.values.shape}: {path}"
+        )
+    tags = [*_cfa_tags(mosaic, path), *_colour_tags((1.0, 1.0, 1.0) if white_balance is None else white_balance)]
+    _write(path, mosaic.values, photometric=_PHOTOMETRIC_CFA, extratags=tags, rowsperstrip=mosaic.values.shape[0])
+
+
+def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
+    """Write a frame as an uncompressed 16-bit TIFF: (H, W) for a mosaic or monochrome frame, (H, W, 3) for RGB.
+
+    A TIFF does not tell pattern and levels: whoever reads it states them. An existing file is replaced, once the
+    new one is complete.
+    """
+    if isinstance(frame, ChannelFrame) and len(frame.values) == 3:
+        _write(path, np.ascontiguousarray(np.moveaxis(frame.values, 0, -1)), photometric="rgb")
+    else:
+        _write(path, frame.values.reshape(frame.values.shape[-2:]), photometric="minisblack")
+
+
+def _write(path: Path | str, values: np.ndarray[Any, np.dtype[np.uint16]], **options: Any) -> None:
+    import tifffile
+
+    path = Path(path)
+    temporary = path.with_name(path.name + ".part")
+    try:
+        tifffile.imwrite(temporary, values, metadata=None, byteorder="<", software="rgbmidic", **options)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _cfa_tags(mosaic: Mosaic, path: Path | str) -> list[tuple[Any, ...]]:
+    black = [_whole(level, "black", path) for level in mosaic.black_level.ravel()]
+    channels = bytes(int(channel) for channel in cfa_channels(mosaic.cfa).ravel())
+    return [
+        (50706, "B", 4, b"\x01\x04\x00\x00", True),  # DNGVersion
+        (50707, "B", 4, b"\x01\x01\x00\x00", True),  # DNGBackwardVersion
+        (50708, "s", 0, "rgbmidic", True),  # UniqueCameraModel
+        (33421, "H", 2, (2, 2), True),  # CFARepeatPatternDim
+        (33422, "B", 4, channels, True),  # CFAPattern
+        (50710, "B", 3, b"\x00\x01\x02", True),  # CFAPlaneColor
+        (50711, "H", 1, 1, True),  # CFALayout: rectangular
+        (50713, "H", 2, (2, 2), True),  # BlackLevelRepeatDim
+        (50714, "I", 4, black, True),  # BlackLevel, by position
+        (50717, "I", 1, _whole(mosaic.white_level, "white", path), True),  # WhiteLevel
+    ]
+
+
+def _colour_tags(white_balance: Sequence[float]) -> list[tuple[Any, ...]]:
+    if len(white_balance) != 3 or not all(np.isfinite(factor) and factor > 0 for factor in white_balance):
+        raise InputError(f"white_balance is three positive factors (R, G, B), not {white_balance!r}")
+    neutral = [min(white_balance) / factor for factor in white_balance]
+    return [
+        (50721, "2i", 9, _rationals(_XYZ_TO_SRGB), True),  # ColorMatrix1
+        (50728, "2I", 3, _rationals(neutral), True),  # AsShotNeutral
+        (50778, "H", 1, _ILLUMINANT_D65, True),  # CalibrationIlluminant1
+    ]
+
+
+def _rationals(numbers: Iterable[float]) -> list[int]:
+    fractions = [Fraction(number).limit_denominator(10_000) for number in numbers]
+    return [part for fraction in fractions for part in (fraction.numerator, fraction.denominator)]
+
+
+def _whole(level: float, name: str, path: Path | str) -> int:
+    if level != int(level) or level > 65535:
+        raise InputError(f"a DNG holds a {name} level that is a whole number up to 65535, not {level}: {path}")
+    return int(level)

@@ -1,0 +1,380 @@
+"""What every demosaicing method takes and gives.
+
+Demosaicing by fixed linear filters: Malvar, He and Cutler (2004).
+
+No demosaicing: the mosaic divided by each colour's local mean.
+
+Linear prediction of every channel at every pixel from the samples around it (simple kriging).
+
+The contrast of channel c, divided by its own spread, is ``sqrt(s_c) a + sqrt(1 - s_c) e_c + n_c``: common texture a of
+autocorrelation C, what is private to the channel, and camera noise, with s_c the share of the common texture. The best
+linear prediction of a channel at a pixel from the N x N samples around it has the filter ``(K + V)^-1 k``, with K the
+covariance of the samples, V their noise and k their covariance with what is wanted. It depends on the pixel's phase in
+the 2x2 cell and on the three shares alone, so the filters of a frame are a small table.
+
+Demosaicing that survives reflections: the speckle's own statistics fill in what a colour did not sample.
+
+Usual methods assume that the three channels show one texture. Under coloured lights that holds where the paint is mat
+and breaks where one light reflects. Here it is measured, block by block, how much of each channel's contrast is common
+and how much its own (`rgbmidic.illumination.colour_factors`), and every channel is predicted from all the samples
+around with exactly that trust (`rgbmidic.illumination.demosaic`). A channel in a reflection no longer leaks
+into the others, its own sparkle is kept, the coarse lattices of red and blue are filled from what the others see; a
+coloured specimen, whose channels have nothing in common, is reconstructed channel by channel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.lights import PAD, malvar, pad_mosaic
+from rgbmidic._kernels.mesh import TILE, fill_unknown, predict
+from rgbmidic.errors import InputError
+from rgbmidic.frames.data import cfa_channels, sampled_channels
+from rgbmidic.illumination.colour_factors import (
+    BLOCK,
+    MEAN_BLOCK,
+    ColourFactors,
+    Moments,
+    colour_factors,
+    enlarged,
+    gather_moments,
+    learn_texture,
+    local_means,
+    scaled,
+    widened,
+)
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
+from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.illumination.unmix import needed
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = [
+    "SIZE",
+    "SMALLEST_FRAME",
+    "WIDE",
+    "Demosaicer",
+    "FilterTable",
+    "MalvarDemosaicer",
+    "NormalisedMosaic",
+    "Reconstruction",
+    "ReflectionAwareDemosaicer",
+    "check_mosaic",
+    "prediction_filters",
+    "red_position",
+]
+
+
+@runtime_checkable
+class Demosaicer(Protocol):
+    """Gives every pixel all three camera channels, from a mosaic that has one of them at each.
+
+    Calling it with a `LinearMosaic` of size (H, W) gives `LinearChannels` of shape (3, H, W), order R, G, B. A value
+    is invalid, and NaN, when a saturated sample took part in it.
+    """
+
+    def __call__(self, mosaic: LinearMosaic) -> LinearChannels: ...
+
+
+def check_mosaic(mosaic: LinearMosaic) -> None:
+    """Raise `InputError` unless `mosaic` has at least one full 2x2 cell and consistent arrays."""
+    if not isinstance(mosaic, LinearMosaic):
+        raise InputError(f"demosaicing takes a LinearMosaic, not {type(mosaic).__name__}")
+    if mosaic.values.ndim != 2 or min(mosaic.values.shape) < 2:
+        raise InputError(f"a mosaic has at least 2 rows and 2 columns; given is shape {mosaic.values.shape}")
+    if mosaic.saturated.shape != mosaic.values.shape:
+        raise InputError(
+            f"the saturation mask has shape {mosaic.saturated.shape}, the mosaic has {mosaic.values.shape}"
+        )
+
+
+def red_position(cfa: str) -> tuple[int, int]:
+    """Row and column of red in the 2x2 cell of a Bayer pattern."""
+    row, column = np.argwhere(cfa_channels(cfa) == 0)[0]
+    return int(row), int(column)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MalvarDemosaicer:
+    """Bilinear averages corrected by the Laplacian of the channel sampled at the pixel.
+
+    Assumes that the channels share their texture: where a light reflects, that light's sparkle leaks into the others.
+
+    References
+    ----------
+    H. S. Malvar, L. He, R. Cutler, High-quality linear interpolation for demosaicing of Bayer-patterned color images,
+    IEEE ICASSP 2004, figure 2.
+    """
+
+    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
+        """Demosaic; see `Demosaicer`."""
+        check_mosaic(mosaic)
+        values = np.empty((3, *mosaic.values.shape), dtype=np.float32)
+        malvar(_padded(mosaic), *red_position(mosaic.cfa), values)
+        return LinearChannels(values=values, valid=np.isfinite(values), full_scale=mosaic.full_scale)
+
+
+def _padded(mosaic: LinearMosaic) -> FloatImage:
+    """The mosaic (H + 4, W + 4), mirrored about its border pixels, NaN where saturated."""
+    rows, columns = mosaic.values.shape
+    padded = np.empty((rows + 2 * PAD, columns + 2 * PAD), dtype=np.float32)
+    pad_mosaic(np.ascontiguousarray(mosaic.values, dtype=np.float32), np.asarray(mosaic.saturated, bool), padded)
+    return padded
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NormalisedMosaic:
+    """Each sample divided by its colour's local mean is the speckle, whatever its colour.
+
+    All channels then show one image, each with its own local mean: correlate one of them. With the prefilter [1 2 1]
+    the floor that a demosaicing must beat. A channel in a reflection has less contrast and leaves a pattern.
+    """
+
+    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
+        """Channels that share one image; see `Demosaicer`."""
+        check_mosaic(mosaic)
+        saturated = np.asarray(mosaic.saturated, bool)
+        values = np.where(saturated, np.float32(np.nan), mosaic.values).astype(np.float32)
+        level = enlarged(local_means(values, red_position(mosaic.cfa)), MEAN_BLOCK, values.shape)
+        own = np.take_along_axis(level, sampled_channels(mosaic.cfa, values.shape)[None], axis=0)[0]
+        out = level * np.divide(values, own, out=np.full_like(values, np.nan), where=own > 0)
+        return LinearChannels(values=out, valid=np.isfinite(out), full_scale=mosaic.full_scale)
+
+
+SIZE, WIDE = 5, 7
+"""Side of the square of samples that a value is predicted from, and where the colours have nothing in common."""
+LEVELS_PER_OCTAVE = 1
+"""Fineness in which a channel's private variance is rounded; twice as fine measures the same."""
+LARGEST, SMALLEST = 10, -10
+"""Range (powers of two) of the private variance relative to the common one."""
+OFFSET_VARIANCE = 10.0
+"""Variance of an unknown constant under the texture: makes the filter's coefficients sum to one."""
+SPARKLE_VARIANCE = 0.29
+"""Variance (px²) of the aperture through which sparkle is seen: a square pixel, 1/12, and a lens blur of 0.45 px."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilterTable:
+    """Filters of the tiles of a frame.
+
+    Attributes
+    ----------
+    index : (h, w) int32
+        Row of `taps` for each tile.
+    taps : (T, 2, n, size², 16) float32
+        As `rgbmidic._kernels.mesh.predict` takes them.
+    size : int
+        Side of the square of samples.
+    """
+
+    index: npt.NDArray[np.int32]
+    taps: FloatImage
+    size: int = SIZE
+
+
+def prediction_filters(
+    private: FloatArray, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
+) -> FilterTable:
+    """The table of filters for tiles whose channels have some private variance.
+
+    Parameters
+    ----------
+    private : (3, h, w)
+        Variance private to each channel in each tile, relative to the common one.
+    noise : (3,)
+        Variance of the camera noise of each channel relative to the channel's own variance.
+    texture
+        Autocorrelation of the common texture, and of what is private.
+    cfa
+        Bayer pattern.
+    size
+        Side of the square of samples, odd.
+
+    Returns
+    -------
+    FilterTable
+        With one output for each channel.
+    """
+    level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(private, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
+    code = (level[0] * 1000 + level[1]) * 1000 + level[2]
+    _, first, index = np.unique(code, return_index=True, return_inverse=True)
+    share = 1 / (1 + 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE))
+    taps = _solved(share, np.asarray(noise, dtype=np.float64), texture, cfa, size)
+    lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
+    return FilterTable(
+        index=index.reshape(level.shape[1:]).astype(np.int32),
+        taps=lanes.astype(np.float32),
+        size=size,
+    )
+
+
+def _solved(share: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int) -> FloatArray:
+    """Filters (T, 4, 3, size²) for shares (T, 3) of the common texture."""
+    common, fine = _covariances(texture, size)
+    # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
+    private = texture.private * common + (1 - texture.private) * fine
+    centre, count = size * size // 2, len(share)
+    taps = np.empty((count, 4, 3, size * size))
+    for phase, channel in enumerate(_channels_around(cfa, size)):
+        root, own = np.sqrt(share[:, channel]), np.sqrt(1 - share[:, channel])
+        same = channel[:, None] == channel[None]
+        samples = root[:, :, None] * root[:, None] * common + own[:, :, None] * own[:, None] * (same * private)
+        samples[:, np.arange(size * size), np.arange(size * size)] += np.maximum(noise, 1e-8)[channel]
+        mine = channel[:, None] == np.arange(3)
+        wanted = root[:, :, None] * np.sqrt(share)[:, None] * common[:, centre, None]
+        wanted += (1 - share)[:, None] * (mine * private[:, centre, None])
+        solution = np.linalg.solve(samples, wanted)
+        taps[:, phase] = solution.transpose(0, 2, 1)
+    return taps
+
+
+@lru_cache(maxsize=64)
+def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, FloatArray]:
+    """Covariance between the samples of the square: of the texture, and of the sparkle of a reflection."""
+    offset = np.arange(size) - size // 2
+    points = np.stack(np.meshgrid(offset, offset, indexing="ij"), -1).reshape(-1, 2)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    return texture(apart) + OFFSET_VARIANCE, np.exp(-(apart**2) / (4 * SPARKLE_VARIANCE))
+
+
+@lru_cache(maxsize=64)
+def _channels_around(cfa: str, size: int) -> list[npt.NDArray[np.intp]]:
+    """Channel of each sample of the square, for the four phases of its centre: (0, 0), (0, 1), (1, 0), (1, 1)."""
+    cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
+    return [cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel() for p in (0, 1) for q in (0, 1)]
+
+
+SMALLEST_FRAME = 64
+"""Rows and columns under which a frame holds too few speckles for statistics."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reconstruction:
+    """Channels with all that was found out on the way.
+
+    Attributes
+    ----------
+    channels : LinearChannels
+        (3, H, W), or the mixtures of them that were asked for.
+    texture : TextureModel
+        The one used: given, or learnt from the frame.
+    factors : ColourFactors
+        How each channel sees the texture, on a grid of 8 px.
+    mean : (3, h, w) float32
+        Local mean of each channel on a grid of 4 px.
+    """
+
+    channels: LinearChannels
+    texture: TextureModel
+    factors: ColourFactors
+    mean: FloatImage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReflectionAwareDemosaicer:
+    """Predicts every channel from all the samples around, each trusted as far as it shows the common texture.
+
+    Attributes
+    ----------
+    crosstalk : Crosstalk or None
+        Lets the sparkle of one light that several channels see be told from the common texture; None: no crosstalk.
+    texture : TextureModel or None
+        The speckle's autocorrelation; None learns it from each frame. Frames of one test should share one.
+    """
+
+    crosstalk: Crosstalk | None = None
+    texture: TextureModel | None = None
+
+    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
+        """Demosaic; see `Demosaicer`."""
+        return self.reconstruct(mosaic).channels
+
+    def reconstruct(self, mosaic: LinearMosaic, mixing: FloatArray | None = None) -> Reconstruction:
+        """Demosaic and tell what was found out.
+
+        Parameters
+        ----------
+        mosaic
+            The linearised frame.
+        mixing : (n, 3), or None
+            Mixtures of the channels to give instead of them; not valid where a channel that matters in one
+            (`rgbmidic.illumination.unmix.needed`) is not.
+
+        Raises
+        ------
+        InputError
+            The frame is smaller than 64 x 64 px.
+        """
+        check_mosaic(mosaic)
+        if min(mosaic.values.shape) < SMALLEST_FRAME:
+            raise InputError(
+                f"reflection-aware demosaicing needs at least {SMALLEST_FRAME} x {SMALLEST_FRAME} px to know the "
+                f'speckle; the frame has {mosaic.values.shape[1]} x {mosaic.values.shape[0]}: use method "malvar"'
+            )
+        saturated = np.asarray(mosaic.saturated, dtype=bool)
+        values = np.ascontiguousarray(mosaic.values, dtype=np.float32)
+        damaged = bool(saturated.any())
+        if damaged:
+            values = np.where(saturated, np.float32(np.nan), values)
+        moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise)
+        texture = learn_texture(moments) if self.texture is None else self.texture
+        matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
+        factors = colour_factors(moments, texture.band, matrix, coloured=texture.private)
+        table = _filters(factors, texture, mosaic.cfa)
+        mixing = np.eye(3) if mixing is None else mixing
+        out, unknown = _predict(moments, factors, table, mixing, damaged=damaged)
+        valid = np.ones(out.shape, dtype=bool)
+        if damaged:
+            known = _validity(saturated, unknown, mosaic.cfa)
+            valid = np.stack([known[matters].all(axis=0) for matters in needed(mixing)])
+        channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
+        return Reconstruction(channels=channels, texture=texture, factors=factors, mean=moments.mean)
+
+
+def _filters(factors: ColourFactors, texture: TextureModel, cfa: str) -> FilterTable:
+    noise = np.median(factors.noise / (1 + factors.private), axis=(1, 2))
+    # a colour left to itself has only every other sample, so it needs to look farther
+    size = SIZE if texture.private < 0.5 else WIDE
+    return prediction_filters(_per_tile(factors.private), noise, texture, cfa, size=size)
+
+
+def _per_tile(grid: FloatArray) -> FloatArray:
+    """Mean of a grid of blocks over the tiles; the last one may be narrower."""
+    ratio = TILE // BLOCK
+    missing = [(0, 0), *((0, -side % ratio) for side in grid.shape[1:])]
+    padded = np.pad(grid, missing, mode="edge") if np.any(missing) else grid
+    parts = [padded[:, row::ratio, column::ratio] for row, column in np.ndindex(ratio, ratio)]
+    return np.asarray(sum(parts) / ratio**2)
+
+
+def _predict(
+    moments: Moments, factors: ColourFactors, table: FilterTable, mixing: FloatArray, *, damaged: bool
+) -> tuple[FloatImage, BoolArray]:
+    """Mixtures (n, H, W) of the channels and where samples stayed unknown (H, W)."""
+    spread, pad = factors.spread.astype(np.float32), table.size // 2
+    padded = scaled(moments, np.float32(1) / spread, pad=pad, width=table.index.shape[1] * TILE)
+    rows, columns = moments.contrast.shape
+    unknown = np.zeros(padded.shape, dtype=bool)
+    if damaged:
+        source = padded.copy()
+        fill_unknown(source, _per_tile(factors.share), *moments.red, pad, padded, unknown)
+    out = np.empty((len(mixing), rows, columns), dtype=np.float32)
+    scale, mean = widened(spread, BLOCK, columns), widened(moments.mean, MEAN_BLOCK, columns)
+    mixing = mixing.astype(np.float32)
+    predict(padded, table.index, table.taps, table.size, scale, BLOCK, mean, MEAN_BLOCK, mixing, out)
+    return out, unknown[pad : pad + rows, pad : pad + columns]
+
+
+def _validity(saturated: BoolArray, unknown: BoolArray, cfa: str) -> BoolArray:
+    """A channel is not known within a pixel of its own saturated samples, none where the texture is not known."""
+    site = sampled_channels(cfa, saturated.shape)
+    near = np.ones((3, 3), np.uint8)
+    wide = cv2.dilate(unknown.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    own = [cv2.dilate((saturated & (site == c)).astype(np.uint8), near).astype(bool) for c in range(3)]
+    return np.stack([~(mask | wide) for mask in own])

@@ -1,0 +1,277 @@
+"""A small piece of a scene's speckle, and what it tells that no formula does.
+
+Its droplets' domes, and what a Bayer mosaic does to the lights' images: the noise that it passes and the trace that it
+leaves. The piece goes through the real demosaicing and unmixing, so any method of `rgbmidic.illumination.separate` is
+described, linear or not.
+
+Spectrum of a speckle in closed form: a Boolean model of discs seen through pixel aperture, lens and prefilter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.render import PLATE
+from rgbmidic.correlation.images import PREFILTERS
+from rgbmidic.errors import InputError
+from rgbmidic.frames.data import sampled_channels, shift_cfa
+from rgbmidic.illumination.linearise import LinearMosaic
+from rgbmidic.illumination.separate import separate
+from rgbmidic.scene.scene import Scene
+from rgbmidic.scene.surface import Surface
+from rgbmidic.typing import FloatArray
+
+__all__ = ["SpecklePatch", "SpeckleSpectrum", "cover_covariance", "cross_spectra", "mosaic_disturbances"]
+
+_LEVEL = 0.25
+"""Fraction of full scale of the mean of each light's image: no sample saturates."""
+_NOISE = 0.005
+"""Standard deviation of the probing noise, in units of full scale."""
+_RIM = 8
+"""Pixels at the edge of the piece that are left out."""
+_SUBSAMPLES = 3
+_CARRIERS = ((1, -1, 1, -1), (1, 1, -1, -1), (1, -1, -1, 1))
+"""Signs of the parts that alternate along x, along y and along both, in the phases (0, 0), (0, 1), (1, 0), (1, 1)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpecklePatch:
+    """A square piece of speckle as the camera sees it.
+
+    Attributes
+    ----------
+    texture : ndarray, shape (n, n)
+        Grey levels with mean 1.
+    domes : ndarray, shape (n, n)
+        Height of the droplets above the white paint, px; without the wrinkles.
+    """
+
+    texture: FloatArray
+    domes: FloatArray
+
+    @classmethod
+    def of(cls, scene: Scene, size: int) -> SpecklePatch:
+        """A piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
+        camera, surface = scene.camera, scene.surface
+        pixel = scene.body.front[2] / camera.focal_px
+        smooth = replace(
+            surface, white=replace(surface.white, slope_deg=0.0), black=replace(surface.black, slope_deg=0.0)
+        )
+        place = (np.arange(size * _SUBSAMPLES) + 0.5) / _SUBSAMPLES * pixel
+        x, y = np.meshgrid(place, place)
+        points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+        cover, height, _ = smooth.sample(points, np.array([PLATE, 0.0, np.inf, np.inf]))
+        albedo = surface.white.albedo + cover * (surface.black.albedo - surface.white.albedo)
+        texture = _seen(albedo, size, camera.lens_blur)
+        return cls(texture=texture / texture.mean(), domes=_seen(height / pixel, size, camera.lens_blur))
+
+
+def _seen(fine: FloatArray, size: int, blur: float) -> FloatArray:
+    """Fine samples (flat) averaged over the pixels and blurred by the lens."""
+    whole = fine.reshape(size, _SUBSAMPLES, size, _SUBSAMPLES).mean(axis=(1, 3))
+    line = np.exp(-2 * (np.pi * blur * np.fft.fftfreq(size)) ** 2)
+    return np.asarray(np.fft.ifft2(np.fft.fft2(whole) * np.outer(line, line)).real)
+
+
+def mosaic_disturbances(scene: Scene, texture: FloatArray, demosaic: str) -> tuple[FloatArray, FloatArray]:
+    """Cross spectra of what disturbs the lights' images.
+
+    Parameters
+    ----------
+    scene
+        Bayer camera and lights.
+    texture : ndarray, shape (n, n)
+        Of a `SpecklePatch`.
+    demosaic
+        Method of `rgbmidic.illumination.separate`.
+
+    Returns
+    -------
+    noise : ndarray, shape (3, k, k, n, n)
+        Of noise of unit variance in the samples of R, G or B.
+    trace : ndarray, shape (3, k, k, n, n)
+        Of what stays with the mosaic when the texture moves, for its three carriers (alternating along x, along y, and
+        along both), in units of each light's mean; lights of equal brightness.
+    """
+    camera, crosstalk = scene.camera, scene.camera.true_crosstalk(scene.lights)
+    colours = sampled_channels(camera.cfa, texture.shape)
+    level = _LEVEL * camera.full_scale
+    samples = level * crosstalk.matrix.sum(axis=1)[colours] * texture
+
+    def lights(values: FloatArray, cfa: str) -> FloatArray:
+        mosaic = LinearMosaic(
+            values=values.astype(np.float32),
+            saturated=np.zeros(values.shape, dtype=bool),
+            cfa=cfa,
+            full_scale=camera.full_scale,
+            noise=camera.noise,
+        )
+        return separate(mosaic, crosstalk, demosaic).values.astype(np.float64)
+
+    noise = _noise(lights, samples, colours, camera.cfa, _NOISE * camera.full_scale)
+    return noise, _trace(lights, crosstalk.matrix, texture, camera.cfa, level)
+
+
+def _noise(
+    lights: Callable[[FloatArray, str], FloatArray],
+    samples: FloatArray,
+    colours: npt.NDArray[np.intp],
+    cfa: str,
+    amplitude: float,
+) -> FloatArray:
+    random = np.random.default_rng(0)
+    quiet = lights(samples, cfa)
+    spectra = []
+    for colour in range(3):
+        disturbed = samples + np.where(colours == colour, random.normal(scale=amplitude, size=samples.shape), 0)
+        spectra.append(cross_spectra((lights(disturbed, cfa) - quiet) / amplitude))
+    return np.stack(spectra)
+
+
+def _trace(
+    lights: Callable[[FloatArray, str], FloatArray], matrix: FloatArray, texture: FloatArray, cfa: str, level: float
+) -> FloatArray:
+    """The texture under the four phases of the mosaic: what is the same in all of them moves with the texture."""
+    phases = []
+    for rows, columns in np.ndindex(2, 2):
+        name = shift_cfa(cfa, rows, columns)
+        phases.append(lights(level * matrix.sum(axis=1)[sampled_channels(name, texture.shape)] * texture, name) / level)
+    parts = [np.tensordot(np.array(signs) / 4, phases, axes=1) for signs in _CARRIERS]
+    return np.stack([cross_spectra(part) for part in parts])
+
+
+def cross_spectra(fields: FloatArray) -> FloatArray:
+    """Cross spectra (k, k, n, n) of fields (k, n, n), their rims faded out."""
+    size = fields.shape[-1]
+    ramp = np.clip((np.arange(size) + 0.5 - _RIM) / _RIM, 0, 1)
+    line = np.sin(np.pi / 2 * np.minimum(ramp, ramp[::-1])) ** 2
+    window = np.outer(line, line)
+    transform = np.fft.fft2(np.nan_to_num(fields - np.nanmean(fields, axis=(1, 2), keepdims=True)) * window)
+    products = transform[:, None] * transform[None].conj()
+    return np.asarray(products.real / (window**2).sum())
+
+
+_SQRT6 = math.sqrt(6.0)
+_FINE = 4
+"""Samples per pixel on which the droplets' covariance is tabulated."""
+
+
+def cover_covariance(surface: Surface, distance: FloatArray) -> FloatArray:
+    """Covariance of the black cover (0 or 1) at two points, by their distance (mm).
+
+    Boolean model of discs of random radius R and number density n: ``(1 - coverage)^2 (exp(n E[overlap]) - 1)``, with
+    the overlap of two equal discs at that distance.
+    """
+    size = np.linspace(-1, 1, 61)[1:-1]
+    law = (1 - abs(size)) / (1 - abs(size)).sum()
+    overlap = np.zeros_like(distance)
+    for value, share in zip(size, law, strict=True):
+        radius = surface.droplet / 2 * math.exp(surface.spread * _SQRT6 * value)
+        x = np.clip(distance / (2 * radius), 0, 1)
+        overlap += share * 2 * radius**2 * (np.arccos(x) - x * np.sqrt(1 - x * x))
+    return np.asarray((1 - surface.coverage) ** 2 * np.expm1(surface.droplets_per_area * overlap))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeckleSpectrum:
+    """Power spectra on the frequencies of a square of n x n px, in px^2; their sum over n^2 is a variance.
+
+    Attributes
+    ----------
+    frequency : ndarray, shape (n,)
+        Cycles per px, in the order of `numpy.fft`.
+    texture : ndarray, shape (n, n)
+        Of the locally normalised image, without prefilter.
+    optics : ndarray, shape (n, n)
+        Squared transfer of lens and pixel aperture.
+    prefilter : ndarray, shape (n, n)
+        Squared transfer of the prefilter.
+    """
+
+    frequency: FloatArray
+    texture: FloatArray
+    optics: FloatArray
+    prefilter: FloatArray
+
+    @classmethod
+    def of(cls, surface: Surface, *, pixel: float, blur: float, prefilter: str) -> SpeckleSpectrum:
+        """Spectrum of a painted surface; `pixel` in mm, `blur` the lens blur in px."""
+        if not surface.coverage > 0:
+            raise InputError("a surface without droplets (coverage 0) has no texture to correlate")
+        widest = surface.droplet * math.exp(_SQRT6 * surface.spread) / pixel
+        n = int(np.clip(2 ** math.ceil(math.log2(6 * widest)), 128, 1024))
+        step = np.fft.fftfreq(n * _FINE, 1 / n)
+        distance = pixel * np.hypot(step[:, None], step)
+        fine = np.maximum(np.fft.fft2(cover_covariance(surface, distance)).real, 0) / _FINE**2
+        inside = np.r_[: n // 2, -(n // 2) : 0]
+        frequency = np.asarray(np.fft.fftfreq(n), dtype=np.float64)
+        edge = surface.softness / pixel / math.sqrt(20)  # standard deviation of a smooth step's derivative
+        filtered = _outer(_prefilter_transfer(prefilter, frequency))
+        texture = _contrast(surface) ** 2 * fine[np.ix_(inside, inside)] * _optics(frequency, math.hypot(blur, edge))
+        return cls(frequency=frequency, texture=texture, optics=_optics(frequency, blur), prefilter=filtered)
+
+    @property
+    def energy(self) -> float:
+        """Mean square of the texture's gradient along x after the prefilter, px^-2."""
+        return float((self._gradient * self.prefilter).mean())
+
+    @property
+    def variance(self) -> float:
+        """Variance of the texture after the prefilter."""
+        return float((self.texture * self.prefilter).mean())
+
+    def contrast_score(self, element_size: float) -> float:
+        """Variance density of the right-hand side under a unit change of the texture's contrast.
+
+        The integral of ``phi t dt/dx = phi/2 d(t^2)/dx`` is ``-1/2 integral t^2 dphi/dx``: with the spectrum of t^2 at
+        zero frequency, ``2 integral C^2`` for a Gaussian texture, and ``integral (dphi/dx)^2 = 4/h^2 integral phi^2``.
+        """
+        return float(2 * ((self.texture * self.prefilter) ** 2).mean() / element_size**2)
+
+    def score(self, disturbance: FloatArray) -> FloatArray:
+        """Variance density of the right-hand side under disturbances with power spectra (..., n, n) before the
+        prefilter."""
+        return np.asarray((self._gradient * self.prefilter**2 * disturbance).mean(axis=(-2, -1)))
+
+    def residual(self, disturbance: FloatArray) -> FloatArray:
+        """Variance at a pixel, after the prefilter, of disturbances with power spectra (..., n, n)."""
+        return np.asarray((self.prefilter * disturbance).mean(axis=(-2, -1)))
+
+    def pull(self, cross: FloatArray) -> float:
+        """Mean product of the gradients along x, after the prefilter, of the texture and of a field with which it has
+        the cross spectrum (n, n)."""
+        return float(((2 * np.pi * self.frequency) ** 2 * self.prefilter * cross).mean())
+
+    @property
+    def slope(self) -> FloatArray:
+        """Squared transfer (n, n) from a height to its slope along a random direction."""
+        square = (2 * np.pi * self.frequency) ** 2
+        return np.asarray((square + square[:, None]) / 2)
+
+    @property
+    def _gradient(self) -> FloatArray:
+        return np.asarray((2 * np.pi * self.frequency) ** 2 * self.texture)
+
+
+def _contrast(surface: Surface) -> float:
+    white, black, cover = surface.white.albedo, surface.black.albedo, surface.coverage
+    return (white - black) / max(white + cover * (black - white), 1e-9)
+
+
+def _optics(frequency: FloatArray, blur: float) -> FloatArray:
+    return _outer(np.sinc(frequency) ** 2 * np.exp(-4 * (np.pi * blur * frequency) ** 2))
+
+
+def _prefilter_transfer(name: str, frequency: FloatArray) -> FloatArray:
+    taps = PREFILTERS[name]
+    place = np.arange(len(taps)) - len(taps) // 2
+    return np.asarray((taps @ np.cos(2 * np.pi * place[:, None] * frequency)) ** 2)
+
+
+def _outer(line: FloatArray) -> FloatArray:
+    return np.outer(line, line)
