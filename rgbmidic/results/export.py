@@ -260,8 +260,9 @@ def export_result(
 
     ``"npz"`` is the store, in px: nodes (N, 2), elements (E, 3), names (T,), lights (k,) and every quantity of
     `rgbmidic.results.QUANTITIES` that has one shape in all frames, the frames as first axis.
-    ``"csv"`` and ``"hdf5"`` are for engineers: seconds, millimetres where the scale is known, Green-Lagrange strain over the shortest virtual strain gauge. csv has a header line, whose names hold the units,
-    and a row per node and frame with the quantities that are one number per node.
+    ``"csv"`` and ``"hdf5"`` are for engineers: seconds, millimetres where the scale is known, Green-Lagrange
+    strain over the shortest virtual strain gauge. csv has a header line, whose names hold the units, and a row per node
+    and frame with the quantities that are one number per node.
     x is to the right, y down (ParaView's part of hdf5: up); NaN (an empty field in csv) where not measured.
 
     Parameters

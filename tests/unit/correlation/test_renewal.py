@@ -36,7 +36,7 @@ def prepared(image):
 
 
 def chained(images, update_reference):
-    """Solutions of the images after the first; `update_reference` says who follows, of frame, update, deformed and step."""
+    """Solutions of the images after the first; `update_reference` says who follows: frame, update, deformed, step."""
     reference_update = ReferenceUpdate.none(first_reference(images[0]))
     start, solutions, updated = Start(displacement=np.zeros_like(reference_update.displacement)), [], []
     for number, image in enumerate(images[1:], start=1):
