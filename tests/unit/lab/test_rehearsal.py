@@ -13,7 +13,7 @@ _REST = """
 import importlib, pkgutil, sys
 from pathlib import Path
 import rgbmidic._kernels
-from rgbmidic.lab import rehearsal
+from rgbmidic.lab.planning import plan as rehearsal
 
 def kernels():
     names = [one.name for one in pkgutil.iter_modules(rgbmidic._kernels.__path__)]
