@@ -5,6 +5,7 @@ Every message says what is wrong, what is allowed and what was given, and names 
 
 import errno
 import os
+import re
 
 __all__ = [
     "CalibrationError",
@@ -17,6 +18,8 @@ __all__ = [
     "disk_reason",
     "legible",
 ]
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
 def legible(name: str | os.PathLike[str]) -> str:
@@ -32,10 +35,14 @@ def disk_reason(error: OSError) -> str:
 
 
 class RgbmidicError(Exception):
-    """Base of all errors that rgbmidic raises on purpose."""
+    """Base of all errors that rgbmidic raises on purpose.
+
+    The message is one line: line ends and other control characters, which come from damaged files and from other
+    libraries, stand in it as ``\\n``, ``\\x1b``.
+    """
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(legible(message))
+        super().__init__(_CONTROL.sub(lambda found: ascii(found[0])[1:-1], legible(message)))
 
 
 class InputError(RgbmidicError, ValueError):
