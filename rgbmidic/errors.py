@@ -16,6 +16,7 @@ __all__ = [
     "ResultError",
     "RgbmidicError",
     "disk_reason",
+    "first_line",
     "legible",
 ]
 
@@ -32,6 +33,11 @@ def disk_reason(error: OSError) -> str:
     if error.errno not in (errno.EMFILE, errno.ENFILE):
         return error.strerror or str(error)
     return f"{error.strerror}: this process may open no more (ulimit -n shows the limit and raises it)"
+
+
+def first_line(error: Exception) -> str:
+    """First line of what another library's error says; the error's name where it says nothing, as a MemoryError."""
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
 class RgbmidicError(Exception):
