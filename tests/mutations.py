@@ -104,6 +104,7 @@ WRITERS: dict[str, tuple[Callable[[Path], object], FrameSettings]] = {
     "movie.seq": (lambda path: write_seq(path, FRAMES, bits=12), STATED),
     "movie.npy": (lambda path: np.save(path, FRAMES), STATED),
     "plain.h5": (_hdf5(), STATED),
+    "bare_chunks.h5": (_hdf5(chunks=(1, 5, 7)), STATED),
     "chunks.h5": (_hdf5(chunks=(2, 12, 16), compression="gzip"), STATED),
 }
 

@@ -169,6 +169,26 @@ def test_a_chunk_of_another_size_is_no_frame(tmp_path: Path, old: tuple[int, int
     series.read(1)
 
 
+@pytest.mark.parametrize("options", [{}, {"compression": "gzip"}])
+def test_a_chunk_that_a_damaged_index_does_not_lead_to_is_missed(tmp_path: Path, options: dict[str, Any]) -> None:
+    frames = np.random.default_rng(3).integers(1, 4096, (5, 12, 16)).astype(np.uint16)
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file.create_dataset("data", data=frames, chunks=(1, 5, 7), **options)
+    content = (tmp_path / "m.h5").read_bytes()
+    entry, other = (struct.pack("<QQQQ", frame, 5, 14, 0) for frame in (2, 0))
+    assert content.count(entry) == 1
+    (tmp_path / "m.h5").write_bytes(content.replace(entry, other))
+    series, missed = open_series(FrameSettings(path=(str(tmp_path / "m.h5"),), kind="monochrome")), 0
+    for index, frame in enumerate(frames):
+        try:
+            (read,) = series.read(index)
+        except FrameError:
+            missed += 1
+        else:
+            np.testing.assert_array_equal(read.values[0], frame)
+    assert missed
+
+
 def test_a_header_that_announces_gigabytes_takes_none(tmp_path: Path) -> None:
     (tmp_path / "m.npy").write_bytes(b"\x93NUMPY\2\0" + struct.pack("<I", 2**32 - 1) + bytes(500))
     tracemalloc.start()
