@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError, legible
+from rgbmidic.errors import FrameError, RgbmidicError, first_line, legible
 from rgbmidic.frames.layout import MAXIMUM_FRAMES, check_count, cut_short
 from rgbmidic.frames.npy import StackShape
 from rgbmidic.frames.recording import Integers, Recording, even_times
@@ -104,7 +104,7 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     except RgbmidicError:
         raise
     except Exception as error:  # h5py meets damaged files with many kinds of error
-        raise damaged(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from None
+        raise damaged(path, first_line(error)) from None
 
 
 @remembered
@@ -173,12 +173,19 @@ def _check_written(dataset: h5py.Dataset, index: int, stack: StackShape, path: P
         raise FrameError(
             f"{path} is stored in chunks of shape {dataset.chunks}, more than {MAXIMUM_BYTES / 1e6:.0f} MB each"
         )
+    created, size = dataset.id.get_create_plist(), math.prod(dataset.chunks) * dataset.dtype.itemsize
+    filters = [created.get_filter(place)[0] for place in range(created.get_nfilters())]
     for corner in _corners(dataset, index, stack):
         chunk = dataset.id.get_chunk_info_by_coord(corner)
         if chunk.byte_offset is None or chunk.byte_offset + chunk.size > path.stat().st_size:
             raise FrameError(
                 f"{path}: frame {index} of {stack.count} is not all there: truncated or still being written"
             )
+        used = {code for place, code in enumerate(filters) if not chunk.filter_mask >> place & 1}
+        # the list of chunks may name one that a damaged index does not lead to: libhdf5 gives what memory holds instead
+        found = len(dataset.id.read_direct_chunk(corner)[1])
+        if used <= {h5py.h5z.FILTER_SHUFFLE} and found != size:
+            raise damaged(path, f"a chunk of frame {index} has {found} bytes; needed are {size}")
 
 
 def _corners(dataset: h5py.Dataset, index: int, stack: StackShape) -> Iterator[tuple[int, ...]]:

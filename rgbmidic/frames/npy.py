@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.errors import FrameError
+from rgbmidic.errors import FrameError, first_line
 from rgbmidic.frames.layout import Layout
 from rgbmidic.frames.recording import Recording
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import StoredFrame, damaged
 
 __all__ = ["NpyFile", "StackShape"]
+
+_MAXIMUM_HEADER = 2**16
+"""Bytes: numpy refuses to parse more than 10,000, but reads as many as a damaged header announces, up to 4 GB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,18 +79,18 @@ class _Header:
 @remembered
 def _header(path: Path) -> _Header:
     with path.open("rb") as file:
-        try:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, fortran, dtype = read(file)
-        except Exception as error:  # a damaged header is parsed as Python and fails in many ways
-            raise damaged(path, f"its header is not numpy's: {str(error).splitlines()[0]}") from None
-        start = file.tell()
+        head = io.BytesIO(file.read(_MAXIMUM_HEADER))
+    try:
+        version = np.lib.format.read_magic(head)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(head)
+    except Exception as error:  # a damaged header is parsed as Python and fails in many ways
+        raise damaged(path, f"its header is not numpy's: {first_line(error)}") from None
     stack = StackShape.of(shape, dtype, path)
     if fortran:
         raise FrameError(
             f"{path} is stored in Fortran order; save it with numpy.save(file, numpy.ascontiguousarray(stack))"
         )
     size = math.prod(stack.shape) * dtype.itemsize
-    layout = Layout.checked(path, count=stack.count, start=start, size=size)
+    layout = Layout.checked(path, count=stack.count, start=head.tell(), size=size)
     return _Header(shape=stack.shape, dtype=dtype, layout=layout)
