@@ -375,14 +375,16 @@ def kill(folder: Path, times: int, workers: int) -> None:
     """Measure the test at one go, and killed at random moments and resumed; compare all quantities of all frames."""
     command = [sys.executable, "-m", "rgbmidic.cli", "run", str(folder / "test.toml"), "--no-figures"]
     command += ["--workers", str(workers), "--out"]
-    began = time.perf_counter()
     if not (folder / "whole").exists():
         subprocess.run([*command, str(folder / "whole")], check=True)
-    whole = time.perf_counter() - began
-    moments = random.Random(3)
+    moments, running = random.Random(3), 0
     for number in range(times):
+        until = _stored(folder / "killed") + moments.uniform(0, 1.4) * _stored(folder / "whole") / times
         run = subprocess.Popen([*command, str(folder / "killed"), *(["--resume"] if number else [])])
-        time.sleep(moments.uniform(0.3, 1.7) * max(whole, 60) / times + 8)
+        time.sleep(moments.uniform(0, 4))  # some are killed while they start
+        while run.poll() is None and _stored(folder / "killed") < until:
+            time.sleep(0.01)
+        running += run.poll() is None
         run.send_signal(signal.SIGKILL)
         run.wait()
         done = 0
@@ -394,7 +396,12 @@ def kill(folder: Path, times: int, workers: int) -> None:
     for index in range(len(one)):
         for name, value in one.frame(index).values.items():
             np.testing.assert_array_equal(value, other.frame(index).values[name], err_msg=f"{name} of frame {index}")
-    print(f"the same bits in all {len(one)} frames")
+    print(f"the same bits in all {len(one)} frames; {running} of {times} runs were killed before they ended")
+
+
+def _stored(result: Path) -> int:
+    """Bytes of the frames of a result."""
+    return sum(file.stat().st_size for file in result.glob("solution/*.frames"))
 
 
 def main() -> None:

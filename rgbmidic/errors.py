@@ -5,6 +5,7 @@ Every message says what is wrong, what is allowed and what was given, and names 
 
 import errno
 import os
+import re
 
 __all__ = [
     "CalibrationError",
@@ -15,8 +16,11 @@ __all__ = [
     "ResultError",
     "RgbmidicError",
     "disk_reason",
+    "first_line",
     "legible",
 ]
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
 def legible(name: str | os.PathLike[str]) -> str:
@@ -31,11 +35,20 @@ def disk_reason(error: OSError) -> str:
     return f"{error.strerror}: this process may open no more (ulimit -n shows the limit and raises it)"
 
 
+def first_line(error: Exception) -> str:
+    """First line of what another library's error says; the error's name where it says nothing, as a MemoryError."""
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
+
+
 class RgbmidicError(Exception):
-    """Base of all errors that rgbmidic raises on purpose."""
+    """Base of all errors that rgbmidic raises on purpose.
+
+    The message is one line: line ends and other control characters, which come from damaged files and from other
+    libraries, stand in it as ``\\n``, ``\\x1b``.
+    """
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(legible(message))
+        super().__init__(_CONTROL.sub(lambda found: ascii(found[0])[1:-1], legible(message)))
 
 
 class InputError(RgbmidicError, ValueError):

@@ -41,6 +41,10 @@ _CAMERA_HEADERS = (
     *(b"\0MRM", b"FUJIFILM", b"FOVb"),  # Minolta, Fujifilm, Sigma
 )
 _CR3_HEADER = b"ftypcrx "
+_BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
+"""How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
+_ODD_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
+"""And those of headers that it can read all the same."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,11 +84,15 @@ class CameraRaw(FrameSource):
 
 @contextmanager
 def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
-    """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError, what it tells a warning."""
+    """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError, what it tells a warning.
+
+    Where libjpeg, which unpacks some, tells that the data are broken, that is a FrameError, too.
+    """
     import rawpy
 
     try:
-        with complaints(os.fsencode(path)) as told, rawpy.imread(str(path)) as raw:
+        starts = (os.fsencode(path), *(start.encode() for start in _BROKEN_JPEG + _ODD_JPEG))
+        with complaints(*starts) as told, rawpy.imread(str(path)) as raw:
             needed = 2 * raw.sizes.raw_height * raw.sizes.raw_width
             check_size(path, needed=needed, stored=path.stat().st_size)
             yield raw
@@ -95,6 +103,8 @@ def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
     except rawpy.LibRawError as error:
         raise _undecodable(path, error) from None
     for line in told:
+        if line.startswith(_BROKEN_JPEG):
+            raise damaged(path, f"libjpeg says: {line}")
         logger.warning("LibRaw says: %s", line)
 
 

@@ -5,6 +5,7 @@ Stacks of frames in HDF5 files (.h5, .hdf5, NeXus .nxs): one dataset, named behi
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
 import re
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError, legible
+from rgbmidic.errors import FrameError, RgbmidicError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import (
@@ -35,6 +36,10 @@ if TYPE_CHECKING:
     import h5py
 
 __all__ = ["HDF5_ENDINGS", "Hdf5File", "NpyFile", "StackShape", "split_dataset"]
+
+
+_MAXIMUM_HEADER = 2**16
+"""Bytes: numpy refuses to parse more than 10,000, but reads as many as a damaged header announces, up to 4 GB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,20 +99,20 @@ class _Header:
 @remembered
 def _header(path: Path) -> _Header:
     with path.open("rb") as file:
-        try:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, fortran, dtype = read(file)
-        except Exception as error:  # a damaged header is parsed as Python and fails in many ways
-            raise damaged(path, f"its header is not numpy's: {str(error).splitlines()[0]}") from None
-        start = file.tell()
+        head = io.BytesIO(file.read(_MAXIMUM_HEADER))
+    try:
+        version = np.lib.format.read_magic(head)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(head)
+    except Exception as error:  # a damaged header is parsed as Python and fails in many ways
+        raise damaged(path, f"its header is not numpy's: {first_line(error)}") from None
     stack = StackShape.of(shape, dtype, path)
     if fortran:
         raise FrameError(
             f"{path} is stored in Fortran order; save it with numpy.save(file, numpy.ascontiguousarray(stack))"
         )
     size = math.prod(stack.shape) * dtype.itemsize
-    layout = Layout.checked(path, count=stack.count, start=start, size=size)
+    layout = Layout.checked(path, count=stack.count, start=head.tell(), size=size)
     return _Header(shape=stack.shape, dtype=dtype, layout=layout)
 
 
@@ -189,7 +194,7 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     except RgbmidicError:
         raise
     except Exception as error:  # h5py meets damaged files with many kinds of error
-        raise damaged(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from None
+        raise damaged(path, first_line(error)) from None
 
 
 @remembered
@@ -258,12 +263,19 @@ def _check_written(dataset: h5py.Dataset, index: int, stack: StackShape, path: P
         raise FrameError(
             f"{path} is stored in chunks of shape {dataset.chunks}, more than {MAXIMUM_BYTES / 1e6:.0f} MB each"
         )
+    created, size = dataset.id.get_create_plist(), math.prod(dataset.chunks) * dataset.dtype.itemsize
+    filters = [created.get_filter(place)[0] for place in range(created.get_nfilters())]
     for corner in _corners(dataset, index, stack):
         chunk = dataset.id.get_chunk_info_by_coord(corner)
         if chunk.byte_offset is None or chunk.byte_offset + chunk.size > path.stat().st_size:
             raise FrameError(
                 f"{path}: frame {index} of {stack.count} is not all there: truncated or still being written"
             )
+        used = {code for place, code in enumerate(filters) if not chunk.filter_mask >> place & 1}
+        # the list of chunks may name one that a damaged index does not lead to: libhdf5 gives what memory holds instead
+        found = len(dataset.id.read_direct_chunk(corner)[1])
+        if used <= {h5py.h5z.FILTER_SHUFFLE} and found != size:
+            raise damaged(path, f"a chunk of frame {index} has {found} bytes; needed are {size}")
 
 
 def _corners(dataset: h5py.Dataset, index: int, stack: StackShape) -> Iterator[tuple[int, ...]]:

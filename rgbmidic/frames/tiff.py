@@ -105,8 +105,9 @@ def checked_page(page: TiffPage, path: Path) -> None:
     if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
         kind = page.dtype or f"{page.bitspersample}-bit"
         raise FrameError(f"{path} has {kind} samples; allowed are unsigned 8 or 16 bit")
-    if not (page.imagelength and page.imagewidth):  # an entry that is damaged counts as 0
-        raise damaged(path, f"its header announces {page.imagelength} rows of {page.imagewidth} pixels")
+    if not (page.imagelength and page.imagewidth and page.samplesperpixel):  # an entry that is damaged counts as 0
+        told = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
+        raise damaged(path, f"its header announces {told}")
     size = path.stat().st_size
     if reason := missing_data(page, size):
         raise damaged(path, reason)

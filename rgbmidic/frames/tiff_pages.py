@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError
+from rgbmidic.errors import FrameError, RgbmidicError, first_line
 from rgbmidic.frames.stored import damaged
 from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
@@ -92,7 +92,7 @@ def _opened(path: Path) -> Iterator[TiffFile]:
     except (RgbmidicError, OSError):
         raise
     except Exception as error:  # tifffile meets damaged headers with many kinds of error
-        raise damaged(path, error) from None
+        raise damaged(path, first_line(error)) from None
 
 
 def is_dng(path: Path) -> bool:

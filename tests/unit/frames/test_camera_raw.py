@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import rawpy
@@ -163,6 +164,37 @@ def test_what_libraw_prints_comes_as_one_warning(
     read_frame(dng)
     assert [record.getMessage() for record in caplog.records] == [f"LibRaw says: {dng}: data corrupted at 1378"]
     assert capfd.readouterr().err == "progress of another thread\n"
+
+
+def test_what_libjpeg_prints_makes_a_raw_damaged(
+    dng: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    imread = rawpy.imread
+
+    def talks(name: str) -> rawpy.RawPy:
+        os.write(2, b"Corrupt JPEG data: bad Huffman code\n")
+        return imread(name)
+
+    monkeypatch.setattr(rawpy, "imread", talks)
+    with pytest.raises(
+        FrameError, match=r"whole\.dng is damaged .*: libjpeg says: Corrupt JPEG data: bad Huffman code"
+    ):
+        read_frame(dng)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_damaged_jpeg_in_a_raw_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    write_monochrome_dng(tmp_path / "lossy.dng", noisy_mosaic((64, 64)).values, linear_rgb=True)
+    jpeg = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))[1].tobytes()
+    with tifffile.TiffFile(tmp_path / "lossy.dng", mode="r+") as tiff:
+        page = tiff.pages.first
+        page.tags["Compression"].overwrite(34892)
+        page.tags["BitsPerSample"].overwrite((8, 8, 8))
+        tiff.filehandle.seek(page.dataoffsets[0])
+        tiff.filehandle.write(jpeg[: len(jpeg) // 2] + b"\xff\xd9")  # its end in its middle
+    with pytest.raises(FrameError, match="already demosaiced"):
+        read_frame(tmp_path / "lossy.dng")
+    assert capfd.readouterr().err == ""
 
 
 def test_a_real_truncated_raw_is_told_in_one_line(shared_data: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames import open_source, read_frame
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.frames.formats import FORMATS
 from rgbmidic.settings import FrameSettings
 
@@ -341,6 +341,24 @@ def test_data_for_fewer_rows_than_the_header_says_are_no_frame(tmp_path: Path, s
         tiff.pages.first.tags[257].overwrite(31 + rows)
     with pytest.raises(FrameError, match="too few for its size"):
         read_frame(tmp_path / "f.tif", kind="monochrome")
+
+
+def test_a_header_without_samples_is_refused_in_whole_and_in_part(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "f.tif", GREY, photometric="minisblack")
+    with tifffile.TiffFile(tmp_path / "f.tif", mode="r+") as tiff:
+        tiff.pages.first.tags["SamplesPerPixel"].overwrite(0)
+    source = open_source(tmp_path / "f.tif", FrameSettings(path=("f.tif",), kind="monochrome"))
+    for window in (None, Window(origin=(0, 0), shape=(4, 4), frame=GREY.shape)):
+        with pytest.raises(FrameError, match=r"f\.tif is damaged .* 31 rows of 45 pixels with 0 samples"):
+            source.read(0, window)
+
+
+def test_what_a_damaged_file_puts_into_a_message_keeps_it_one_line(tmp_path: Path) -> None:
+    path = _png(tmp_path / "f.png", GREY)
+    path.write_bytes(path.read_bytes().replace(b"IDAT", b"I\n\x1bT"))
+    with pytest.raises(FrameError) as raised:
+        read_frame(path, kind="monochrome")
+    assert str(raised.value) == rf"{path} is damaged or truncated: the checksum of its I\n\x1bT part is wrong"
 
 
 def test_an_empty_frame_of_usual_size_is_read(tmp_path: Path) -> None:

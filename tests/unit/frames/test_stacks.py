@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -153,6 +154,49 @@ def test_chunks_that_were_never_written_are_no_black_frames(tmp_path: Path) -> N
         series.read(4)
     with pytest.raises(FrameError, match=r"m\.h5: the file ends before the first of its 6 frames"):
         _series(tmp_path / "m.h5:flat").read(0)
+
+
+@pytest.mark.parametrize(("old", "new"), [((70, 0), (60, 0)), ((70, 0), (0, 0))])
+def test_a_chunk_of_another_size_is_no_frame(tmp_path: Path, old: tuple[int, int], new: tuple[int, int]) -> None:
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file.create_dataset("data", data=np.ones((2, 10, 14), dtype=np.uint16), chunks=(1, 5, 7), shuffle=True)
+    content = (tmp_path / "m.h5").read_bytes()
+    entry = struct.pack("<IIQ", *old, 0)  # size and mask of a chunk, and its first index
+    (tmp_path / "m.h5").write_bytes(content.replace(entry, struct.pack("<IIQ", *new, 0), 1))
+    series = open_series(FrameSettings(path=(str(tmp_path / "m.h5"),), kind="monochrome"))
+    with pytest.raises(FrameError, match=rf"m\.h5 is damaged .* frame 0 has {new[0]} bytes; needed are 70"):
+        series.read(0)
+    series.read(1)
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "gzip"}])
+def test_a_chunk_that_a_damaged_index_does_not_lead_to_is_missed(tmp_path: Path, options: dict[str, Any]) -> None:
+    frames = np.random.default_rng(3).integers(1, 4096, (5, 12, 16)).astype(np.uint16)
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file.create_dataset("data", data=frames, chunks=(1, 5, 7), **options)
+    content = (tmp_path / "m.h5").read_bytes()
+    entry, other = (struct.pack("<QQQQ", frame, 5, 14, 0) for frame in (2, 0))
+    assert content.count(entry) == 1
+    (tmp_path / "m.h5").write_bytes(content.replace(entry, other))
+    series, missed = open_series(FrameSettings(path=(str(tmp_path / "m.h5"),), kind="monochrome")), 0
+    for index, frame in enumerate(frames):
+        try:
+            (read,) = series.read(index)
+        except FrameError:
+            missed += 1
+        else:
+            np.testing.assert_array_equal(read.values[0], frame)
+    assert missed
+
+
+def test_a_header_that_announces_gigabytes_takes_none(tmp_path: Path) -> None:
+    (tmp_path / "m.npy").write_bytes(b"\x93NUMPY\2\0" + struct.pack("<I", 2**32 - 1) + bytes(500))
+    tracemalloc.start()
+    with pytest.raises(FrameError, match=r"m\.npy is damaged .* expected 4294967295 bytes got 500"):
+        open_series(FrameSettings(path=(str(tmp_path / "m.npy"),), kind="monochrome"))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**20
 
 
 def test_samples_in_other_files_are_refused(tmp_path: Path) -> None:
