@@ -107,7 +107,7 @@ def test_frames_that_are_not_measured_yet_are_without_data(tmp_path: Path) -> No
 def test_it_survives_netcdf_and_being_sent_to_a_process(result: Result, tmp_path: Path) -> None:
     data = result.to_xarray(ScaleSettings(mm_per_pixel=0.02))
     data.to_netcdf(tmp_path / "result.nc", engine="h5netcdf")
-    with xr.open_dataset(tmp_path / "result.nc", decode_times=False) as back:
+    with xr.open_dataset(tmp_path / "result.nc") as back:
         xr.testing.assert_allclose(back, data)
         assert json.loads(back.attrs["versions"]) == result.provenance["versions"]
     xr.testing.assert_identical(pickle.loads(pickle.dumps(data)), data)
