@@ -17,7 +17,7 @@ from xarray.core import indexing
 
 from rgbmidic._version import __version__
 from rgbmidic.results.physical import frame_times, scale_of
-from rgbmidic.results.quantities import QUANTITIES, SHARED, Quantity
+from rgbmidic.results.quantities import QUANTITIES, SHARED, ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.timing import STAGES
@@ -92,7 +92,7 @@ def _lazy(result: Result, axes: tuple[str, ...], names: tuple[str, ...], about: 
     return xr.Variable(axes, indexing.LazilyIndexedArray(_Frames(result, names)), about)
 
 
-def _attributes(entry: Quantity) -> dict[str, Any]:
+def _attributes(entry: ResultQuantity) -> dict[str, Any]:
     about: dict[str, Any] = {"units": entry.unit or "1", "long_name": entry.meaning}
     if entry.codes:
         about["flag_values"] = np.arange(len(entry.codes), dtype=entry.dtype)

@@ -27,7 +27,7 @@ from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.physical import Physical
-from rgbmidic.results.quantities import QUANTITIES, Quantity
+from rgbmidic.results.quantities import QUANTITIES, ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray, FloatArray
@@ -181,7 +181,7 @@ def _describe(out: h5py.File, dataset: h5py.Dataset, axes: tuple[str, ...], unit
     return dataset
 
 
-def _declare(out: h5py.File, told: Physical, entry: Quantity) -> None:
+def _declare(out: h5py.File, told: Physical, entry: ResultQuantity) -> None:
     """An array for all frames of a quantity, still without content."""
     axes = tuple(_axis(out, axis) for axis in entry.axes)
     shape = (len(told.result), *(len(out[axis]) for axis in axes))
@@ -307,7 +307,7 @@ def _write_npz(told: Physical, file: BinaryIO) -> None:
                     _write_frames(result, quantity, member)
 
 
-def _write_frames(result: Result, quantity: Quantity, file: IO[bytes]) -> None:
+def _write_frames(result: Result, quantity: ResultQuantity, file: IO[bytes]) -> None:
     """One array of all frames, of which one frame at a time is in memory."""
     one = quantity.unmeasured(result.table.layout.sizes)
     head = {"descr": one.dtype.str, "fortran_order": False, "shape": (len(result), *one.shape)}

@@ -29,11 +29,11 @@ from rgbmidic.typing import FloatArray
 if TYPE_CHECKING:
     from rgbmidic.fields.history import Units
 
-__all__ = ["Histories", "Told", "history_csv", "history_rows", "read_histories", "write_histories"]
+__all__ = ["Histories", "HistoryColumn", "history_csv", "history_rows", "read_histories", "write_histories"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Told:
+class HistoryColumn:
     """One quantity over the frames, in the unit that it is told in.
 
     Attributes
@@ -83,12 +83,12 @@ class Histories:
     numbers: npt.NDArray[np.int64]
     status: npt.NDArray[np.int64]
     times: FloatArray | None
-    quantities: tuple[Told, ...]
+    quantities: tuple[HistoryColumn, ...]
     stress_strain: tuple[str, str] | None
     units: Units
     remarks: tuple[str, ...]
 
-    def __getitem__(self, name: str) -> Told:
+    def __getitem__(self, name: str) -> HistoryColumn:
         """The quantity of a name, or of its column's."""
         for told in self.quantities:
             if name in (told.name, told.column):
@@ -282,7 +282,7 @@ def _checked(probe: Probe, nodal: Nodal, result: Result) -> list[History]:
 
 def _told(
     history: History, units: Units, clock: FloatArray, window: int, share: float, references: npt.NDArray[np.bool_]
-) -> Iterator[Told]:
+) -> Iterator[HistoryColumn]:
     """A history in the units of the reader, and its rates over a window of frames, at kinks those of both sides."""
     length = history.unit == "px"
     unit = units.length if length else history.unit
@@ -300,12 +300,12 @@ def _told(
             yield _in_units(told, units.per_time(unit, power), values, std, units if length else None)
 
 
-def _in_units(name: str, unit: str, values: FloatArray, std: FloatArray, lengths: Units | None) -> Told:
+def _in_units(name: str, unit: str, values: FloatArray, std: FloatArray, lengths: Units | None) -> HistoryColumn:
     values, std = (values, std) if lengths is None else lengths.lengths(values, std)
-    return Told(name=name, unit=unit, values=values, std=std)
+    return HistoryColumn(name=name, unit=unit, values=values, std=std)
 
 
-def _channels(channels: Channels | None, times: FloatArray | None, offset: float) -> list[Told]:
+def _channels(channels: Channels | None, times: FloatArray | None, offset: float) -> list[HistoryColumn]:
     """The channels at the times of the frames."""
     if channels is None:
         return []
@@ -314,10 +314,15 @@ def _channels(channels: Channels | None, times: FloatArray | None, offset: float
             f"the channels {channels.path} cannot be brought to the frames, whose times are not known: state "
             "frame_rate in [scale]"
         )
-    return [Told(name=name, unit="", values=values, std=None) for name, values in channels.at(times, offset).items()]
+    return [
+        HistoryColumn(name=name, unit="", values=values, std=None)
+        for name, values in channels.at(times, offset).items()
+    ]
 
 
-def _stress(channels: Channels | None, beside: list[Told], area: float | None, force: str | None) -> list[Told]:
+def _stress(
+    channels: Channels | None, beside: list[HistoryColumn], area: float | None, force: str | None
+) -> list[HistoryColumn]:
     """The stress, where a cross-section (square mm) is known."""
     if area is None:
         return []
@@ -325,7 +330,7 @@ def _stress(channels: Channels | None, beside: list[Told], area: float | None, f
         raise InputError(f"a stress needs channels with a force and an area above 0 mm², not {area:g}")
     name, newtons = channels.force(force)
     values = next(told.values for told in beside if told.name == name)
-    return [Told(name="stress", unit="MPa", values=values * newtons / area, std=None)]
+    return [HistoryColumn(name="stress", unit="MPa", values=values * newtons / area, std=None)]
 
 
 def _remarks(
@@ -334,7 +339,7 @@ def _remarks(
     exposed: float | None,
     frames: npt.NDArray[np.int64],
     read: Mapping[str, list[History]],
-    beside: list[Told],
+    beside: list[HistoryColumn],
 ) -> Iterator[str]:
     if units.mm_per_pixel is None:
         yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"

@@ -24,7 +24,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.fields import EQUIVALENT, MEASURES, NodalCovariance, Strain, StrainGauges, Units, strain_of_gradient
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section, regular
 from rgbmidic.typing import BoolArray, FloatArray
@@ -166,17 +166,17 @@ def _numbers(path: Path, lines: list[str], parted: str, count: int) -> FloatArra
 
 _NODE, _ELEMENT = ("node",), ("element",)
 _STRAIN = (
-    Quantity("exx", _NODE, "", "components.0", "strain in x"),
-    Quantity("eyy", _NODE, "", "components.1", "strain in y"),
-    Quantity("exy", _NODE, "", "components.2", "strain, tensor shear"),
-    Quantity("exx_std", _NODE, "", "components_std.0", "standard uncertainty of exx"),
-    Quantity("eyy_std", _NODE, "", "components_std.1", "standard uncertainty of eyy"),
-    Quantity("exy_std", _NODE, "", "components_std.2", "standard uncertainty of exy"),
-    Quantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane"),
-    Quantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane"),
-    Quantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y"),
-    Quantity("equivalent", _NODE, "", "equivalent", EQUIVALENT),
-    Quantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of equivalent"),
+    ResultQuantity("exx", _NODE, "", "components.0", "strain in x"),
+    ResultQuantity("eyy", _NODE, "", "components.1", "strain in y"),
+    ResultQuantity("exy", _NODE, "", "components.2", "strain, tensor shear"),
+    ResultQuantity("exx_std", _NODE, "", "components_std.0", "standard uncertainty of exx"),
+    ResultQuantity("eyy_std", _NODE, "", "components_std.1", "standard uncertainty of eyy"),
+    ResultQuantity("exy_std", _NODE, "", "components_std.2", "standard uncertainty of exy"),
+    ResultQuantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane"),
+    ResultQuantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane"),
+    ResultQuantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y"),
+    ResultQuantity("equivalent", _NODE, "", "equivalent", EQUIVALENT),
+    ResultQuantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of equivalent"),
 )
 _ELEMENT_STRAIN = tuple(
     replace(entry, name=f"{entry.name}_element", axes=_ELEMENT, meaning=f"{entry.meaning}, constant in an element")
@@ -248,7 +248,7 @@ class Physical:
         return f"{length:.4g} px" + ("" if scale is None else f" ({length * scale:.3g} mm)")
 
     @cached_property
-    def quantities(self) -> dict[str, Quantity]:
+    def quantities(self) -> dict[str, ResultQuantity]:
         """What `frame` gives, by name: the stackable quantities of the table, and strain; lengths in `units`."""
         kept = [entry for entry in QUANTITIES.values() if entry.stackable and entry.name not in _REPLACED]
         told = [replace(entry, unit=self.units.length) if entry.unit == "px" else entry for entry in kept]
@@ -286,7 +286,7 @@ class Physical:
         return strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)))
 
 
-def _part(strain: Strain, entry: Quantity) -> FloatArray:
+def _part(strain: Strain, entry: ResultQuantity) -> FloatArray:
     attribute, _, column = entry.source.partition(".")
     values: FloatArray = getattr(strain, attribute)
     return values[:, int(column)] if column else values

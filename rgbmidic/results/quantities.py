@@ -18,11 +18,11 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
 
-__all__ = ["QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "Quantity"]
+__all__ = ["QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "ResultQuantity"]
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class ResultQuantity:
     """What is kept under one name, of every frame or of all together.
 
     Attributes
@@ -124,19 +124,21 @@ _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
-    Quantity(
+    ResultQuantity(
         "number", (), "", "", "number of the frame: a frame that is missing leaves a gap", dtype=np.int64, blank=-1
     ),
-    Quantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
-    Quantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
-    Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
-    Quantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
-    Quantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
-    Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
-    Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
-    Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
-    Quantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
-    Quantity(
+    ResultQuantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
+    ResultQuantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
+    ResultQuantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
+    ResultQuantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
+    ResultQuantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
+    ResultQuantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
+    ResultQuantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
+    ResultQuantity(
+        "inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT
+    ),
+    ResultQuantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
+    ResultQuantity(
         "u",
         _NODE,
         "px",
@@ -144,20 +146,22 @@ _TABLE = (
         "displacement in x against the reference, at the node (not the best linear fit's nodal value)",
         **_EXACT,
     ),
-    Quantity("v", _NODE, "px", "displacement.1", "displacement in y against the reference, at the node", **_EXACT),
-    Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
-    Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
-    Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
-    Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
-    Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
-    Quantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx"),
-    Quantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy"),
-    Quantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
-    Quantity("match", (), "", "", _MATCH),
-    Quantity("best_match", (), "", "", _BEST, blank=0),
-    Quantity("reference_updates", ("reference_update",), "", "", _RENEWALS, dtype=np.int64, blank=0),
-    Quantity("misfit", _NODE, "", "misfit", _MISFIT),
-    Quantity(
+    ResultQuantity(
+        "v", _NODE, "px", "displacement.1", "displacement in y against the reference, at the node", **_EXACT
+    ),
+    ResultQuantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
+    ResultQuantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
+    ResultQuantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
+    ResultQuantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
+    ResultQuantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
+    ResultQuantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx"),
+    ResultQuantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy"),
+    ResultQuantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
+    ResultQuantity("match", (), "", "", _MATCH),
+    ResultQuantity("best_match", (), "", "", _BEST, blank=0),
+    ResultQuantity("reference_updates", ("reference_update",), "", "", _RENEWALS, dtype=np.int64, blank=0),
+    ResultQuantity("misfit", _NODE, "", "misfit", _MISFIT),
+    ResultQuantity(
         "light_fraction",
         ("node", "light"),
         "",
@@ -165,24 +169,24 @@ _TABLE = (
         "share of each light in what determines a node",
         blank=0,
     ),
-    Quantity("residual", _LIGHT, "", "residual", _RESIDUAL),
-    Quantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
-    Quantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
-    Quantity("rigid", ("light", "function"), "", "rigid", _RIGID),
-    Quantity("seconds", (len(STAGES),), "s", "", _SECONDS),
-    Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
-    Quantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
+    ResultQuantity("residual", _LIGHT, "", "residual", _RESIDUAL),
+    ResultQuantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
+    ResultQuantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
+    ResultQuantity("rigid", ("light", "function"), "", "rigid", _RIGID),
+    ResultQuantity("seconds", (len(STAGES),), "s", "", _SECONDS),
+    ResultQuantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
+    ResultQuantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
 )
 
-QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
+QUANTITIES: dict[str, ResultQuantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
 
 _CORNERS = "node indices; `(p1 - p0) x (p2 - p0) > 0` in (x, y)"
 _REFERENCE = "reference image of each light, stretched to 8 bit, for pictures"
-SHARED: dict[str, Quantity] = {
-    "nodes": Quantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
-    "elements": Quantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
-    "reference": Quantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
+SHARED: dict[str, ResultQuantity] = {
+    "nodes": ResultQuantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
+    "elements": ResultQuantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
+    "reference": ResultQuantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
 }
 """What all frames share."""
 
@@ -228,7 +232,7 @@ class FrameRecord:
         Parameters
         ----------
         solution
-            Gives the quantities that have a `Quantity.source`.
+            Gives the quantities that have a `ResultQuantity.source`.
         inputs
             Path and SHA-256 of the files that the frame was read from.
         given

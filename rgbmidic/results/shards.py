@@ -36,7 +36,7 @@ import numpy.typing as npt
 from rgbmidic.errors import ResultError
 from rgbmidic.results.files import writing
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
-from rgbmidic.results.quantities import QUANTITIES, FrameRecord, Quantity
+from rgbmidic.results.quantities import QUANTITIES, FrameRecord, ResultQuantity
 from rgbmidic.typing import BoolArray
 
 __all__ = ["FrameTable", "RecordLayout", "ShardWriter", "discard", "shard_files"]
@@ -458,18 +458,18 @@ def _layout_number(head: bytes, place: int) -> int:
     return number
 
 
-def _stored(entry: Quantity) -> np.dtype[Any]:
+def _stored(entry: ResultQuantity) -> np.dtype[Any]:
     return np.dtype(entry.dtype).newbyteorder("<")
 
 
-def _packed(entry: Quantity, value: Any) -> bytes:
+def _packed(entry: ResultQuantity, value: Any) -> bytes:
     if entry.dtype is np.str_:
         return json.dumps(np.asarray(value).tolist()).encode("ascii")
     raw = np.asarray(value, dtype=_stored(entry)).tobytes()
     return zlib.compress(raw, _FAST) if entry.dtype is np.uint8 else raw
 
 
-def _unpacked(entry: Quantity, part: bytes, shape: Sequence[int]) -> Any:
+def _unpacked(entry: ResultQuantity, part: bytes, shape: Sequence[int]) -> Any:
     """What `_packed` packed; what a head promises beyond that is an error before it is memory."""
     if entry.dtype is np.str_:
         return np.array(json.loads(part), dtype=np.str_).reshape(shape)
