@@ -1,6 +1,6 @@
-"""The quantities of a result, each declared once: record, store, exports, figures and documents read this table.
+"""The field table of a result: every quantity declared once, and the record of one frame.
 
-What is kept of one frame.
+Record, store, exports, figures and documents read this table.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "ResultQuantit
 
 @dataclass(frozen=True, slots=True)
 class ResultQuantity:
-    """What is kept under one name, of every frame or of all together.
+    """An entry of the field table: what is kept under one name, of every frame or of all together.
 
     Attributes
     ----------
@@ -35,9 +35,10 @@ class ResultQuantity:
     unit
         Empty where there is none.
     source
-        Attribute of a `Solution` it comes from, a column of it behind a dot; empty where the main job gives it.
+        Attribute of the object that it comes from, such as a `Solution`, a column of it behind a dot; empty where the
+        main job provides it.
     meaning
-        What docs/conventions.md says of it.
+        Its description in docs/conventions.md.
     dtype
         Type of the array, in memory and on disk: what is known to no more than some digits has single precision.
     blank
@@ -57,7 +58,7 @@ class ResultQuantity:
     codes: tuple[str, ...] = ()
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
-        """Shape in one frame of a result with these sizes of ``"node"`` and ``"light"``; None for an open axis."""
+        """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis."""
         return tuple(axis if isinstance(axis, int) else sizes.get(axis) for axis in self.axes)
 
     @property
@@ -66,7 +67,7 @@ class ResultQuantity:
         return None not in self.shape({"node": 0, "light": 0}) and self.dtype is not np.str_
 
     def convert(self, value: Any, sizes: Mapping[str, int]) -> Any:
-        """`value` in the type of the table; an `InputError` where it has another shape."""
+        """Return `value` in the type of the table; an `InputError` where it has another shape."""
         array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
         fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
         if not fits:
@@ -74,18 +75,18 @@ class ResultQuantity:
         return array if self.axes else array.item()
 
     def unmeasured(self, sizes: Mapping[str, int]) -> Any:
-        """What a frame holds that could not be measured; open axes have no entry."""
+        """Return the value of a frame that could not be measured; open axes have the length 0."""
         return np.full([size or 0 for size in self.shape(sizes)], self.blank, dtype=self.dtype)
 
-    def of(self, solution: Solution) -> Any:
-        """This quantity of a solved frame."""
+    def of(self, source: object) -> Any:
+        """Take the quantity from an object with the attribute that `source` names."""
         attribute, _, column = self.source.partition(".")
-        value = getattr(solution, attribute)
+        value = getattr(source, attribute)
         return value[:, int(column)] if column else value
 
 
 UNKNOWN_TIME = np.iinfo(np.int64).min
-"""`time_ns` of a frame whose time nobody knows."""
+"""`time_ns` of a frame whose time is not known."""
 
 _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
@@ -98,17 +99,17 @@ _RESIDUAL = (
     "weighted rms of `f - g(x + u)`, in the unit of the images that are correlated: none if these are divided by their "
     "local mean (the default), else DN"
 )
-_WEIGHT = "mean share of each light in the weights; adds up to the part of the region that any light sees"
+_WEIGHT = "mean fraction of each light in the weights; adds up to the part of the region that any light sees"
 _BRIGHTNESS = (
     "gain and offset (DN) of each light against the reference, from the speckle's contrast and mean, medians over the "
-    "elements; told, not used"
+    "elements; reported, not used"
 )
 _MATCH = (
     "median correlation coefficient of the elements with their reference, of the light that matches best; NaN unless "
     "`frames.update_reference` looks at it"
 )
 _BEST = "largest `match` of the frames compared with the same reference, up to this one"
-_RENEWALS = (
+_UPDATES = (
     "places in the result of the frames that became the reference in turn, up to this one: it was itself compared with "
     "the last before it, or with the test's reference"
 )
@@ -118,7 +119,9 @@ _RIGID = (
 )
 _UNREAD = "1 where the frame failed because it could not be read, which `--resume` tries again, else 0"
 _TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
-_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not tell it"
+_REFLECTION = (
+    "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not report it"
+)
 _SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
@@ -159,14 +162,14 @@ _TABLE = (
     ResultQuantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
     ResultQuantity("match", (), "", "", _MATCH),
     ResultQuantity("best_match", (), "", "", _BEST, blank=0),
-    ResultQuantity("reference_updates", ("reference_update",), "", "", _RENEWALS, dtype=np.int64, blank=0),
+    ResultQuantity("reference_updates", ("reference_update",), "", "", _UPDATES, dtype=np.int64, blank=0),
     ResultQuantity("misfit", _NODE, "", "misfit", _MISFIT),
     ResultQuantity(
         "light_fraction",
         ("node", "light"),
         "",
         "light_fraction",
-        "share of each light in what determines a node",
+        "fraction of each light in what determines a node",
         blank=0,
     ),
     ResultQuantity("residual", _LIGHT, "", "residual", _RESIDUAL),
@@ -188,7 +191,7 @@ SHARED: dict[str, ResultQuantity] = {
     "elements": ResultQuantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
     "reference": ResultQuantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
 }
-"""What all frames share."""
+"""What all frames have in common."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -212,6 +215,7 @@ class FrameRecord:
     sizes: Mapping[str, int]
 
     def __post_init__(self) -> None:
+        """Check names and shapes, and take over the types of the table."""
         if odd := self.values.keys() ^ QUANTITIES.keys():
             raise InputError(f"a frame record holds {', '.join(QUANTITIES)}; missing or unknown: {', '.join(odd)}")
         values = {name: entry.convert(self.values[name], self.sizes) for name, entry in QUANTITIES.items()}
@@ -219,7 +223,15 @@ class FrameRecord:
 
     @classmethod
     def of(cls, *, nodes: int, lights: int, **values: Any) -> FrameRecord:
-        """The record of the quantities given (None: not known); the others hold what an unmeasured frame does."""
+        """Make a record of some quantities; the others have the value of a frame that could not be measured.
+
+        Parameters
+        ----------
+        nodes, lights
+            Their numbers N and k.
+        **values
+            Quantities by name; None where not known.
+        """
         sizes = {"node": nodes, "light": lights}
         blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
         given = {name: value for name, value in values.items() if value is not None}
@@ -227,15 +239,15 @@ class FrameRecord:
 
     @classmethod
     def from_solution(cls, solution: Solution, *, inputs: Mapping[str, str] | None = None, **given: Any) -> FrameRecord:
-        """The record of a solved frame.
+        """Make the record of a solved frame.
 
         Parameters
         ----------
         solution
-            Gives the quantities that have a `ResultQuantity.source`.
+            Provides the quantities that have a `ResultQuantity.source`.
         inputs
             Path and SHA-256 of the files that the frame was read from.
-        given
+        **given
             The others, such as `number`, `time_ns`, `brightness` and `weights_thumbnail`; None where not known.
         """
         nodes, lights = np.shape(solution.light_fraction)
@@ -246,10 +258,11 @@ class FrameRecord:
     def failed(
         cls, reason: str, *, nodes: int, lights: int, inputs: Mapping[str, str] | None = None, **given: Any
     ) -> FrameRecord:
-        """The record of a frame that could not be measured at all: NaN everywhere, and the reason."""
+        """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason."""
         return cls.of(nodes=nodes, lights=lights, reason=reason, inputs=_pairs(inputs), **given)
 
     def __getattr__(self, name: str) -> Any:
+        """Return a quantity of the table."""
         if name in QUANTITIES:
             return self.values[name]
         raise AttributeError(f"a frame record has no quantity {name!r}")

@@ -117,7 +117,7 @@ class Result:
         return cls(path=path, table=table, **mesh, names=names, lights=lights, provenance=provenance)
 
     def refresh(self) -> Self:
-        """The result as it is now, with the frames that were added since.
+        """Open the result again, with the frames that were added since.
 
         Raises
         ------
@@ -133,12 +133,12 @@ class Result:
         return replace(self, table=table, provenance=provenance)
 
     def __len__(self) -> int:
-        """Number of frames T."""
+        """Return the number of frames T."""
         return len(self.names)
 
     @property
     def finished(self) -> BoolArray:
-        """Which frames are measured, failed ones included, shape (T,)."""
+        """Mask of the frames that are measured, failed ones included, shape (T,)."""
         return self.table.finished
 
     @cached_property
@@ -148,11 +148,11 @@ class Result:
         return tuple(index for index in range(len(self)) if index not in references)
 
     def setting(self, section: str, key: str, default: Any = None) -> Any:
-        """A setting of the run, as TEST.toml names it; `default` where it was not kept."""
+        """Return a setting of the run, as TEST.toml names it; `default` where it was not kept."""
         return self.provenance.get("settings", {}).get(section, {}).get(key, default)
 
     def frame(self, index: int) -> FrameRecord:
-        """Everything that is kept of one frame.
+        """Read everything that is kept of one frame.
 
         Raises
         ------
@@ -164,12 +164,12 @@ class Result:
         return self.table.read(index)
 
     def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
-        """One quantity, frame after frame (None: all): an array, or a plain number or text."""
+        """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts."""
         chosen = range(len(self)) if frames is None else frames
         return (values[name] for values in self.table.each([name], chosen))
 
     def stack(self, name: str) -> AnyArray:
-        """One quantity of all frames, the frames as first axis; takes the memory of all of them."""
+        """Read one quantity of all frames into one array, the frames as first axis."""
         one = QUANTITIES[name].unmeasured(self.table.layout.sizes)
         stacked = np.empty((len(self), *one.shape), dtype=one.dtype)
         for index, value in enumerate(self.each(name)):
@@ -177,7 +177,7 @@ class Result:
         return stacked
 
     def to_xarray(self, scale: ScaleSettings | None = None) -> xr.Dataset:
-        """The result with named dimensions, coordinates and units; values are read frame by frame when they are used.
+        """Return the result with named dimensions, coordinates and units; values are read frame by frame when used.
 
         Parameters
         ----------
@@ -210,12 +210,14 @@ class Result:
         return dataset
 
     def __getattr__(self, name: str) -> AnyArray:
+        """Read a stackable quantity of the table, and keep it."""
         if name not in QUANTITIES or not QUANTITIES[name].stackable:
             raise AttributeError(f"a result has no attribute {name!r}")
         stacked = self.__dict__[name] = self.stack(name)
         return stacked
 
     def __dir__(self) -> list[str]:
+        """List the attributes, quantities included."""
         return [*super().__dir__(), *(name for name, quantity in QUANTITIES.items() if quantity.stackable)]
 
     @property
@@ -241,13 +243,11 @@ class Result:
     @cached_property
     def mean_light_fraction(self) -> FloatArray:
         """Mean of `light_fraction` over the measured nodes, shape (T, k); NaN where none is measured."""
-        shares = np.full((len(self), len(self.lights)), np.nan)
-        for row, values in zip(
-            shares, self.table.each(["light_fraction", "node_status"], range(len(self))), strict=True
-        ):
+        fractions = np.full((len(self), len(self.lights)), np.nan)
+        for row, values in enumerate(self.table.each(["light_fraction", "node_status"], range(len(self)))):
             if (measured := values["node_status"] == 0).any():
-                row[:] = values["light_fraction"][measured].mean(axis=0, dtype=np.float64)
-        return shares
+                fractions[row] = values["light_fraction"][measured].mean(axis=0, dtype=np.float64)
+        return fractions
 
     @cached_property
     def reference(self) -> npt.NDArray[np.uint8] | None:
@@ -265,8 +265,8 @@ class Result:
 
     @property
     def frame_shape(self) -> tuple[int, int] | None:
-        """Rows and columns of the frames; None where neither the provenance nor a reference image tells them."""
-        noted = self.provenance.get("frame_shape")
-        if noted is None and self.reference is not None:
-            noted = self.reference.shape[1:]
-        return noted and (noted[0], noted[1])
+        """Rows and columns of the frames; None where neither the provenance nor a reference image has them."""
+        shape = self.provenance.get("frame_shape")
+        if shape is None and self.reference is not None:
+            shape = self.reference.shape[1:]
+        return shape and (shape[0], shape[1])
