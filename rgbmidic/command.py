@@ -87,7 +87,7 @@ def optional(module: str, extra: str) -> Any:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("rgbmidic"):
             raise
-        raise InputError(f'this command needs {error.name}: pip install "rgbmidic[{extra}]"') from None
+        raise InputError(f'this needs the package {error.name}: pip install "rgbmidic[{extra}]"') from None
 
 
 def read_place(text: str, option: str, form: str) -> tuple[float, ...]:

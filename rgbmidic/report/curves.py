@@ -11,7 +11,7 @@ import numpy as np
 
 from rgbmidic.report.setup import Course, NoiseFloor
 from rgbmidic.report.style import GAP, LEGEND, LINES, NUMBERS, draw_figure, finish_plot, literal, time_unit
-from rgbmidic.results import QUANTITIES, Histories, Told
+from rgbmidic.results import QUANTITIES, Histories, HistoryColumn
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def history_figure(histories: Histories) -> Figure:
 
     Where a stress is known a last panel shows it over the strain.
     """
-    panels: dict[tuple[str, str], list[Told]] = {}
+    panels: dict[tuple[str, str], list[HistoryColumn]] = {}
     for told in histories.quantities:
         panels.setdefault((_kind(told), told.unit), []).append(told)
     timed = histories.times is not None
@@ -137,7 +137,7 @@ def history_figure(histories: Histories) -> Figure:
     return draw_figure(draw, count=count, aspect=0.45, beside=LEGEND, tallest=_PANEL * count + 1)
 
 
-def _kind(told: Told) -> str:
+def _kind(told: HistoryColumn) -> str:
     """What stands on the axis: quantities of one kind and unit share a panel, other channels have one each."""
     if told.std is None and told.name != "stress":
         return told.name
@@ -148,7 +148,7 @@ def _kind(told: Told) -> str:
     return {"deg": "rotation", "": "strain"}.get(told.unit, "displacement")
 
 
-def _line(axis: Axes, over: FloatArray, told: Told) -> None:
+def _line(axis: Axes, over: FloatArray, told: HistoryColumn) -> None:
     marker = "o" if np.isfinite(told.values).sum() <= _MARKERS else None
     (line,) = axis.plot(over, told.values, marker=marker, markersize=2.5, linewidth=1, label=literal(told.name))
     if told.std is not None:
@@ -156,7 +156,7 @@ def _line(axis: Axes, over: FloatArray, told: Told) -> None:
         axis.fill_between(over, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
 
 
-def _limit(axis: Axes, quantities: list[Told]) -> None:
+def _limit(axis: Axes, quantities: list[HistoryColumn]) -> None:
     """Let the values, and not the widest uncertainty among them, say what is shown."""
     known = np.concatenate([told.values[np.isfinite(told.values)] for told in quantities])
     if known.size and np.ptp(known) > 0:

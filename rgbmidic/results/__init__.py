@@ -3,7 +3,7 @@
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.histories import Histories, Told, history_rows, write_histories
+from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
 from rgbmidic.results.physical import (
     Channels,
     exposure,
@@ -15,7 +15,7 @@ from rgbmidic.results.physical import (
     units_of,
 )
 from rgbmidic.results.provenance import Origin
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.store import ResultStore, finish_result
 
@@ -27,11 +27,11 @@ __all__ = [
     "Channels",
     "FrameRecord",
     "Histories",
+    "HistoryColumn",
     "Origin",
-    "Quantity",
     "Result",
+    "ResultQuantity",
     "ResultStore",
-    "Told",
     "export_result",
     "exposure",
     "finish_result",

@@ -1,6 +1,7 @@
-"""Files of a result: each appears under its name only when it is complete, and whatever is wrong with one is told.
+"""Files of a result, and claims on its folder.
 
-Claims on a folder: files that name the processes that write there, and which frames each of them writes.
+A file appears under its name only when it is complete; a damaged one is an error that names it. A claim is a file that
+names a process that writes into the folder, and the frames that it writes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -42,13 +42,20 @@ __all__ = [
 ]
 
 
+ALL_FRAMES = range(sys.maxsize)
+"""All frames that a folder has or will have."""
+_PAUSES = (0.02, 0.05, 0.1, 0.2)
+"""Seconds, at most, between tries. Two that start at once see each other and both step back; a pause drawn by chance
+lets one be first. A process of an array looks at a folder in some ms."""
+
+
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write an npz file, not compressed: its size on disk is what it takes in memory."""
     write_complete(path, lambda file: np.savez(file, **arrays))
 
 
 def read_arrays(path: Path, names: Iterable[str]) -> dict[str, AnyArray]:
-    """The named arrays of a file that `write_arrays` wrote, checksums verified; the others are not read.
+    """Read the named arrays of a file that `write_arrays` wrote, with their checksums; the others are not read.
 
     Raises
     ------
@@ -65,7 +72,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, AnyArray]:
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
-    """One array, once its header is found to promise what the file holds."""
+    """Read one array after a check that its header promises what the file holds."""
     entry = archive.getinfo(f"{name}.npy")
     if entry.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{name} is compressed")
@@ -86,7 +93,7 @@ def write_json(path: Path, document: Any) -> None:
 
 
 def write_new_json(path: Path, document: Any) -> bool:
-    """Write a JSON file where there is none; of all who try at once one succeeds, the others are told False."""
+    """Write a JSON file where there is none; of several processes at once one gets True, the others False."""
     return write_complete(path, lambda file: file.write(_text(document)), _name_new)
 
 
@@ -113,6 +120,7 @@ def read_json(path: Path) -> Any:
 
 
 def _rename(temporary: Path, path: Path) -> bool:
+    """Rename, over an older file where there is one."""
     temporary.replace(path)
     return True
 
@@ -163,18 +171,11 @@ def check_file(out: Path, *, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """What the disk refuses inside becomes a `ResultError` that names the file."""
+    """Turn an error of the disk inside the block into a `ResultError` that names the file."""
     try:
         yield
     except OSError as error:
         raise ResultError(f"{path} cannot be written: {disk_reason(error)}") from None
-
-
-ALL_FRAMES = range(sys.maxsize)
-"""Whatever frames a folder has or will have."""
-_PAUSES = (0.02, 0.05, 0.1, 0.2)
-"""Seconds, at most, between tries. Two that start at once see each other and both step back; a pause drawn by chance
-lets one be first. A process of an array looks at a folder in some ms."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,7 +185,7 @@ class Claim:
     Attributes
     ----------
     file
-        The file that says so.
+        The file of the claim.
     process
         Who holds it.
     """
@@ -204,7 +205,11 @@ class Claim:
         for pause in _PAUSES:
             file = folder / f"in_use.{secrets.token_hex(8)}.json"
             if not (other := next(_others(file, frames), None)):
-                _write(file, {**_this_process(), "first": frames.start, "stop": frames.stop})
+                holder = {"process": os.getpid(), "host": socket.gethostname()}
+                part = file.with_suffix(".part")
+                with writing(file):  # whole at once; it need not outlive the machine
+                    part.write_text(json.dumps(holder | {"first": frames.start, "stop": frames.stop}), encoding="utf-8")
+                    part.replace(file)
                 if not (other := next(_others(file, frames), None)):
                     return cls(file=file, process=os.getpid())
                 file.unlink(missing_ok=True)
@@ -217,54 +222,35 @@ class Claim:
         )
 
     def release(self) -> None:
-        """Let others have the frames."""
+        """Remove the claim, so that other processes can write the frames."""
         if self.process == os.getpid():
             with writing(self.file):
                 self.file.unlink(missing_ok=True)
 
 
-def _write(file: Path, holder: dict[str, Any]) -> None:
-    """Whole at once; it need not outlive the machine."""
-    part = file.with_suffix(".part")
-    with writing(file):
-        part.write_text(json.dumps(holder), encoding="utf-8")
-        part.replace(file)
-
-
 def _others(mine: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Claims of others on any of these frames."""
+    """Yield the claims of other processes on any of these frames; one that cannot be read is on all of them."""
     for file in mine.parent.glob("in_use.*.json"):
         if file == mine:
             continue
-        with suppress(FileNotFoundError):
-            holder = _holder(file)
-            if not _may_live(holder):
-                file.unlink(missing_ok=True)
-            elif _overlap(holder, frames):
-                yield file, holder
-
-
-def _this_process() -> dict[str, Any]:
-    return {"process": os.getpid(), "host": socket.gethostname()}
-
-
-def _holder(file: Path) -> dict[str, Any]:
-    """What a claim says; empty where it cannot be read."""
-    try:
-        holder = read_json(file)
-    except ResultError:
-        return {}
-    return holder if isinstance(holder, dict) else {}
-
-
-def _overlap(holder: dict[str, Any], frames: range) -> bool:
-    """Whether a claim is on some of the frames; one that does not tell is on all."""
-    first, stop = holder.get("first"), holder.get("stop")
-    return not (isinstance(first, int) and isinstance(stop, int)) or max(first, frames.start) < min(stop, frames.stop)
+        try:
+            document = read_json(file)
+        except FileNotFoundError:
+            continue
+        except ResultError:
+            document = {}
+        holder = document if isinstance(document, dict) else {}
+        first, stop = holder.get("first"), holder.get("stop")
+        if not _may_live(holder):
+            file.unlink(missing_ok=True)
+        elif not (isinstance(first, int) and isinstance(stop, int)) or (
+            max(first, frames.start) < min(stop, frames.stop)
+        ):
+            yield file, holder
 
 
 def _may_live(holder: dict[str, Any]) -> bool:
-    """False only for a process of this host that is found dead."""
+    """Report whether the process of a claim may live: False only for one of this host that is found dead."""
     if holder.get("host") != socket.gethostname() or os.name == "nt":  # where signal 0 would end a process
         return True
     try:

@@ -1,8 +1,6 @@
-"""What probes read off a result over the frames, in physical units.
+"""Histories: what probes laid on a result measure over the frames, in physical units, and as a table or a CSV file.
 
-Histories as a table: a summary for people, all of it as a CSV file.
-
-Probes laid on a result: read frame by frame, told in physical units with rates and what was recorded beside.
+A probe is read frame by frame; its rates, and the channels recorded beside the test, go with it.
 """
 
 from __future__ import annotations
@@ -12,13 +10,24 @@ import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import EQUIVALENT, History, Nodal, NodalCovariance, Probe, RigidMotion, Units, make_probe, rates
+from rgbmidic.fields import (
+    EQUIVALENT,
+    History,
+    Nodal,
+    NodalCovariance,
+    Probe,
+    RigidMotion,
+    Units,
+    column,
+    make_probe,
+    rates,
+)
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.physical import Channels, exposure, frame_times, reference_frames, scale_of, shared_part
@@ -26,15 +35,18 @@ from rgbmidic.results.result import Result
 from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 
-if TYPE_CHECKING:
-    from rgbmidic.fields.history import Units
+__all__ = ["Histories", "HistoryColumn", "history_csv", "history_rows", "read_histories", "write_histories"]
 
-__all__ = ["Histories", "Told", "history_csv", "history_rows", "read_histories", "write_histories"]
+
+_BLURRED = 1.0
+"""Motion (px) within the exposure from which a frame is reported to be blurred: the speckle is smeared over a pixel."""
+_FAST = 95
+"""Percentile of the nodes' speeds that stands for the fast ones: single outliers do not count."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Told:
-    """One quantity over the frames, in the unit that it is told in.
+class HistoryColumn:
+    """A column of `Histories`: one quantity over the frames in the reader's unit.
 
     Attributes
     ----------
@@ -54,19 +66,17 @@ class Told:
     @property
     def column(self) -> str:
         """Name of its column, with the unit."""
-        from rgbmidic.fields.history import column
-
         return column(self.name, self.unit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Histories:
-    """What probes tell of the frames that are measured.
+    """What probes measure in the frames that there are.
 
     Attributes
     ----------
     frames, numbers, status : ndarray, shape (T,), int
-        Place in the result, number (with gaps where frames are lost) and end of each frame.
+        Place in the result, number (with gaps where frames are lost) and status of each frame.
     times : ndarray, shape (T,), or None
         In seconds.
     quantities
@@ -83,28 +93,35 @@ class Histories:
     numbers: npt.NDArray[np.int64]
     status: npt.NDArray[np.int64]
     times: FloatArray | None
-    quantities: tuple[Told, ...]
+    quantities: tuple[HistoryColumn, ...]
     stress_strain: tuple[str, str] | None
     units: Units
     remarks: tuple[str, ...]
 
-    def __getitem__(self, name: str) -> Told:
-        """The quantity of a name, or of its column's."""
-        for told in self.quantities:
-            if name in (told.name, told.column):
-                return told
+    def __getitem__(self, name: str) -> HistoryColumn:
+        """Return the quantity of a name, or of a column name with unit."""
+        for quantity in self.quantities:
+            if name in (quantity.name, quantity.column):
+                return quantity
         raise KeyError(name)
 
 
 def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
-    """Headings, and of every quantity its extremes, last value and median standard uncertainty, as texts."""
+    """Summarise histories for a table.
+
+    Returns
+    -------
+    headings : list of str
+    rows : list of list of str
+        Of every quantity: name, unit, extremes, last value, median standard uncertainty, number of frames.
+    """
     rows = []
-    for told in histories.quantities:
-        known = told.values[np.isfinite(told.values)]
-        std = np.array([]) if told.std is None else told.std[np.isfinite(told.std)]
+    for quantity in histories.quantities:
+        known = quantity.values[np.isfinite(quantity.values)]
+        std = np.array([]) if quantity.std is None else quantity.std[np.isfinite(quantity.std)]
         ends = [f"{value:.5g}" for value in (known.min(), known.max(), known[-1])] if known.size else ["-"] * 3
         spread = f"{np.median(std):.2g}" if std.size else "-"
-        rows.append([told.name, told.unit, *ends, spread, f"{known.size}"])
+        rows.append([quantity.name, quantity.unit, *ends, spread, f"{known.size}"])
     return ["quantity", "unit", "smallest", "largest", "last", "uncertainty", "frames"], rows
 
 
@@ -126,10 +143,10 @@ def history_csv(histories: Histories, file: BinaryIO) -> None:
     columns: dict[str, FloatArray] = {}
     if histories.times is not None:
         columns["time_s"] = histories.times
-    for told in histories.quantities:
-        columns[told.column] = told.values
-        if told.std is not None:
-            columns[f"{told.column}_std"] = told.std
+    for quantity in histories.quantities:
+        columns[quantity.column] = quantity.values
+        if quantity.std is not None:
+            columns[f"{quantity.column}_std"] = quantity.std
     text = io.TextIOWrapper(file, encoding="utf-8", newline="")
     writer = csv.writer(text)
     writer.writerow(["frame", "number", "status", *columns])
@@ -137,12 +154,6 @@ def history_csv(histories: Histories, file: BinaryIO) -> None:
     for head, row in zip(heads, np.column_stack([*columns.values()]).tolist(), strict=True):
         writer.writerow([*head, *("" if value != value else f"{value:.9g}" for value in row)])
     text.detach()  # leaves the file open for whoever opened it
-
-
-_BLURRED = 1.0
-"""Motion (px) within the exposure from which a frame is told to be blurred."""
-_FAST = 95
-"""Percentile of the nodes' speeds that stands for the fast ones."""
 
 
 def read_histories(
@@ -155,7 +166,7 @@ def read_histories(
     area: float | None = None,
     force: str | None = None,
 ) -> Histories:
-    """What probes read off a result.
+    """Read probes off a result.
 
     The frames are read once, one after the other; only the nodes that the probes need are kept.
 
@@ -166,7 +177,7 @@ def read_histories(
     probes
         Where, and what.
     scale
-        Units and frame rate in place of those that the result was measured with.
+        It replaces the ``[scale]`` that was kept with the result; None: that one.
     channels
         Recorded beside the test.
     offset
@@ -176,11 +187,16 @@ def read_histories(
     force
         Name of the channel with the force, where there are several.
 
+    Returns
+    -------
+    Histories
+        Rigid motion, probes in their order with their rates, channels, stress.
+
     Raises
     ------
     InputError
-        A probe is outside the region, or measured in no frame; a window longer than the test; channels without a time
-        of the frames, or none in common.
+        A probe is outside the region, or measured in no frame; the window is longer than the test; the times of the
+        frames are not known, or have none in common with those of the channels.
     """
     if not probes.places and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
@@ -194,20 +210,30 @@ def read_histories(
         raise InputError(f"rates over a window of {probes.window} frames need as many; {len(there)} are measured")
     times = None if times is None else times[there]
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=result.nodes, elements=result.elements))
-    made = _made(covariance, probes)
+    counts: dict[str, int] = {}
+    made = []
+    for kind, place in probes.places:
+        counts[kind] = counts.get(kind, 0) + 1
+        made.append(make_probe(covariance, kind, counts[kind], place, probes.measure))
     clock = result.number[there].astype(np.float64) if times is None else times
     nodal, rigid, speed = _read(result, there, covariance, made, probes.rigid_motion, clock)
-    own = {probe.name: _checked(probe, part, result) for probe, part in zip(made, nodal, strict=True)}
+    own = {probe.name: probe.histories(part) for probe, part in zip(made, nodal, strict=True)}
+    for name, histories in own.items():
+        if not any(np.isfinite(history.values).any() for history in histories):
+            raise InputError(
+                f"{name} is measured in no frame of {result.path}: the nodes around it are not measured (node_status "
+                "says why); place it elsewhere"
+            )
     read = [*rigid, *(history for part in own.values() for history in part)]
     references = reference_frames(result)[there]
     quantities = [
-        told
+        column
         for history in read
-        for told in _told(history, units, clock, probes.window, shared_part(result), references)
+        for column in _in_units(history, units, clock, probes.window, shared_part(result), references)
     ]
     beside = _channels(channels, times, offset)
     stress = _stress(channels, beside, area, force)
-    strain = next((told.name for told in quantities if told.name.endswith(("_strain", "_e1"))), None)
+    strain = next((column.name for column in quantities if column.name.endswith(("_strain", "_e1"))), None)
     return Histories(
         frames=there,
         numbers=result.number[there],
@@ -220,16 +246,6 @@ def read_histories(
     )
 
 
-def _made(covariance: NodalCovariance, probes: ProbeSettings) -> list[Probe]:
-    """The probes, those of a kind numbered from 1."""
-    counts: dict[str, int] = {}
-    made = []
-    for kind, place in probes.places:
-        counts[kind] = counts.get(kind, 0) + 1
-        made.append(make_probe(covariance, kind, counts[kind], place, probes.measure))
-    return made
-
-
 def _read(
     result: Result,
     frames: npt.NDArray[np.int64],
@@ -238,7 +254,7 @@ def _read(
     rigid: str,
     clock: FloatArray,
 ) -> tuple[list[Nodal], list[History], FloatArray]:
-    """What each probe needs, the rigid motion where it is asked for, and the speed (T,) of the fast nodes."""
+    """Read the displacements that each probe needs, the rigid motion and the speed (T,) of the fast nodes."""
     kept: list[list[FloatArray]] = [[] for _ in probes]
     motions = np.full((len(frames), 3, 2), np.nan)
     speed, before = np.full(len(frames), np.nan), np.full((2, len(result.nodes)), np.nan)
@@ -256,37 +272,22 @@ def _read(
             own.append(field[:, probe.nodes])
     stacked = [np.stack(own, axis=1) for own in kept]
     nodal = [Nodal(u=part[0], v=part[1], u_std=part[2], v_std=part[3]) for part in stacked]
-    return nodal, _rigid(motions) if rigid != "none" else [], speed
-
-
-def _rigid(motions: FloatArray) -> list[History]:
-    """Histories of rigid motions (T, 3, 2): shift along x and y, rotation, each with its uncertainty."""
     motions[:, 2] = np.degrees(motions[:, 2])
-    names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"}
-    return [
+    names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid != "none" else {}
+    histories = [
         History(name=name, unit=unit, values=motions[:, place, 0], std=motions[:, place, 1])
         for place, (name, unit) in enumerate(names.items())
     ]
+    return nodal, histories, speed
 
 
-def _checked(probe: Probe, nodal: Nodal, result: Result) -> list[History]:
-    """What a probe reads; an `InputError` where that is nothing."""
-    histories = probe.histories(nodal)
-    if not any(np.isfinite(history.values).any() for history in histories):
-        raise InputError(
-            f"{probe.name} is measured in no frame of {result.path}: the nodes around it are not measured (node_status "
-            "says why); place it elsewhere"
-        )
-    return histories
-
-
-def _told(
+def _in_units(
     history: History, units: Units, clock: FloatArray, window: int, share: float, references: npt.NDArray[np.bool_]
-) -> Iterator[Told]:
-    """A history in the units of the reader, and its rates over a window of frames, at kinks those of both sides."""
+) -> Iterator[HistoryColumn]:
+    """Convert a history to the reader's units; add its rates over a window of frames, at kinks those of both sides."""
     length = history.unit == "px"
     unit = units.length if length else history.unit
-    yield _in_units(history.name, unit, history.values, history.std, units if length else None)
+    yield _column(history.name, unit, history.values, history.std, units if length else None)
     if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
@@ -296,17 +297,17 @@ def _told(
             values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")
             if side and not np.isfinite(values).any():
                 continue  # no kink
-            told = f"{history.name}_{name if length else 'rate'}{side}"
-            yield _in_units(told, units.per_time(unit, power), values, std, units if length else None)
+            title = f"{history.name}_{name if length else 'rate'}{side}"
+            yield _column(title, units.per_time(unit, power), values, std, units if length else None)
 
 
-def _in_units(name: str, unit: str, values: FloatArray, std: FloatArray, lengths: Units | None) -> Told:
+def _column(name: str, unit: str, values: FloatArray, std: FloatArray, lengths: Units | None) -> HistoryColumn:
     values, std = (values, std) if lengths is None else lengths.lengths(values, std)
-    return Told(name=name, unit=unit, values=values, std=std)
+    return HistoryColumn(name=name, unit=unit, values=values, std=std)
 
 
-def _channels(channels: Channels | None, times: FloatArray | None, offset: float) -> list[Told]:
-    """The channels at the times of the frames."""
+def _channels(channels: Channels | None, times: FloatArray | None, offset: float) -> list[HistoryColumn]:
+    """Interpolate the channels at the times of the frames."""
     if channels is None:
         return []
     if times is None:
@@ -314,18 +315,23 @@ def _channels(channels: Channels | None, times: FloatArray | None, offset: float
             f"the channels {channels.path} cannot be brought to the frames, whose times are not known: state "
             "frame_rate in [scale]"
         )
-    return [Told(name=name, unit="", values=values, std=None) for name, values in channels.at(times, offset).items()]
+    return [
+        HistoryColumn(name=name, unit="", values=values, std=None)
+        for name, values in channels.at(times, offset).items()
+    ]
 
 
-def _stress(channels: Channels | None, beside: list[Told], area: float | None, force: str | None) -> list[Told]:
-    """The stress, where a cross-section (square mm) is known."""
+def _stress(
+    channels: Channels | None, beside: list[HistoryColumn], area: float | None, force: str | None
+) -> list[HistoryColumn]:
+    """Compute the stress where a cross-section (square mm) is known."""
     if area is None:
         return []
     if channels is None or not area > 0:
         raise InputError(f"a stress needs channels with a force and an area above 0 mm², not {area:g}")
     name, newtons = channels.force(force)
-    values = next(told.values for told in beside if told.name == name)
-    return [Told(name="stress", unit="MPa", values=values * newtons / area, std=None)]
+    values = next(column.values for column in beside if column.name == name)
+    return [HistoryColumn(name="stress", unit="MPa", values=values * newtons / area, std=None)]
 
 
 def _remarks(
@@ -334,7 +340,7 @@ def _remarks(
     exposed: float | None,
     frames: npt.NDArray[np.int64],
     read: Mapping[str, list[History]],
-    beside: list[Told],
+    beside: list[HistoryColumn],
 ) -> Iterator[str]:
     if units.mm_per_pixel is None:
         yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"
@@ -349,11 +355,9 @@ def _remarks(
         )
     if any(history.name.endswith("_equivalent") for part in read.values() for history in part):
         yield f"equivalent: {EQUIVALENT}"
-    for name, missing in _gaps({name: part[0].values for name, part in read.items()}).items():
-        yield f"{name} is not measured in {missing} of {len(frames)} frames"
-    for name, missing in _gaps({told.name: told.values for told in beside}).items():
-        yield f"the channel {name} has no value in {missing} of {len(frames)} frames"
-
-
-def _gaps(values: Mapping[str, FloatArray]) -> dict[str, int]:
-    return {name: missing for name, part in values.items() if (missing := int(np.isnan(part).sum()))}
+    for name, part in read.items():
+        if missing := int(np.isnan(part[0].values).sum()):
+            yield f"{name} is not measured in {missing} of {len(frames)} frames"
+    for channel in beside:
+        if missing := int(np.isnan(channel.values).sum()):
+            yield f"the channel {channel.name} has no value in {missing} of {len(frames)} frames"

@@ -1,10 +1,8 @@
-"""Analog channels recorded beside a test, such as a force: a CSV file, brought to the times of the frames.
+"""A result as an engineer reads it: millimetres and seconds where they are known, finite strain over a stated gauge.
 
-A result as an engineer reads it: millimetres and seconds where they are known, finite strain over a stated gauge.
-
-What the files for other programs and the report hold is declared in the field table and here.
-
-In what units a result is told, and when its frames were taken: what its settings and the camera's files say.
+Scale, frame times and exposure come from the settings of the run and from the camera's files; analog channels recorded
+beside the test, such as a force, come from a CSV file. What the files for other programs and the report hold is
+declared in the field table and here.
 """
 
 from __future__ import annotations
@@ -17,20 +15,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import EQUIVALENT, MEASURES, NodalCovariance, Strain, StrainGauges, Units, strain_of_gradient
+from rgbmidic.fields import (
+    EQUIVALENT,
+    MEASURES,
+    NodalCovariance,
+    StrainGauges,
+    Units,
+    reference_fraction,
+    strain_of_gradient,
+)
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section, regular
 from rgbmidic.typing import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    from rgbmidic.fields.history import Units
 
 __all__ = [
     "Channels",
@@ -50,11 +53,93 @@ _TIME = re.compile(r"(?:time|t)(?:[\s_(\[]+(s|ms|us|µs)[)\]]?)?", re.IGNORECASE
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _NEWTONS = {"N": 1.0, "kN": 1e3}
 _UNIT = re.compile(r".*[\s_(\[](kN|N)[)\]]?")
+_DIFFERENT = 0.01
+"""Relative difference of a stated frame rate from that of the frames' time stamps above which a warning says so: stamps
+in whole microseconds give the median interval of 10,000 frames per second to 1 %."""
+
+
+def scale_of(result: Result) -> ScaleSettings:
+    """Return the ``[scale]`` that a result was measured with."""
+    return read_section(ScaleSettings, "scale", result.provenance.get("settings", {}).get("scale", {}))
+
+
+def probes_of(result: Result) -> ProbeSettings:
+    """Return the ``[probes]`` that a result was measured with."""
+    return read_section(ProbeSettings, "probes", result.provenance.get("settings", {}).get("probes", {}))
+
+
+def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
+    """Return the units of a result, with its own ``[scale]`` or another one in its place."""
+    scale = scale_of(result) if scale is None else scale
+    return Units.of(scale, timed=frame_times(result, scale) is not None)
+
+
+def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
+    """Find the time of each frame.
+
+    Time stamps count where the files have one of every frame, from the trigger where the camera reports it; else the
+    time is the number of the frame over `frame_rate`, that of ``[scale]`` before the camera's.
+
+    Parameters
+    ----------
+    result
+        The result; it is read for the numbers and time stamps.
+    scale
+        It replaces the ``[scale]`` that was kept with the result; None: that one.
+
+    Returns
+    -------
+    ndarray, shape (T,), or None
+        In seconds, NaN for frames that are not measured yet; None where no time is known.
+    """
+    scale = scale_of(result) if scale is None else scale
+    there = result.finished
+    stamps, numbers = result.time_ns[there], result.number[there]
+    if (stamps == UNKNOWN_TIME).any():
+        camera_rate = result.provenance.get("frame_rate")
+        rate = scale.frame_rate or camera_rate
+        seconds = numbers / rate if rate else None
+        if camera_rate:
+            _compare(camera_rate, scale.frame_rate, "the camera was set to %.6g: the former is taken")
+    else:
+        seconds = stamps * 1e-9
+        if len(seconds) > 1:
+            stamped_rate = float(np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)))
+            _compare(stamped_rate, scale.frame_rate, "the frames' own times %.6g: these are taken")
+    if seconds is None:
+        return None
+    times = np.full(len(result), np.nan)
+    times[there] = seconds
+    return times
+
+
+def _compare(recorded: float, stated: float | None, contradiction: str) -> None:
+    """Warn where a stated frame rate is not the recorded one."""
+    if stated and abs(recorded / stated - 1) > _DIFFERENT:
+        logger.warning(f"scale.frame_rate states %g frames per second, {contradiction}", stated, recorded)
+
+
+def exposure(result: Result) -> float | None:
+    """Return the exposure time of a frame in seconds; None where the files do not report it."""
+    nanoseconds = result.provenance.get("exposure_ns")
+    return None if nanoseconds is None else float(nanoseconds) * 1e-9
+
+
+def reference_frames(result: Result) -> BoolArray:
+    """Return a mask (T,) of the frames that belong to the reference."""
+    chosen = np.zeros(len(result), dtype=bool)
+    chosen[list(result.provenance["references"])] = True
+    return chosen
+
+
+def shared_part(result: Result) -> float:
+    """Return the fraction of a frame's variance that all frames have in common (see `reference_fraction`)."""
+    return reference_fraction(len(result.setting("frames", "reference", [0])))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Channels:
-    """What was recorded, each value at its time.
+    """Analog channels recorded beside a test: values at their times.
 
     Attributes
     ----------
@@ -74,7 +159,7 @@ class Channels:
     def read(cls, path: Path | str) -> Self:
         """Read a CSV file: a header line, then rows; the first column is ``time_s``, ``time_ms`` or ``time_us``.
 
-        Columns are parted by commas, semicolons (then a comma may be the decimal point) or tabs.
+        Columns are separated by commas, semicolons (then a comma may be the decimal point) or tabs.
 
         Raises
         ------
@@ -89,21 +174,21 @@ class Channels:
         except ValueError:
             raise InputError(f"the channels {path} are not a text file") from None
         lines = [line for line in lines if line.strip()]
-        parted = max(",;\t", key=(lines or [""])[0].count)
-        names = [name.strip() for name in next(csv.reader(lines[:1], delimiter=parted), [])]
+        separator = max(",;\t", key=(lines or [""])[0].count)
+        names = [name.strip() for name in next(csv.reader(lines[:1], delimiter=separator), [])]
         unit = _TIME.fullmatch(names[0]) if len(names) > 1 else None
         if unit is None:
             raise InputError(
                 f'the channels {path} need a header line: "time_s" (or time_ms, time_us) and the name of each channel'
             )
-        table = _numbers(path, lines[1:], parted, len(names))
+        table = _numbers(path, lines[1:], separator, len(names))
         times = table[:, 0] * _SECONDS[(unit[1] or "s").lower()]
         if len(times) < 2 or not (np.diff(times) > 0).all():
             raise InputError(f"the times of the channels {path} must rise from row to row, over two rows or more")
         return cls(path=path, times=times, values=dict(zip(names[1:], table[:, 1:].T, strict=True)))
 
     def at(self, times: FloatArray, offset: float = 0.0) -> dict[str, FloatArray]:
-        """Each channel at the times (T,) of the frames, linear between its values, NaN beyond them.
+        """Interpolate each channel linearly at the times (T,) of the frames; NaN beyond its values.
 
         Parameters
         ----------
@@ -117,16 +202,17 @@ class Channels:
         InputError
             No frame lies within the times of the channels.
         """
-        own = self.times + offset
-        if not ((times >= own[0]) & (times <= own[-1])).any():
+        recorded = self.times + offset
+        if not ((times >= recorded[0]) & (times <= recorded[-1])).any():
             raise InputError(
-                f"the channels {self.path} span {own[0]:.9g} to {own[-1]:.9g} s (offset {offset:g} s included), the "
-                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state the --offset between both clocks"
+                f"the channels {self.path} span {recorded[0]:.9g} to {recorded[-1]:.9g} s (offset {offset:g} s "
+                f"included), the frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state the --offset between "
+                "both clocks"
             )
-        return {name: np.interp(times, own, values, np.nan, np.nan) for name, values in self.values.items()}
+        return {name: np.interp(times, recorded, values, np.nan, np.nan) for name, values in self.values.items()}
 
     def force(self, name: str | None = None) -> tuple[str, float]:
-        """Name of the channel with a force, and newtons for one of its unit.
+        """Return the name of the channel with a force, and its unit in newtons.
 
         Parameters
         ----------
@@ -150,11 +236,11 @@ class Channels:
         return name, found[name]
 
 
-def _numbers(path: Path, lines: list[str], parted: str, count: int) -> FloatArray:
-    """Rows of numbers (n, count); an empty field is NaN."""
+def _numbers(path: Path, lines: list[str], separator: str, count: int) -> FloatArray:
+    """Read rows of numbers (n, count); an empty field is NaN."""
     rows = []
-    for number, row in enumerate(csv.reader(lines, delimiter=parted), 2):
-        fields = [part.strip().replace(",", ".") if parted == ";" else part.strip() for part in row]
+    for number, row in enumerate(csv.reader(lines, delimiter=separator), 2):
+        fields = [part.strip().replace(",", ".") if separator == ";" else part.strip() for part in row]
         try:
             rows.append([float(part) if part else math.nan for part in fields])
         except ValueError:
@@ -166,24 +252,24 @@ def _numbers(path: Path, lines: list[str], parted: str, count: int) -> FloatArra
 
 _NODE, _ELEMENT = ("node",), ("element",)
 _STRAIN = (
-    Quantity("exx", _NODE, "", "components.0", "strain in x"),
-    Quantity("eyy", _NODE, "", "components.1", "strain in y"),
-    Quantity("exy", _NODE, "", "components.2", "strain, tensor shear"),
-    Quantity("exx_std", _NODE, "", "components_std.0", "standard uncertainty of exx"),
-    Quantity("eyy_std", _NODE, "", "components_std.1", "standard uncertainty of eyy"),
-    Quantity("exy_std", _NODE, "", "components_std.2", "standard uncertainty of exy"),
-    Quantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane"),
-    Quantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane"),
-    Quantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y"),
-    Quantity("equivalent", _NODE, "", "equivalent", EQUIVALENT),
-    Quantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of equivalent"),
+    ResultQuantity("exx", _NODE, "", "components.0", "strain in x"),
+    ResultQuantity("eyy", _NODE, "", "components.1", "strain in y"),
+    ResultQuantity("exy", _NODE, "", "components.2", "strain, tensor shear"),
+    ResultQuantity("exx_std", _NODE, "", "components_std.0", "standard uncertainty of exx"),
+    ResultQuantity("eyy_std", _NODE, "", "components_std.1", "standard uncertainty of eyy"),
+    ResultQuantity("exy_std", _NODE, "", "components_std.2", "standard uncertainty of exy"),
+    ResultQuantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane"),
+    ResultQuantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane"),
+    ResultQuantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y"),
+    ResultQuantity("equivalent", _NODE, "", "equivalent", EQUIVALENT),
+    ResultQuantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of equivalent"),
 )
 _ELEMENT_STRAIN = tuple(
     replace(entry, name=f"{entry.name}_element", axes=_ELEMENT, meaning=f"{entry.meaning}, constant in an element")
     for entry in _STRAIN[:3]
 )
 _REPLACED = ("time_ns", *(entry.name for entry in _STRAIN))
-"""Quantities of the table in whose place others stand here: times in s, finite strain over a gauge."""
+"""Quantities of the table that others replace here: times in s, finite strain over a gauge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,7 +281,7 @@ class Physical:
     result
         The result.
     scale
-        Its ``[scale]``, or what stands in place of it.
+        Its ``[scale]``, or the one that replaces it.
     units
         Of lengths and times.
     times : ndarray, shape (T,)
@@ -212,7 +298,7 @@ class Physical:
 
     @classmethod
     def of(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
-        """With the scale and the times that the result knows, or with another ``[scale]`` in place of its own."""
+        """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
         scale = scale_of(result) if scale is None else scale
         times, units = frame_times(result, scale), units_of(result, scale)
         mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
@@ -222,7 +308,7 @@ class Physical:
 
     @classmethod
     def untimed(cls, result: Result, scale: ScaleSettings) -> Self:
-        """Without the times, which take a look at every frame: for who reads single frames, or a result that grows."""
+        """Leave out the times, for which every frame is read: for single frames, or a result that still grows."""
         mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
         times = np.arange(len(result), dtype=np.float64)
         return cls(result=result, scale=scale, units=Units.of(scale, timed=False), times=times, mesh=mesh)
@@ -239,129 +325,43 @@ class Physical:
 
     @property
     def measure_name(self) -> str:
-        """It with capitals, as people write it."""
+        """Name of the strain measure with capitals."""
         return self.measure.title()
 
     def in_units(self, length: float) -> str:
-        """A length, given in px, in words: in px, and in mm where the scale is known."""
+        """Write a length (px) as text: in px, and in mm where the scale is known."""
         scale = self.units.mm_per_pixel
         return f"{length:.4g} px" + ("" if scale is None else f" ({length * scale:.3g} mm)")
 
     @cached_property
-    def quantities(self) -> dict[str, Quantity]:
-        """What `frame` gives, by name: the stackable quantities of the table, and strain; lengths in `units`."""
+    def quantities(self) -> dict[str, ResultQuantity]:
+        """Entries of what `frame` returns: the stackable quantities of the table, and strain; lengths in `units`."""
         kept = [entry for entry in QUANTITIES.values() if entry.stackable and entry.name not in _REPLACED]
-        told = [replace(entry, unit=self.units.length) if entry.unit == "px" else entry for entry in kept]
-        return {entry.name: entry for entry in (*told, *_STRAIN, *_ELEMENT_STRAIN)}
+        converted = [replace(entry, unit=self.units.length) if entry.unit == "px" else entry for entry in kept]
+        return {entry.name: entry for entry in (*converted, *_STRAIN, *_ELEMENT_STRAIN)}
 
     def is_strain(self, name: str) -> bool:
-        """Whether a quantity depends on measure and gauge."""
+        """Report whether a quantity depends on strain measure and gauge."""
         return any(entry.name == name for entry in (*_STRAIN, *_ELEMENT_STRAIN))
 
     @property
     def length(self) -> float:
-        """What a length in px is multiplied by."""
+        """Factor from px to the unit of lengths."""
         return self.units.mm_per_pixel or 1.0
 
     def frame(self, index: int) -> dict[str, Any]:
-        """The `quantities` of one frame, each in its type; errors as `Result.frame`."""
+        """Return the `quantities` of one frame, each in its type; errors as `Result.frame`."""
         record = self.result.frame(index)
         values = {name: record.values[name] for name in self.quantities if name in record.values}
         for component in ("u", "v"):
             pair = self.units.lengths(record.values[component], record.values[f"{component}_std"])
             values |= zip((component, f"{component}_std"), pair, strict=True)
         values |= self.strain(record.u, record.v, record.u_std, record.v_std)
-        elements = self._element_strain(record)
-        values |= {entry.name: _part(elements, entry) for entry in _ELEMENT_STRAIN}
-        return values
+        gradient = self.mesh.element_gradient(np.stack([record.u, record.v], axis=1))
+        elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)))
+        return values | {entry.name: entry.of(elements) for entry in _ELEMENT_STRAIN}
 
     def strain(self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) -> dict[str, FloatArray]:
-        """The strain at the nodes by name, from the displacements (N,) of one frame in px."""
+        """Return the strain at the nodes by name, from the displacements (N,) of one frame in px."""
         strain = self.gauges.strain(u, v, u_std, v_std)
-        return {entry.name: _part(strain, entry) for entry in _STRAIN}
-
-    def _element_strain(self, record: FrameRecord) -> Strain:
-        """Strain of the linear field in each element, without its uncertainty."""
-        gradient = self.mesh.element_gradient(np.stack([record.u, record.v], axis=1))
-        return strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)))
-
-
-def _part(strain: Strain, entry: Quantity) -> FloatArray:
-    attribute, _, column = entry.source.partition(".")
-    values: FloatArray = getattr(strain, attribute)
-    return values[:, int(column)] if column else values
-
-
-_DIFFERENT = 0.01
-"""Share by which a stated rate may differ from that of the frames' stamps before it is told."""
-
-
-def scale_of(result: Result) -> ScaleSettings:
-    """The ``[scale]`` that a result was measured with."""
-    return read_section(ScaleSettings, "scale", result.provenance.get("settings", {}).get("scale", {}))
-
-
-def probes_of(result: Result) -> ProbeSettings:
-    """The ``[probes]`` that a result was measured with."""
-    return read_section(ProbeSettings, "probes", result.provenance.get("settings", {}).get("probes", {}))
-
-
-def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
-    """The units of a result, with its own ``[scale]`` or another one in its place."""
-    from rgbmidic.fields.history import Units
-
-    scale = scale_of(result) if scale is None else scale
-    return Units.of(scale, timed=frame_times(result, scale) is not None)
-
-
-def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
-    """Time (T,) of each frame in seconds, from the trigger where the camera tells it; None where nobody knows.
-
-    What the files tell of every frame, else the number of the frame over `frame_rate`, that of ``[scale]`` before the
-    camera's. NaN for frames that are not measured yet.
-    """
-    scale = scale_of(result) if scale is None else scale
-    there = result.finished
-    stamps, numbers = result.time_ns[there], result.number[there]
-    if (stamps == UNKNOWN_TIME).any():
-        own = result.provenance.get("frame_rate")
-        rate = scale.frame_rate or own
-        seconds = numbers / rate if rate else None
-        if own:
-            _compare(own, scale.frame_rate, "the camera was set to %.6g: the former is taken")
-    else:
-        seconds = stamps * 1e-9
-        if len(seconds) > 1:
-            own = float(np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)))
-            _compare(own, scale.frame_rate, "the frames' own times %.6g: these are taken")
-    if seconds is None:
-        return None
-    times = np.full(len(result), np.nan)
-    times[there] = seconds
-    return times
-
-
-def _compare(own: float, stated: float | None, told: str) -> None:
-    """Tell where a stated frame rate is not that of the files."""
-    if stated and abs(own / stated - 1) > _DIFFERENT:
-        logger.warning(f"scale.frame_rate states %g frames per second, {told}", stated, own)
-
-
-def exposure(result: Result) -> float | None:
-    """Time in seconds that each frame collects light; None where the files do not tell it."""
-    told = result.provenance.get("exposure_ns")
-    return None if told is None else float(told) * 1e-9
-
-
-def reference_frames(result: Result) -> BoolArray:
-    """Which frames (T,) belong to the reference."""
-    chosen = np.zeros(len(result), dtype=bool)
-    chosen[list(result.provenance["references"])] = True
-    return chosen
-
-
-def shared_part(result: Result) -> float:
-    """Share of every frame's variance that the reference puts into all alike (`rgbmidic.fields.nodal`)."""
-    from rgbmidic.fields.nodal import reference_fraction
-
-    return reference_fraction(len(result.setting("frames", "reference", [0])))
+        return {entry.name: entry.of(strain) for entry in _STRAIN}

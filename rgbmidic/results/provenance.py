@@ -1,4 +1,4 @@
-"""Where a result comes from: what all its frames share, kept so that a later run can tell whether it is the same."""
+"""Provenance of a result: what all its frames share, kept so that a later run can check that it is the same."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ PUT_BACK = "put back the file that was there, or delete it and go on with --resu
 _SEAL = "sha256"
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
 READING = ("scale", "probes", "setup")
-"""Sections of the settings that say how a result is read, and not what is measured."""
-_TOLD = 3
-"""Differences that an error names."""
+"""Sections of the settings that state how a result is read, and not what is measured."""
+_NAMED = 3
+"""Differences that an error names: more do not fit a line of a terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,9 +91,13 @@ class Origin:
         return {name: SHARED[name].convert(getattr(self, name), {}) for name in ("nodes", "elements")}
 
     def provenance(self) -> dict[str, Any]:
-        """What ``provenance.json`` says at the start, in plain values."""
+        """Return the content of ``provenance.json`` at the start of a run, in plain values."""
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION, "created": now()}
-        document["versions"] = {"rgbmidic": __version__, "python": platform.python_version(), **_package_versions()}
+        versions = {"rgbmidic": __version__, "python": platform.python_version()}
+        for name in _PACKAGES:
+            with suppress(importlib.metadata.PackageNotFoundError):
+                versions[name] = importlib.metadata.version(name)
+        document["versions"] = versions
         document["platform"] = platform.platform()
         if self.settings is not None:
             document |= {"settings": self.settings.to_mapping(), "base": str(self.settings.base)}
@@ -106,16 +110,8 @@ class Origin:
         return plain
 
 
-def _package_versions() -> dict[str, str]:
-    versions = {}
-    for name in _PACKAGES:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions
-
-
 def digest(content: Mapping[str, AnyArray] | list[str]) -> str:
-    """SHA-256 of arrays or of texts, in hexadecimal digits."""
+    """Return the SHA-256 of arrays or of texts in hexadecimal digits."""
     if isinstance(content, list):
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
     sums = hashlib.sha256()
@@ -135,15 +131,17 @@ def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> No
     before, after = dict(_compared(was)), dict(_compared(now))
     names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
     if names:
-        told = "; ".join(
-            f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:_TOLD]
+        differences = "; ".join(
+            f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:_NAMED]
         )
-        more = f"; and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
-        raise ResultError(f"{path} is of another test and is not gone on with: {told}{more}; give another folder")
+        more = f"; and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        raise ResultError(
+            f"{path} is of another test and is not gone on with: {differences}{more}; give another folder"
+        )
 
 
 def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """What decides on the bits of a result, by names for people."""
+    """Yield what decides on the bits of a result, each under a name for messages."""
     for section, keys in document.get("settings", {}).items():
         if section in READING:
             continue
@@ -163,12 +161,12 @@ def _short(value: Any) -> str:
 
 
 def fingerprint(document: Mapping[str, Any]) -> bytes:
-    """Digest of 16 bytes of what `check_same` compares: every record of a run has it in its header."""
+    """Return the digest (16 bytes) of what `check_same` compares: every record of a run has it in its header."""
     return hashlib.sha256(_canonical(dict(_compared(document)))).digest()[:16]
 
 
 def sealed(document: Mapping[str, Any]) -> dict[str, Any]:
-    """A provenance with the checksum of all it says, as it is written."""
+    """Add the checksum of the content to a provenance, as it is written."""
     return {**document, _SEAL: hashlib.sha256(_canonical(document)).hexdigest()}
 
 
@@ -177,7 +175,7 @@ def _canonical(document: Mapping[str, Any]) -> bytes:
 
 
 def is_result(path: Path) -> bool:
-    """Whether a folder has the provenance of a result, of whatever version and state.
+    """Report whether a folder has the provenance of a result, of whatever version and state.
 
     Raises
     ------
@@ -198,12 +196,12 @@ def _document(path: Path) -> dict[str, Any] | None:
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
-    """The provenance of the result in a folder: lights, settings, fingerprints, versions, dates.
+    """Read the provenance of the result in a folder: lights, settings, fingerprints, versions, dates.
 
     Raises
     ------
     ResultError
-        The folder is no result, of another schema version, or what the file says was changed.
+        The folder is no result, has another schema version, or the file was changed.
     """
     document = _document(path)
     if document is None:
@@ -224,5 +222,5 @@ def read_provenance(path: Path) -> dict[str, Any]:
 
 
 def now() -> str:
-    """Date and time of this moment."""
+    """Return the present date and time."""
     return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,6 +1,6 @@
-"""The quantities of a result, each declared once: record, store, exports, figures and documents read this table.
+"""The field table of a result: every quantity declared once, and the record of one frame.
 
-What is kept of one frame.
+Record, store, exports, figures and documents read this table.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
 
-__all__ = ["QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "Quantity"]
+__all__ = ["QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "ResultQuantity"]
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
-    """What is kept under one name, of every frame or of all together.
+class ResultQuantity:
+    """An entry of the field table: what is kept under one name, of every frame or of all together.
 
     Attributes
     ----------
@@ -35,9 +35,10 @@ class Quantity:
     unit
         Empty where there is none.
     source
-        Attribute of a `Solution` it comes from, a column of it behind a dot; empty where the main job gives it.
+        Attribute of the object that it comes from, such as a `Solution`, a column of it behind a dot; empty where the
+        main job provides it.
     meaning
-        What docs/conventions.md says of it.
+        Its description in docs/conventions.md.
     dtype
         Type of the array, in memory and on disk: what is known to no more than some digits has single precision.
     blank
@@ -57,7 +58,7 @@ class Quantity:
     codes: tuple[str, ...] = ()
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
-        """Shape in one frame of a result with these sizes of ``"node"`` and ``"light"``; None for an open axis."""
+        """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis."""
         return tuple(axis if isinstance(axis, int) else sizes.get(axis) for axis in self.axes)
 
     @property
@@ -66,7 +67,7 @@ class Quantity:
         return None not in self.shape({"node": 0, "light": 0}) and self.dtype is not np.str_
 
     def convert(self, value: Any, sizes: Mapping[str, int]) -> Any:
-        """`value` in the type of the table; an `InputError` where it has another shape."""
+        """Return `value` in the type of the table; an `InputError` where it has another shape."""
         array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
         fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
         if not fits:
@@ -74,18 +75,18 @@ class Quantity:
         return array if self.axes else array.item()
 
     def unmeasured(self, sizes: Mapping[str, int]) -> Any:
-        """What a frame holds that could not be measured; open axes have no entry."""
+        """Return the value of a frame that could not be measured; open axes have the length 0."""
         return np.full([size or 0 for size in self.shape(sizes)], self.blank, dtype=self.dtype)
 
-    def of(self, solution: Solution) -> Any:
-        """This quantity of a solved frame."""
+    def of(self, source: object) -> Any:
+        """Take the quantity from an object with the attribute that `source` names."""
         attribute, _, column = self.source.partition(".")
-        value = getattr(solution, attribute)
+        value = getattr(source, attribute)
         return value[:, int(column)] if column else value
 
 
 UNKNOWN_TIME = np.iinfo(np.int64).min
-"""`time_ns` of a frame whose time nobody knows."""
+"""`time_ns` of a frame whose time is not known."""
 
 _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
@@ -98,17 +99,17 @@ _RESIDUAL = (
     "weighted rms of `f - g(x + u)`, in the unit of the images that are correlated: none if these are divided by their "
     "local mean (the default), else DN"
 )
-_WEIGHT = "mean share of each light in the weights; adds up to the part of the region that any light sees"
+_WEIGHT = "mean fraction of each light in the weights; adds up to the part of the region that any light sees"
 _BRIGHTNESS = (
     "gain and offset (DN) of each light against the reference, from the speckle's contrast and mean, medians over the "
-    "elements; told, not used"
+    "elements; reported, not used"
 )
 _MATCH = (
     "median correlation coefficient of the elements with their reference, of the light that matches best; NaN unless "
     "`frames.update_reference` looks at it"
 )
 _BEST = "largest `match` of the frames compared with the same reference, up to this one"
-_RENEWALS = (
+_UPDATES = (
     "places in the result of the frames that became the reference in turn, up to this one: it was itself compared with "
     "the last before it, or with the test's reference"
 )
@@ -118,25 +119,29 @@ _RIGID = (
 )
 _UNREAD = "1 where the frame failed because it could not be read, which `--resume` tries again, else 0"
 _TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
-_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not tell it"
+_REFLECTION = (
+    "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not report it"
+)
 _SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
-    Quantity(
+    ResultQuantity(
         "number", (), "", "", "number of the frame: a frame that is missing leaves a gap", dtype=np.int64, blank=-1
     ),
-    Quantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
-    Quantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
-    Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
-    Quantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
-    Quantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
-    Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
-    Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
-    Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
-    Quantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
-    Quantity(
+    ResultQuantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
+    ResultQuantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
+    ResultQuantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
+    ResultQuantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
+    ResultQuantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
+    ResultQuantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
+    ResultQuantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
+    ResultQuantity(
+        "inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT
+    ),
+    ResultQuantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
+    ResultQuantity(
         "u",
         _NODE,
         "px",
@@ -144,47 +149,49 @@ _TABLE = (
         "displacement in x against the reference, at the node (not the best linear fit's nodal value)",
         **_EXACT,
     ),
-    Quantity("v", _NODE, "px", "displacement.1", "displacement in y against the reference, at the node", **_EXACT),
-    Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
-    Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
-    Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
-    Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
-    Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
-    Quantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx"),
-    Quantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy"),
-    Quantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
-    Quantity("match", (), "", "", _MATCH),
-    Quantity("best_match", (), "", "", _BEST, blank=0),
-    Quantity("reference_updates", ("reference_update",), "", "", _RENEWALS, dtype=np.int64, blank=0),
-    Quantity("misfit", _NODE, "", "misfit", _MISFIT),
-    Quantity(
+    ResultQuantity(
+        "v", _NODE, "px", "displacement.1", "displacement in y against the reference, at the node", **_EXACT
+    ),
+    ResultQuantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
+    ResultQuantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
+    ResultQuantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
+    ResultQuantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
+    ResultQuantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
+    ResultQuantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx"),
+    ResultQuantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy"),
+    ResultQuantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
+    ResultQuantity("match", (), "", "", _MATCH),
+    ResultQuantity("best_match", (), "", "", _BEST, blank=0),
+    ResultQuantity("reference_updates", ("reference_update",), "", "", _UPDATES, dtype=np.int64, blank=0),
+    ResultQuantity("misfit", _NODE, "", "misfit", _MISFIT),
+    ResultQuantity(
         "light_fraction",
         ("node", "light"),
         "",
         "light_fraction",
-        "share of each light in what determines a node",
+        "fraction of each light in what determines a node",
         blank=0,
     ),
-    Quantity("residual", _LIGHT, "", "residual", _RESIDUAL),
-    Quantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
-    Quantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
-    Quantity("rigid", ("light", "function"), "", "rigid", _RIGID),
-    Quantity("seconds", (len(STAGES),), "s", "", _SECONDS),
-    Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
-    Quantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
+    ResultQuantity("residual", _LIGHT, "", "residual", _RESIDUAL),
+    ResultQuantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
+    ResultQuantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
+    ResultQuantity("rigid", ("light", "function"), "", "rigid", _RIGID),
+    ResultQuantity("seconds", (len(STAGES),), "s", "", _SECONDS),
+    ResultQuantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
+    ResultQuantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
 )
 
-QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
+QUANTITIES: dict[str, ResultQuantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
 
 _CORNERS = "node indices; `(p1 - p0) x (p2 - p0) > 0` in (x, y)"
 _REFERENCE = "reference image of each light, stretched to 8 bit, for pictures"
-SHARED: dict[str, Quantity] = {
-    "nodes": Quantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
-    "elements": Quantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
-    "reference": Quantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
+SHARED: dict[str, ResultQuantity] = {
+    "nodes": ResultQuantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
+    "elements": ResultQuantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
+    "reference": ResultQuantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
 }
-"""What all frames share."""
+"""What all frames have in common."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -208,6 +215,7 @@ class FrameRecord:
     sizes: Mapping[str, int]
 
     def __post_init__(self) -> None:
+        """Check names and shapes, and take over the types of the table."""
         if odd := self.values.keys() ^ QUANTITIES.keys():
             raise InputError(f"a frame record holds {', '.join(QUANTITIES)}; missing or unknown: {', '.join(odd)}")
         values = {name: entry.convert(self.values[name], self.sizes) for name, entry in QUANTITIES.items()}
@@ -215,7 +223,15 @@ class FrameRecord:
 
     @classmethod
     def of(cls, *, nodes: int, lights: int, **values: Any) -> FrameRecord:
-        """The record of the quantities given (None: not known); the others hold what an unmeasured frame does."""
+        """Make a record of some quantities; the others have the value of a frame that could not be measured.
+
+        Parameters
+        ----------
+        nodes, lights
+            Their numbers N and k.
+        **values
+            Quantities by name; None where not known.
+        """
         sizes = {"node": nodes, "light": lights}
         blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
         given = {name: value for name, value in values.items() if value is not None}
@@ -223,15 +239,15 @@ class FrameRecord:
 
     @classmethod
     def from_solution(cls, solution: Solution, *, inputs: Mapping[str, str] | None = None, **given: Any) -> FrameRecord:
-        """The record of a solved frame.
+        """Make the record of a solved frame.
 
         Parameters
         ----------
         solution
-            Gives the quantities that have a `Quantity.source`.
+            Provides the quantities that have a `ResultQuantity.source`.
         inputs
             Path and SHA-256 of the files that the frame was read from.
-        given
+        **given
             The others, such as `number`, `time_ns`, `brightness` and `weights_thumbnail`; None where not known.
         """
         nodes, lights = np.shape(solution.light_fraction)
@@ -242,10 +258,11 @@ class FrameRecord:
     def failed(
         cls, reason: str, *, nodes: int, lights: int, inputs: Mapping[str, str] | None = None, **given: Any
     ) -> FrameRecord:
-        """The record of a frame that could not be measured at all: NaN everywhere, and the reason."""
+        """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason."""
         return cls.of(nodes=nodes, lights=lights, reason=reason, inputs=_pairs(inputs), **given)
 
     def __getattr__(self, name: str) -> Any:
+        """Return a quantity of the table."""
         if name in QUANTITIES:
             return self.values[name]
         raise AttributeError(f"a frame record has no quantity {name!r}")

@@ -7,17 +7,23 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.command import optional
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results.provenance import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.results.shards import FrameTable
 from rgbmidic.results.store import check_complete, listed, load_frames, read_mesh, read_names, read_reference
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from rgbmidic.settings import ScaleSettings
 
 __all__ = ["Result"]
 
@@ -26,12 +32,22 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Result:
-    """The reading side of a result folder, as far as it has come when it is opened.
+    """The result of a test: what a laboratory post-processes.
 
-    Every quantity of `rgbmidic.results.QUANTITIES` whose shape is the same in all frames is an attribute with the
-    frames as first axis, such as ``result.u`` of shape (T, N): read when it is first asked for, then kept, so that it
-    takes its T x N numbers of memory. `each` gives any quantity one frame after the other and keeps nothing, `frame`
-    everything of one frame. A frame that is not measured yet is blank, with that as its reason.
+    `Result.open` opens a result folder as far as it has come; nothing but the mesh and the table of the frames is read
+    then. The quantities are those of `rgbmidic.results.QUANTITIES` (table in ``docs/conventions.md``), and there are
+    four ways to read them:
+
+    - ``result.u``, ``result.misfit`` and so on: one quantity of all T frames as an array with the frames as first
+      axis, such as (T, N) for N nodes. It is read when it is first used and then kept in memory. Only quantities whose
+      shape is the same in all frames are attributes.
+    - `each`: any quantity one frame after the other, for results larger than the memory.
+    - `frame`: everything of one frame, a `FrameRecord`.
+    - `to_xarray`: all of it with named dimensions, coordinates and units, read frame by frame when it is used.
+
+    Displacements are in px on the reference image (x to the right, y down), at the nodes; NaN where a node has no data.
+    Millimetres, seconds, finite strain and rates follow from them: `rgbmidic.results.histories.read_histories` for
+    probes, `rgbmidic.fields` for arrays. A frame that is not measured yet is blank, with that as its reason.
 
     Attributes
     ----------
@@ -49,6 +65,13 @@ class Result:
         The lights' names.
     provenance
         Settings, versions and dates, as in ``provenance.json``.
+
+    Examples
+    --------
+    >>> result = Result.open("my_result")  # doctest: +SKIP
+    >>> converged = result.status == 0  # doctest: +SKIP
+    >>> result.u[converged].shape  # doctest: +SKIP
+    (50, 1200)
     """
 
     path: Path
@@ -94,7 +117,7 @@ class Result:
         return cls(path=path, table=table, **mesh, names=names, lights=lights, provenance=provenance)
 
     def refresh(self) -> Self:
-        """The result as it is now, with the frames that were added since.
+        """Open the result again, with the frames that were added since.
 
         Raises
         ------
@@ -110,12 +133,12 @@ class Result:
         return replace(self, table=table, provenance=provenance)
 
     def __len__(self) -> int:
-        """Number of frames T."""
+        """Return the number of frames T."""
         return len(self.names)
 
     @property
     def finished(self) -> BoolArray:
-        """Which frames are measured, failed ones included, shape (T,)."""
+        """Mask of the frames that are measured, failed ones included, shape (T,)."""
         return self.table.finished
 
     @cached_property
@@ -125,11 +148,11 @@ class Result:
         return tuple(index for index in range(len(self)) if index not in references)
 
     def setting(self, section: str, key: str, default: Any = None) -> Any:
-        """A setting of the run, as TEST.toml names it; `default` where it was not kept."""
+        """Return a setting of the run, as TEST.toml names it; `default` where it was not kept."""
         return self.provenance.get("settings", {}).get(section, {}).get(key, default)
 
     def frame(self, index: int) -> FrameRecord:
-        """Everything that is kept of one frame.
+        """Read everything that is kept of one frame.
 
         Raises
         ------
@@ -141,25 +164,60 @@ class Result:
         return self.table.read(index)
 
     def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
-        """One quantity, frame after frame (None: all): an array, or a plain number or text."""
+        """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts."""
         chosen = range(len(self)) if frames is None else frames
         return (values[name] for values in self.table.each([name], chosen))
 
     def stack(self, name: str) -> AnyArray:
-        """One quantity of all frames, the frames as first axis; takes the memory of all of them."""
+        """Read one quantity of all frames into one array, the frames as first axis."""
         one = QUANTITIES[name].unmeasured(self.table.layout.sizes)
         stacked = np.empty((len(self), *one.shape), dtype=one.dtype)
         for index, value in enumerate(self.each(name)):
             stacked[index] = value
         return stacked
 
+    def to_xarray(self, scale: ScaleSettings | None = None) -> xr.Dataset:
+        """Return the result with named dimensions, coordinates and units; values are read frame by frame when used.
+
+        Parameters
+        ----------
+        scale
+            It replaces the ``[scale]`` that was kept with the result; None: that one.
+
+        Returns
+        -------
+        xarray.Dataset
+            Dimensions: `frame` (T), `node` (N), `light` (k), `element` (E), `corner` (3), `component` (exx, eyy, exy)
+            and, of single variables, `brightness_part` and `stage`.
+            Coordinates: `x`, `y` of the nodes in px and, where the scale is known, `x_mm`, `y_mm`; `number`, `name`
+            and, where it is known, `time` (s) of the frames; names of lights and components.
+            Variables: every quantity of `QUANTITIES` that has one shape in all frames, in its unit there (displacements
+            in px), such as `u` (frame, node), `light_fraction` (frame, node, light) and `status` (frame); the six
+            components of the small strain and its uncertainty as `strain` and `strain_std` (frame, node, component);
+            `elements` (element, corner). Each has the attributes ``units`` and ``long_name``, a status
+            ``flag_values`` and ``flag_meanings``.
+            Attributes: ``settings``, ``calibration`` and ``versions`` as JSON texts, ``references``, dates, and
+            ``mm_per_pixel`` with its uncertainty where the scale is known.
+
+        Raises
+        ------
+        InputError
+            The package xarray is not installed (extra ``xarray``).
+        ResultError
+            A frame is damaged; raised when a value of it is read.
+        """
+        dataset: xr.Dataset = optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
+        return dataset
+
     def __getattr__(self, name: str) -> AnyArray:
+        """Read a stackable quantity of the table, and keep it."""
         if name not in QUANTITIES or not QUANTITIES[name].stackable:
             raise AttributeError(f"a result has no attribute {name!r}")
         stacked = self.__dict__[name] = self.stack(name)
         return stacked
 
     def __dir__(self) -> list[str]:
+        """List the attributes, quantities included."""
         return [*super().__dir__(), *(name for name, quantity in QUANTITIES.items() if quantity.stackable)]
 
     @property
@@ -185,13 +243,11 @@ class Result:
     @cached_property
     def mean_light_fraction(self) -> FloatArray:
         """Mean of `light_fraction` over the measured nodes, shape (T, k); NaN where none is measured."""
-        shares = np.full((len(self), len(self.lights)), np.nan)
-        for row, values in zip(
-            shares, self.table.each(["light_fraction", "node_status"], range(len(self))), strict=True
-        ):
+        fractions = np.full((len(self), len(self.lights)), np.nan)
+        for row, values in enumerate(self.table.each(["light_fraction", "node_status"], range(len(self)))):
             if (measured := values["node_status"] == 0).any():
-                row[:] = values["light_fraction"][measured].mean(axis=0, dtype=np.float64)
-        return shares
+                fractions[row] = values["light_fraction"][measured].mean(axis=0, dtype=np.float64)
+        return fractions
 
     @cached_property
     def reference(self) -> npt.NDArray[np.uint8] | None:
@@ -209,8 +265,8 @@ class Result:
 
     @property
     def frame_shape(self) -> tuple[int, int] | None:
-        """Rows and columns of the frames; None where neither the provenance nor a reference image tells them."""
-        noted = self.provenance.get("frame_shape")
-        if noted is None and self.reference is not None:
-            noted = self.reference.shape[1:]
-        return noted and (noted[0], noted[1])
+        """Rows and columns of the frames; None where neither the provenance nor a reference image has them."""
+        shape = self.provenance.get("frame_shape")
+        if shape is None and self.reference is not None:
+            shape = self.reference.shape[1:]
+        return shape and (shape[0], shape[1])

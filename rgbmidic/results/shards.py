@@ -1,16 +1,14 @@
-"""The frames of a result on disk: files that only ever grow, and the table of what they hold.
+"""The frames of a result on disk: files that only ever grow, the records in them, and the table of what they hold.
 
-``000007.frames`` holds records one after the other, each behind a header of 40 bytes that says of which run and which
-frame it is and how long it is: a frame counts once its record is whole. Readers go from header to header; where one is
-damaged they look for the next one of the same run. A process that is killed leaves at most the beginning of a record;
-readers pass over it, and nobody appends to a file of another writer. A frame that is written twice counts as it is in
-the file with the higher number, there as it was written last; one that is taken back has `_NO_FRAME` in its header.
+``000007.frames`` holds records one after the other, each behind a header of 40 bytes with the run, the frame and the
+length of the record: a frame counts once its record is whole. Readers go from header to header; where one is damaged
+they look for the next one of the same run. A process that is killed leaves at most the beginning of a record; readers
+pass over it, and nobody appends to a file of another writer. A frame that is written twice counts as it is in the file
+with the higher number, there as it was written last; one that is discarded has `_NO_FRAME` in its header.
 
-One frame's record as bytes: a head with the checksum of every quantity, then the quantities themselves.
-
-The head holds, as unsigned 32-bit numbers, the CRC-32 of each quantity and, of each quantity that is not stackable, its
-shape and its size in bytes. What has one shape in all frames follows raw, the smallest first; then what has not: texts
-as JSON, pictures packed by zlib, other arrays raw. All numbers are little-endian.
+A record begins with a head of unsigned 32-bit numbers: the CRC-32 of each quantity and, of each quantity that is not
+stackable, its shape and its size in bytes. The quantities of one shape in all frames follow raw, the smallest first;
+then the others: texts as JSON, pictures packed by zlib, other arrays raw. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import accumulate, takewhile
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -36,7 +34,7 @@ import numpy.typing as npt
 from rgbmidic.errors import ResultError
 from rgbmidic.results.files import writing
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
-from rgbmidic.results.quantities import QUANTITIES, FrameRecord, Quantity
+from rgbmidic.results.quantities import QUANTITIES, FrameRecord, ResultQuantity
 from rgbmidic.typing import BoolArray
 
 __all__ = ["FrameTable", "RecordLayout", "ShardWriter", "discard", "shard_files"]
@@ -46,18 +44,170 @@ _SHARD_FRAMES = 500
 _BUFFER = 2**16
 """Bytes that the system is asked for at once: a call takes some us, as long as copying these. Small records come by the
 dozen, large ones pass by the buffer."""
+_AHEAD = 1024
+"""Bytes read where single quantities are asked for: the head (some 250 bytes) and the plain numbers lie in them."""
+_FAST = 1
+"""zlib's quickest level."""
+_RATIO = 1032
+"""How many times its size packed content can have at most (zlib's technical details, "Maximum Compression Factor")."""
 _NAME = re.compile(r"([0-9]{6,})\.(frames|index)")
 """Index files were written by earlier versions, and go with their result."""
 _HEADER = struct.Struct("<16sQQII")
 """Digest of the run, frame, bytes of the record, CRC-32 of the record's head, CRC-32 of these 36 bytes."""
 _CHECKED = _HEADER.size - 4
 _NO_FRAME = 2**63 - 1
+_NUMBER_SIZE = 4
+"""Bytes of a number of the head."""
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
 
 
+class _Fixed(NamedTuple):
+    """Where a quantity lies that has one shape in all frames: first byte, size, checksum in the head, type, shape."""
+
+    first: int
+    size: int
+    check: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+
+
+class _Open(NamedTuple):
+    """Places in the head of the numbers of another quantity: its checksum, its shape, its size in bytes."""
+
+    check: int
+    shape: range
+    size: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordLayout:
+    """Where each quantity of a record lies.
+
+    Attributes
+    ----------
+    sizes
+        Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
+    head
+        Bytes of the head.
+    fixed, open
+        The quantities in the order in which they lie: those of one shape in all frames, then the others.
+    length
+        Bytes of head and fixed quantities.
+    """
+
+    sizes: Mapping[str, int]
+    head: int
+    fixed: Mapping[str, _Fixed]
+    open: Mapping[str, _Open]
+    length: int
+
+    @classmethod
+    def of(cls, sizes: Mapping[str, int]) -> RecordLayout:
+        """Lay out records with these sizes of ``"node"`` and ``"light"``."""
+        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items() if entry.stackable}
+        fixed, count, open_ = sorted(blank, key=lambda name: blank[name].nbytes), len(QUANTITIES), {}
+        for check, name in enumerate((name for name in QUANTITIES if name not in blank), start=len(fixed)):
+            axes = len(QUANTITIES[name].axes)
+            open_[name] = _Open(check, range(count, count + axes), count + axes)
+            count += axes + 1
+        head = count * _NUMBER_SIZE
+        sums = accumulate((blank[name].nbytes for name in fixed), initial=head)
+        places = {
+            name: _Fixed(first, blank[name].nbytes, check, _stored(QUANTITIES[name]), blank[name].shape)
+            for check, (name, first) in enumerate(zip(fixed, sums, strict=False))
+        }
+        length = head + sum(one.size for one in places.values())
+        return cls(sizes=dict(sizes), head=head, fixed=places, open=open_, length=length)
+
+    def encode(self, values: Mapping[str, Any]) -> tuple[bytes, int]:
+        """Return the bytes of a record with these quantities, and the CRC-32 of its head."""
+        parts = [np.asarray(values[name], dtype=one.dtype).tobytes() for name, one in self.fixed.items()]
+        packed = {name: _packed(QUANTITIES[name], values[name]) for name in self.open}
+        parts += packed.values()
+        numbers = [zlib.crc32(part) for part in parts]
+        for name, part in packed.items():
+            numbers += [*np.shape(values[name]), len(part)]
+        head = struct.pack(f"<{len(numbers)}I", *numbers)
+        return b"".join([head, *parts]), zlib.crc32(head)
+
+    def decode(
+        self, file: BinaryIO, start: int, length: int, check: int, names: Iterable[str] | None = None
+    ) -> dict[str, Any]:
+        """Read the record at `start` of a file and verify every checksum.
+
+        Parameters
+        ----------
+        file
+            Open for reading.
+        start, length
+            First byte and number of bytes of the record.
+        check
+            CRC-32 of its head.
+        names
+            Quantities to read; None: all.
+
+        Returns
+        -------
+        dict
+            Each quantity by its name, in the shape and type of the table.
+
+        Raises
+        ------
+        ResultError
+            The record is damaged, or has other sizes.
+        """
+        file.seek(start)
+        block = file.read(length if names is None or length < _AHEAD else _AHEAD)
+        if length < self.length or zlib.crc32(block[: self.head]) != check:
+            raise ResultError("its head is damaged, or of another mesh or other lights")
+        numbers = struct.unpack_from(f"<{self.head // _NUMBER_SIZE}I", block)
+        ends = accumulate((numbers[entry.size] for entry in self.open.values()), initial=self.length)
+        firsts = dict(zip(self.open, ends, strict=False))
+        values = {}
+        for name in (*self.fixed, *self.open) if names is None else names:
+            quantity, fixed = QUANTITIES[name], self.fixed.get(name)
+            first, size = (fixed.first, fixed.size) if fixed else (firsts[name], numbers[self.open[name].size])
+            part = block[first : first + size]
+            if first + size > len(block):
+                file.seek(start + first)
+                part = file.read(min(size, length))
+            if zlib.crc32(part) != numbers[(fixed or self.open[name]).check]:
+                raise ResultError(f"the checksum of {name} is wrong")
+            if fixed is None:
+                shape = [numbers[place] for place in self.open[name].shape]
+                values[name] = quantity.convert(_unpacked(quantity, part, shape), self.sizes)
+            else:
+                array = np.frombuffer(part, dtype=fixed.dtype)
+                values[name] = array.reshape(fixed.shape).astype(quantity.dtype) if fixed.shape else array.item()
+        return values
+
+
+def _stored(entry: ResultQuantity) -> np.dtype[Any]:
+    return np.dtype(entry.dtype).newbyteorder("<")
+
+
+def _packed(entry: ResultQuantity, value: Any) -> bytes:
+    if entry.dtype is np.str_:
+        return json.dumps(np.asarray(value).tolist()).encode("ascii")
+    raw = np.asarray(value, dtype=_stored(entry)).tobytes()
+    return zlib.compress(raw, _FAST) if entry.dtype is np.uint8 else raw
+
+
+def _unpacked(entry: ResultQuantity, part: bytes, shape: Sequence[int]) -> Any:
+    """Undo `_packed`; a head that promises more than there is is an error before memory is taken for it."""
+    if entry.dtype is np.str_:
+        return np.array(json.loads(part), dtype=np.str_).reshape(shape)
+    promised = math.prod(shape) * _stored(entry).itemsize
+    if entry.dtype is np.uint8:
+        part = zlib.decompressobj().decompress(part, min(promised, _RATIO * len(part)) + 1)
+    if len(part) != promised:
+        raise ResultError(f"the head promises {promised} bytes of {entry.name}, there are {len(part)}")
+    return np.frombuffer(part, dtype=_stored(entry)).reshape(shape).astype(entry.dtype)
+
+
 def shard_files(folder: Path) -> list[Path]:
-    """The files of this kind in a folder, in their order."""
+    """List the files of records in a folder, in the order of their numbers."""
     with suppress(FileNotFoundError):
         return sorted((file for file in folder.iterdir() if _NAME.fullmatch(file.name)), key=_number)
     return []
@@ -97,11 +247,21 @@ class ShardWriter:
             The disk is full or refuses.
         """
         content, head = self.layout.encode(record.values)
+        content = _header(self.run, frame, len(content), head) + content
         if self._count == _SHARD_FRAMES:
             self.close()
-        file = self._open()
-        content = _header(self.run, frame, len(content), head) + content
-        _write_at(file, self._end, content)
+        if self._file is None:
+            self._file = _new_file(self.folder)
+        try:
+            with writing(self._file.name):
+                self._file.seek(self._end)
+                rest = memoryview(content)
+                while rest:
+                    rest = rest[self._file.write(rest) :]
+        except BaseException:  # nothing of it stays where the disk refuses
+            with suppress(OSError):
+                self._file.truncate(self._end)
+            raise
         self._count, self._end = self._count + 1, self._end + len(content)
 
     def close(self) -> None:
@@ -118,30 +278,14 @@ class ShardWriter:
             with writing(file.name), file:
                 os.fsync(file.fileno())
 
-    def _open(self) -> BinaryIO:
-        """The file that is written; a new one, of a number that nobody has, where none is open."""
-        if self._file is None:
-            used = [_number(file) for file in shard_files(self.folder)]
-            for number in itertools.count(max(used, default=-1) + 1):
-                with writing(self.folder), suppress(FileExistsError):
-                    self._file = (self.folder / f"{number:06d}.frames").open("xb", buffering=0)
-                    break
-        assert self._file is not None
-        return self._file
 
-
-def _write_at(file: BinaryIO, start: int, content: bytes) -> None:
-    """Write all of it at a place; nothing of it stays where the disk refuses."""
-    try:
-        with writing(file.name):
-            file.seek(start)
-            rest = memoryview(content)
-            while rest:
-                rest = rest[file.write(rest) :]
-    except BaseException:
-        with suppress(OSError):
-            file.truncate(start)
-        raise
+def _new_file(folder: Path) -> BinaryIO:
+    """Open a file of a number that nobody has."""
+    used = [_number(file) for file in shard_files(folder)]
+    for number in itertools.count(max(used, default=-1) + 1):
+        with writing(folder), suppress(FileExistsError):
+            return (folder / f"{number:06d}.frames").open("xb", buffering=0)
+    raise AssertionError("numbers do not end")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -175,7 +319,18 @@ class FrameTable:
 
     @classmethod
     def load(cls, folder: Path, layout: RecordLayout, count: int, run: bytes) -> FrameTable:
-        """The table of a result of `count` frames, of the run with this digest; what is damaged is passed over.
+        """Read the headers of all records; what is damaged is passed over.
+
+        Parameters
+        ----------
+        folder
+            Where the files are.
+        layout
+            Of the records.
+        count
+            Number of frames T of the result.
+        run : bytes, length 16
+            Digest of the run.
 
         Raises
         ------
@@ -202,7 +357,7 @@ class FrameTable:
         return np.asarray(self.shard >= 0)
 
     def without_damaged(self, *, ended: bool) -> FrameTable:
-        """The table without the frames whose records are damaged; reads every record once.
+        """Read every record once and return the table without the damaged ones.
 
         Parameters
         ----------
@@ -218,7 +373,7 @@ class FrameTable:
         return replace(self, shard=np.where(damaged, -1, self.shard), damaged=damaged)
 
     def read(self, frame: int) -> FrameRecord:
-        """All of one frame; a blank record with the reason where it is not measured yet.
+        """Read all of one frame; a frame that is not measured yet gives a blank record with that as its reason.
 
         Raises
         ------
@@ -228,7 +383,25 @@ class FrameTable:
         return FrameRecord(values=next(self.each(None, [frame])), sizes=self.layout.sizes)
 
     def each(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
-        """The named quantities (None: all) of one frame after the other; errors as `read`."""
+        """Read some quantities of one frame after the other.
+
+        Parameters
+        ----------
+        names
+            The quantities; None: all.
+        frames
+            Their indices, in any order.
+
+        Yields
+        ------
+        dict
+            The quantities of a frame by name.
+
+        Raises
+        ------
+        ResultError
+            A record is damaged; the message names file and frame.
+        """
         chosen = np.fromiter(frames, dtype=np.int64)
         columns = (column[chosen].tolist() for column in (self.shard, self.start, self.length, self.head))
         opened, file = -1, None
@@ -237,7 +410,10 @@ class FrameTable:
             for frame, shard, start, length, head in zip(chosen.tolist(), *columns, strict=True):
                 if shard < 0:
                     lost = bool(self.damaged[frame])
-                    blanks[lost] = blanks.get(lost) or self._blank(names, _DAMAGED if lost else _NOT_YET)
+                    if lost not in blanks:
+                        reason, sizes = _DAMAGED if lost else _NOT_YET, self.layout.sizes
+                        blank = FrameRecord.failed(reason, nodes=sizes["node"], lights=sizes["light"]).values
+                        blanks[lost] = {name: blank[name] for name in (blank if names is None else names)}
                     yield dict(blanks[lost])
                     continue
                 if shard != opened:
@@ -253,11 +429,6 @@ class FrameTable:
         finally:
             if file is not None:
                 file.close()
-
-    def _blank(self, names: Sequence[str] | None, reason: str) -> dict[str, Any]:
-        sizes = self.layout.sizes
-        values = FrameRecord.failed(reason, nodes=sizes["node"], lights=sizes["light"]).values
-        return {name: values[name] for name in (values if names is None else names)}
 
 
 def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], bool]:
@@ -295,7 +466,7 @@ def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], b
 
 
 def _parsed(header: bytes, file: Path, run: bytes) -> tuple[int, int, int] | None:
-    """Frame, length and checksum of the head that a header tells; None where it is damaged."""
+    """Frame, length and checksum of the head that a header states; None where it is damaged."""
     if len(header) < _HEADER.size:
         return None
     owner, frame, length, head, check = _HEADER.unpack(header)
@@ -312,7 +483,7 @@ def _header(run: bytes, frame: int, length: int, head: int) -> bytes:
 
 
 def discard(folder: Path, run: bytes, frames: Collection[int]) -> None:
-    """Take back all records of some frames, so that nothing can bring them back; no other run may write meanwhile.
+    """Discard all records of some frames for good; no other run may write meanwhile.
 
     Raises
     ------
@@ -327,155 +498,3 @@ def discard(folder: Path, run: bytes, frames: Collection[int]) -> None:
                 opened.write(_header(run, _NO_FRAME, length, head))
             opened.flush()
             os.fsync(opened.fileno())
-
-
-_AHEAD = 1024
-"""Bytes read where one quantity is asked for: head and plain numbers lie in them."""
-_FAST = 1
-"""zlib's quickest level."""
-
-_NUMBER = struct.Struct("<I")
-_RATIO = 1032
-"""How many times its size packed content can have at most (zlib's technical details, "Maximum Compression Factor")."""
-
-
-class _Fixed(NamedTuple):
-    """Where a quantity lies that has one shape in all frames: first byte, size, checksum in the head, type, shape."""
-
-    first: int
-    size: int
-    check: int
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-
-
-class _Open(NamedTuple):
-    """Where the head tells of another quantity: its checksum, its shape, its size in bytes."""
-
-    check: int
-    shape: range
-    size: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordLayout:
-    """Where each quantity of a record lies.
-
-    Attributes
-    ----------
-    sizes
-        Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
-    head
-        Bytes of the head.
-    fixed, open
-        The quantities in the order in which they lie: those of one shape in all frames, then the others.
-    length
-        Bytes of head and fixed quantities.
-    """
-
-    sizes: Mapping[str, int]
-    head: int
-    fixed: Mapping[str, _Fixed]
-    open: Mapping[str, _Open]
-    length: int
-
-    @classmethod
-    def of(cls, sizes: Mapping[str, int]) -> RecordLayout:
-        """The layout of records with these sizes."""
-        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items() if entry.stackable}
-        fixed, count, open_ = sorted(blank, key=lambda name: blank[name].nbytes), len(QUANTITIES), {}
-        for check, name in enumerate((name for name in QUANTITIES if name not in blank), start=len(fixed)):
-            axes = len(QUANTITIES[name].axes)
-            open_[name] = _Open(check, range(count, count + axes), count + axes)
-            count += axes + 1
-        head = count * _NUMBER.size
-        sums = accumulate((blank[name].nbytes for name in fixed), initial=head)
-        places = {
-            name: _Fixed(first, blank[name].nbytes, check, _stored(QUANTITIES[name]), blank[name].shape)
-            for check, (name, first) in enumerate(zip(fixed, sums, strict=False))
-        }
-        length = head + sum(one.size for one in places.values())
-        return cls(sizes=dict(sizes), head=head, fixed=places, open=open_, length=length)
-
-    def encode(self, values: Mapping[str, Any]) -> tuple[bytes, int]:
-        """A record's bytes, and the checksum of its head."""
-        parts = [np.asarray(values[name], dtype=one.dtype).tobytes() for name, one in self.fixed.items()]
-        packed = {name: _packed(QUANTITIES[name], values[name]) for name in self.open}
-        parts += packed.values()
-        numbers = [zlib.crc32(part) for part in parts]
-        for name, part in packed.items():
-            numbers += [*np.shape(values[name]), len(part)]
-        head = struct.pack(f"<{len(numbers)}I", *numbers)
-        return b"".join([head, *parts]), zlib.crc32(head)
-
-    def decode(
-        self, file: BinaryIO, start: int, length: int, check: int, names: Iterable[str] | None = None
-    ) -> dict[str, Any]:
-        """The named quantities (None: all) of the record at `start` of a file, every checksum verified.
-
-        Raises
-        ------
-        ResultError
-            The record is damaged, or has other sizes.
-        """
-        file.seek(start)
-        block = file.read(length if names is None or length < _AHEAD else _AHEAD)
-        if length < self.length or zlib.crc32(block[: self.head]) != check:
-            raise ResultError("its head is damaged, or of another mesh or other lights")
-        values = {}
-        for name in (*self.fixed, *self.open) if names is None else names:
-            first, size = self._place(name, block)
-            if first + size <= len(block):
-                part = block[first : first + size]
-            else:
-                file.seek(start + first)
-                part = file.read(min(size, length))
-            values[name] = self._value(name, block, part)
-        return values
-
-    def _place(self, name: str, head: bytes) -> tuple[int, int]:
-        """First byte and size of a quantity."""
-        if name in self.fixed:
-            return self.fixed[name][:2]
-        before = takewhile(lambda other: other != name, self.open)
-        first = self.length + sum(_layout_number(head, self.open[other].size) for other in before)
-        return first, _layout_number(head, self.open[name].size)
-
-    def _value(self, name: str, head: bytes, part: bytes) -> Any:
-        fixed = self.fixed.get(name)
-        if zlib.crc32(part) != _layout_number(head, (fixed or self.open[name]).check):
-            raise ResultError(f"the checksum of {name} is wrong")
-        entry = QUANTITIES[name]
-        if fixed is None:
-            shape = [_layout_number(head, place) for place in self.open[name].shape]
-            return entry.convert(_unpacked(entry, part, shape), self.sizes)
-        array = np.frombuffer(part, dtype=fixed.dtype)
-        return array.reshape(fixed.shape).astype(entry.dtype) if fixed.shape else array.item()
-
-
-def _layout_number(head: bytes, place: int) -> int:
-    number: int = _NUMBER.unpack_from(head, _NUMBER.size * place)[0]
-    return number
-
-
-def _stored(entry: Quantity) -> np.dtype[Any]:
-    return np.dtype(entry.dtype).newbyteorder("<")
-
-
-def _packed(entry: Quantity, value: Any) -> bytes:
-    if entry.dtype is np.str_:
-        return json.dumps(np.asarray(value).tolist()).encode("ascii")
-    raw = np.asarray(value, dtype=_stored(entry)).tobytes()
-    return zlib.compress(raw, _FAST) if entry.dtype is np.uint8 else raw
-
-
-def _unpacked(entry: Quantity, part: bytes, shape: Sequence[int]) -> Any:
-    """What `_packed` packed; what a head promises beyond that is an error before it is memory."""
-    if entry.dtype is np.str_:
-        return np.array(json.loads(part), dtype=np.str_).reshape(shape)
-    promised = math.prod(shape) * _stored(entry).itemsize
-    if entry.dtype is np.uint8:
-        part = zlib.decompressobj().decompress(part, min(promised, _RATIO * len(part)) + 1)
-    if len(part) != promised:
-        raise ResultError(f"the head promises {promised} bytes of {entry.name}, there are {len(part)}")
-    return np.frombuffer(part, dtype=_stored(entry)).reshape(shape).astype(entry.dtype)

@@ -56,7 +56,7 @@ __all__ = [
 
 _NAMES, _MESH, _REFERENCE, _FRAMES = "frames.json", "mesh.npz", "reference.npz", "solution"
 _LISTED = 5
-"""Frames that a message names."""
+"""Frames that a message names: more do not fit a line of a terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,9 +105,9 @@ class ResultStore:
 
     @classmethod
     def resume(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
-        """Go on with a result: `finished` tells what is there already.
+        """Go on with a result: `finished` reports which frames are there already.
 
-        How it is read (``[scale]``, ``[setup]``, ``[probes]``) is from now on as `origin` says.
+        How it is read (``[scale]``, ``[setup]``, ``[probes]``) is from now on as `origin` states.
 
         Parameters
         ----------
@@ -134,15 +134,15 @@ class ResultStore:
 
     @classmethod
     def join(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
-        """Start a result where there is none, else go on with it: for several runs of parts, in any order or at once.
+        """Start a result where there is none, else go on with it: for runs of parts of a test, in any order or at once.
 
-        Parameters and errors as `resume`; foreign files as `create`.
+        Parameters and errors are those of `resume`; foreign files are refused as in `create`.
         """
         return cls._claimed(Path(path), origin, range(len(origin.names)) if frames is None else frames)
 
     @classmethod
     def _claimed(cls, path: Path, origin: Origin, frames: range, *, overwrite: bool | None = None) -> Self:
-        """The store with its claim and its beginning; None: whatever is there stays."""
+        """Claim the frames and start the folder; `overwrite` None: whatever is there stays."""
         count, sizes = len(origin.names), {"node": len(origin.mesh["nodes"]), "light": len(origin.lights)}
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
@@ -155,13 +155,15 @@ class ResultStore:
             return cls(path=path, frame_count=count, sizes=sizes, _claim=claim, _writer=writer)
 
     def __enter__(self) -> Self:
+        """Return the store."""
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Release the store."""
         self.release()
 
     def release(self) -> None:
-        """Close what was written and let other runs write these frames."""
+        """Close the file that is written and remove the claim, so that other runs can write these frames."""
         try:
             self._writer.close()
         finally:
@@ -186,17 +188,17 @@ class ResultStore:
         self._writer.append(index, record)
 
     def discard(self, frames: Collection[int]) -> None:
-        """Take frames back, which are to be measured again; a `ResultError` where the disk refuses."""
+        """Discard frames that are to be measured again; a `ResultError` where the disk refuses."""
         if frames:
             self.reopen()
             discard(self.path / _FRAMES, self._writer.run, frames)
 
     def finished(self) -> BoolArray:
-        """Which frames of the test are in the folder, whoever wrote them, shape (T,)."""
+        """Read which frames of the test are in the folder, whoever wrote them, shape (T,)."""
         return self.table().finished
 
     def table(self) -> FrameTable:
-        """What is in the folder now, whoever wrote it; reads it."""
+        """Read the table of the frames that are in the folder now, whoever wrote them."""
         return load_frames(self.path, self.sizes, self.frame_count, self._writer.run)
 
     def reopen(self) -> None:
@@ -206,7 +208,7 @@ class ResultStore:
             write_json(self.path / PROVENANCE, sealed(provenance))
 
     def finish(self) -> None:
-        """`release` and `finish_result`: when every frame is written."""
+        """Release the store and call `finish_result`, when every frame is written."""
         self.release()
         finish_result(self.path)
 
@@ -245,31 +247,31 @@ def check_complete(path: Path, names: tuple[str, ...], table: FrameTable, *, end
     missing = np.flatnonzero(~table.finished).tolist()
     if not missing:
         return
-    told = listed(missing, names)
+    frames = listed(missing, names)
     if ended or table.gaps or table.damaged.any():
         where = f" ({', '.join(file.name for file in table.gaps)})" if table.gaps else ""
         raise ResultError(
-            f"{path} is damaged{where}: of {len(names)} frames are lost {told}; `rgbmidic run TEST.toml --out {path} "
+            f"{path} is damaged{where}: of {len(names)} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
             "--resume` measures them again, --partial (partial=True) reads the rest"
         )
     raise ResultError(
-        f"{path} is incomplete: of {len(names)} frames are missing {told}; was the run interrupted, or does it go on?"
+        f"{path} is incomplete: of {len(names)} frames are missing {frames}; was the run interrupted, or does it go on?"
     )
 
 
 def listed(frames: Sequence[int], names: Sequence[str]) -> str:
-    """The first frames of a list with their names, and how many more there are."""
+    """List the first of some frames with their names, and how many more there are."""
     more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
     return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:_LISTED]) + more
 
 
 def load_frames(path: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
-    """What is in the folder of a result of `count` frames now, of the run with this digest."""
+    """Read the table of the frames that a result of `count` frames holds now; `run` is the digest of the run."""
     return FrameTable.load(path / _FRAMES, RecordLayout.of(sizes), count, run)
 
 
 def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
-    """The frames' names; a `ResultError` where they are not those of the provenance."""
+    """Read the frames' names; a `ResultError` where they are not those of the provenance."""
     try:
         names = read_json(path / _NAMES)
     except FileNotFoundError:
@@ -281,7 +283,7 @@ def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
-    """``nodes`` (N, 2) and ``elements`` (E, 3); a `ResultError` where they are not those of the provenance."""
+    """Read ``nodes`` (N, 2) and ``elements`` (E, 3); a `ResultError` where they are not those of the provenance."""
     mesh = _read(path / _MESH, ["nodes", "elements"], {})
     if digest(mesh) != provenance["mesh"]:
         raise ResultError(f"{path / _MESH} is damaged or of another result")
@@ -289,7 +291,7 @@ def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
 
 
 def read_reference(path: Path, sizes: Mapping[str, int], run: bytes) -> npt.NDArray[np.uint8] | None:
-    """Reference image of each light as a picture, shape (k, H, W); None where none was kept.
+    """Read the reference image of each light as a picture, shape (k, H, W); None where none was kept.
 
     Raises
     ------
@@ -314,7 +316,7 @@ def _read(path: Path, names: Iterable[str], sizes: Mapping[str, int]) -> dict[st
 
 
 def _pictures(images: FloatImage) -> npt.NDArray[np.uint8]:
-    """Images in 8 bit, each stretched between its own extreme percent; 0 where unknown."""
+    """Stretch each image to 8 bit between its percentiles 1 and 99; 0 where unknown."""
     known = np.isfinite(images).any(axis=(1, 2), keepdims=True)
     low, high = np.nanpercentile(np.where(known, images, 0), [1, 99], axis=(1, 2), keepdims=True)
     scaled = 255 * (images - low) / np.maximum(high - low, 1e-6)
@@ -337,9 +339,9 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
 
 
 def _start(path: Path, origin: Origin) -> bytes:
-    """Let the folder hold what all frames share, anew where it is missing or damaged; refuse one of another origin.
+    """Write what all frames share where it is missing or damaged; refuse a folder of another origin.
 
-    Gives the digest of the run, of the provenance that is there: it may write the same number in another way.
+    Returns the digest of the run from the provenance that is there, which may write the same number in another way.
     """
     foreign = [file for name in (_MESH, _REFERENCE, _NAMES) if (file := path / name).exists()]
     foreign += shard_files(path / _FRAMES)

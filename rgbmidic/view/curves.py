@@ -33,7 +33,7 @@ from bokeh.plotting import figure
 
 from rgbmidic.errors import ResultError
 from rgbmidic.report.style import time_unit
-from rgbmidic.results import Histories, Result, Told, probes_of
+from rgbmidic.results import Histories, HistoryColumn, Result, probes_of
 from rgbmidic.results.histories import history_csv, read_histories
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import FloatArray
@@ -62,9 +62,9 @@ def read(result: Result, marks: Sequence[Mark], gauge: float) -> Histories | Non
     return read_histories(result, made) if made.places else None
 
 
-def groups(histories: Histories) -> dict[str, list[Told]]:
+def groups(histories: Histories) -> dict[str, list[HistoryColumn]]:
     """What can be shown together: the same quantity of all probes, by its name and unit."""
-    found: dict[str, list[Told]] = {}
+    found: dict[str, list[HistoryColumn]] = {}
     for told in histories.quantities:
         if told.name.endswith(("_before", "_after")):  # single frames, no curve
             continue
@@ -82,7 +82,7 @@ def over(histories: Histories) -> tuple[FloatArray, str]:
     return factor * histories.times, f"time ({unit})"
 
 
-def band(x: FloatArray, told: Told) -> tuple[list[FloatArray], list[FloatArray]]:
+def band(x: FloatArray, told: HistoryColumn) -> tuple[list[FloatArray], list[FloatArray]]:
     """Outlines of two standard uncertainties on both sides, one for each stretch of frames without a gap."""
     if told.std is None:
         return [], []

@@ -1,0 +1,133 @@
+"""A result as an xarray Dataset, whose variables read the frames that are asked for, and no others.
+
+Attributes follow the CF conventions: ``units`` ("1" where there is none), ``long_name``, and for a status
+``flag_values`` and ``flag_meanings``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from xarray.backends import BackendArray
+from xarray.core import indexing
+
+from rgbmidic._version import __version__
+from rgbmidic.results.physical import frame_times, scale_of
+from rgbmidic.results.quantities import QUANTITIES, SHARED, ResultQuantity
+from rgbmidic.results.result import Result
+from rgbmidic.settings import ScaleSettings
+from rgbmidic.timing import STAGES
+
+__all__ = ["to_dataset"]
+
+_COMPONENTS = ("exx", "eyy", "exy")
+"""Quantities of the field table that are the components of one variable, `strain`; likewise of their uncertainties."""
+_PARTS = {"brightness": ("brightness_part", ("gain", "offset")), "seconds": ("stage", tuple(STAGES))}
+"""Dimension and coordinate of the axes that have a number in the field table in place of a name."""
+
+
+class _Frames(BackendArray):
+    """Quantities of the field table over all frames, stacked along a last axis where there are several.
+
+    Parameters
+    ----------
+    result
+        It is read when the array is indexed.
+    names
+        Of one shape and type.
+    """
+
+    def __init__(self, result: Result, names: tuple[str, ...]) -> None:
+        self.result, self.names = result, names
+        blank = QUANTITIES[names[0]].unmeasured(result.table.layout.sizes)
+        self.dtype = blank.dtype
+        self.shape = (len(result), *blank.shape, *([len(names)] if len(names) > 1 else []))
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
+
+    def _read(self, key: tuple[Any, ...]) -> Any:
+        """The part at an outer key (a whole number, a slice or an array for each axis)."""
+        frames = np.arange(len(self.result))[key[0]]
+        inner = list(enumerate(key[1:]))[::-1]  # from the last axis: a whole number drops its axis
+
+        def part(values: Mapping[str, Any]) -> Any:
+            array = np.stack([values[name] for name in self.names], axis=-1).reshape(self.shape[1:])
+            for axis, index in inner:
+                array = array[(slice(None),) * axis + (index,)]
+            return array
+
+        blank = QUANTITIES[self.names[0]].unmeasured(self.result.table.layout.sizes)
+        read = np.empty((frames.size, *part(dict.fromkeys(self.names, blank)).shape), dtype=self.dtype)
+        for row, values in enumerate(self.result.table.each(self.names, frames.reshape(-1).tolist())):
+            read[row] = part(values)
+        return read.reshape((*frames.shape, *read.shape[1:]))
+
+
+def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset:
+    """The Dataset that `Result.to_xarray` documents."""
+    scale = scale_of(result) if scale is None else scale
+    variables: dict[str, xr.Variable] = {}
+    for name, entry in QUANTITIES.items():
+        dimension = _PARTS[name][0] if name in _PARTS else ""
+        if not entry.stackable or name.removesuffix("_std") in _COMPONENTS or name == "number":
+            continue
+        axes = ("frame", *(axis if isinstance(axis, str) else dimension for axis in entry.axes))
+        variables[name] = _lazy(result, axes, (name,), _attributes(entry))
+    for end, meaning in {"": "small strain", "_std": "standard uncertainty of strain"}.items():
+        names = tuple(f"{name}{end}" for name in _COMPONENTS)
+        about = {"units": "1", "long_name": meaning}
+        if not end:
+            about["description"] = "; ".join(f"{name}: {QUANTITIES[name].meaning}" for name in names)
+        variables[f"strain{end}"] = _lazy(result, ("frame", "node", "component"), names, about)
+    variables["elements"] = xr.Variable(("element", "corner"), result.elements, _attributes(SHARED["elements"]))
+    return xr.Dataset(variables, _coordinates(result, scale), _provenance(result, scale))
+
+
+def _lazy(result: Result, axes: tuple[str, ...], names: tuple[str, ...], about: dict[str, Any]) -> xr.Variable:
+    return xr.Variable(axes, indexing.LazilyIndexedArray(_Frames(result, names)), about)
+
+
+def _attributes(entry: ResultQuantity) -> dict[str, Any]:
+    about: dict[str, Any] = {"units": entry.unit or "1", "long_name": entry.meaning}
+    if entry.codes:
+        about["flag_values"] = np.arange(len(entry.codes), dtype=entry.dtype)
+        about["flag_meanings"] = " ".join(code.replace(" ", "_") for code in entry.codes)
+    return about
+
+
+def _coordinates(result: Result, scale: ScaleSettings) -> dict[str, xr.Variable]:
+    """Places in px and, where the scale is known, in mm; numbers, names and, where they are known, times of frames."""
+    own = {"to the right": result.nodes[:, 0], "down": result.nodes[:, 1]}
+    factors = {"px": 1.0} | ({} if scale.mm_per_pixel is None else {"mm": scale.mm_per_pixel})
+    coordinates = {
+        "frame": xr.Variable("frame", np.arange(len(result)), {"long_name": "place of the frame in the result"}),
+        "number": xr.Variable("frame", result.number, _attributes(QUANTITIES["number"])),
+        "name": xr.Variable("frame", list(result.names), {"long_name": "name of the frame"}),
+        "light": xr.Variable("light", list(result.lights), {"long_name": "name of the light"}),
+        "component": xr.Variable("component", list(_COMPONENTS), {"long_name": "component of the strain tensor"}),
+    }
+    coordinates |= {dimension: xr.Variable(dimension, list(parts)) for dimension, parts in _PARTS.values()}
+    for unit, factor in factors.items():
+        for axis, (way, values) in zip("xy", own.items(), strict=True):
+            about = {"units": unit, "long_name": f"position of the node on the reference image, {way}"}
+            coordinates[axis if unit == "px" else f"{axis}_{unit}"] = xr.Variable("node", factor * values, about)
+    if (times := frame_times(result, scale)) is not None:
+        about = {"units": "s", "long_name": "time of the frame from the trigger"}
+        coordinates["time"] = xr.Variable("frame", times, about)
+    return coordinates
+
+
+def _provenance(result: Result, scale: ScaleSettings) -> dict[str, Any]:
+    """What a reader of the Dataset, or of a file that it is saved in, should know; plain numbers and texts."""
+    kept, places = result.provenance, {"references": list(result.provenance["references"])}
+    facts = {name: kept[name] for name in ("created", "finished", "frame_rate", "exposure_ns") if kept.get(name)}
+    if scale.mm_per_pixel is not None:
+        facts |= {"mm_per_pixel": scale.mm_per_pixel, "mm_per_pixel_std": scale.mm_per_pixel_std}
+    texts = {name: json.dumps(kept[name]) for name in ("settings", "calibration", "versions") if name in kept}
+    about = {"title": f"result {result.path.name}", "source": f"rgbmidic {__version__}"}
+    return {**about, **facts, **places, **texts}
