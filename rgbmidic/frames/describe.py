@@ -94,7 +94,7 @@ def describe(settings: FrameSettings) -> Description:
     """
     series = _opened(settings)
     source, recording = series.lights[0][0], series.recording
-    stored = source.told(0)
+    stored = source.stored(0)
     frame, *_ = series.read(0)
     cfa = getattr(frame, "cfa", None)
     numbered = recording.times_ns is not None or recording.numbers is not None or len(series.lights[0]) > 1
@@ -143,7 +143,7 @@ def _opened(settings: FrameSettings) -> FrameSeries:
     """The frames; those of a mosaic whose pattern nobody tells are read as they are, one grey level at every pixel."""
     series = open_series(settings)
     if settings.kind is None and settings.cfa is None:
-        stored = series.lights[0][0].told(0)
+        stored = series.lights[0][0].stored(0)
         if stored.kind is None and stored.values.ndim == 2:
             return open_series(replace(settings, kind="monochrome"))
     return series

@@ -397,25 +397,30 @@ def cut_short(path: Path, *, whole: int, count: int) -> FrameError:
     return FrameError(f"{path}: the file ends {where}: truncated or still being written")
 
 
-def unpack_bits(data: bytes, bits: int) -> AnyArray:
-    """Samples of 9 to 15 bits that follow one another without a gap, the highest bit of each first.
+def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
+    """Unpack samples of 9 to 15 bits that follow one another without a gap, the highest bit of each first.
 
     Parameters
     ----------
-    data
-        A whole number of groups of samples that end with a byte: 5 bytes hold 4 samples of 10 bits, 3 two of 12.
+    packed : bytes, or ndarray, shape (..., B), uint8
+        Bytes; every line of an array begins with a sample of its own.
     bits
         Bits of a sample, an even number.
 
     Returns
     -------
-    ndarray, shape (8 len(data) / bits,), uint16
+    ndarray, shape (..., N), uint16
+        Groups of samples that end with a byte: 5 bytes hold 4 samples of 10 bits, 3 two of 12. A line that ends within
+        a group is filled up with zeros.
     """
+    lines = np.frombuffer(packed, dtype=np.uint8) if isinstance(packed, bytes) else packed
     group = math.lcm(bits, 8)
-    packed = np.frombuffer(data, dtype=np.uint8).reshape(-1, group // 8)
-    values = np.empty((len(packed), group // bits), dtype=np.uint16)
+    if missing := -lines.shape[-1] % (group // 8):
+        lines = np.pad(lines, [*[(0, 0)] * (lines.ndim - 1), (0, missing)])
+    groups = lines.reshape(*lines.shape[:-1], -1, group // 8)
+    values = np.empty((*groups.shape[:-1], group // bits), dtype=np.uint16)
     for sample in range(group // bits):
         byte, begin = divmod(sample * bits, 8)
-        both = packed[:, byte].astype(np.uint16) << 8 | packed[:, byte + 1]
-        values[:, sample] = both >> (16 - bits - begin) & (2**bits - 1)
-    return values.ravel()
+        both = groups[..., byte].astype(np.uint16) << 8 | groups[..., byte + 1]
+        values[..., sample] = both >> (16 - bits - begin) & (2**bits - 1)
+    return values.reshape(*lines.shape[:-1], -1)

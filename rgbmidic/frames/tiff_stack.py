@@ -54,14 +54,8 @@ _UNITS = {
 class TiffStack(Movie):
     """A TIFF file of several frames of one size, in the order of the file."""
 
-    def _recording(self) -> Recording:
-        return _stack(self.path).recording
-
-    def _shape(self) -> tuple[int, int]:
-        return _stack(self.path).shape
-
-    def _stored(self, index: int) -> StoredFrame:
-        return self._rows(index, range(self._shape()[0]))
+    def _header(self) -> _Stack:
+        return _stack(self.path)
 
     def _rows(self, index: int, rows: range) -> StoredFrame:
         stack = _stack(self.path)
