@@ -112,7 +112,7 @@ class FrameSeries:
         return tuple(source.read(inner, window) for source, inner in self._locate(index))
 
     def gone(self) -> str:
-        """Name the lights of which no file exists any more: first file and number of files; empty where there is none."""
+        """Name the lights of which no file exists any more, by first file and number of files; else empty."""
         exists = os.path.exists  # which raises nothing, whatever the disk says
         lost = [sources for sources in self.lights if not any(exists(source.path) for source in sources)]
         return "; ".join(f"{sources[0].path} and all {len(sources)} files of its series" for sources in lost)
@@ -122,7 +122,7 @@ class FrameSeries:
         return " + ".join(source.name(inner) for source, inner in self._locate(index))
 
     def time_ns(self, index: int) -> int | None:
-        """Return when state `index` was taken (the first light's frame), in ns from the trigger; None where not stated."""
+        """Return when state `index` was taken (the first light's frame), in ns from the trigger; None: not stated."""
         source, inner = next(self._locate(index))
         times = source.recording.times_ns
         return None if times is None else int(times[inner])
