@@ -59,9 +59,7 @@ def separate(
         Unknown method, a frame too small for it, or a crosstalk matrix that is not for three camera channels.
     """
     method = _chosen(method, mosaic)
-    if crosstalk.matrix.shape[0] != 3:
-        rows = crosstalk.matrix.shape[0]
-        raise InputError(f"a Bayer mosaic has 3 camera channels; the crosstalk matrix has {rows} rows")
+    _check_channels(crosstalk)
     if method != DEFAULT_METHOD:
         return unmix(_BY_CHANNEL[method](mosaic), crosstalk)
     demosaicer = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)
@@ -91,6 +89,13 @@ def _chosen(method: str, mosaic: LinearMosaic) -> str:
     if method not in DEMOSAICERS:
         raise InputError(f"unknown demosaicing method {method!r}; allowed are auto, {', '.join(DEMOSAICERS)}")
     return method
+
+
+def _check_channels(crosstalk: Crosstalk) -> None:
+    if crosstalk.matrix.shape[0] != 3:
+        raise InputError(
+            f"a Bayer mosaic has 3 camera channels; the crosstalk matrix has {crosstalk.matrix.shape[0]} rows"
+        )
 
 
 def _reflection(model: Reconstruction, crosstalk: Crosstalk) -> FloatArray:
