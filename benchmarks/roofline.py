@@ -71,15 +71,15 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     coefficients = np.empty((size + 2 * PAD,) * 2, np.float32)
     moments: FloatArray = np.empty((elements, 6))
     compared = values, motion, difference, weight, moments
-    channels, known = random.uniform(0, 200, (3, count)).astype(np.float32), np.ones((3, count), dtype=bool)
+    channels, known = random.uniform(0, 200, (3, size, size)).astype(np.float32), np.ones((3, size, size), dtype=bool)
     lights, lit = np.empty_like(channels), np.empty_like(known)
-    matrix, needed = np.eye(3, dtype=np.float32) + np.float32(0.1), np.eye(3, dtype=bool)
+    grid, needed = np.tile(np.eye(3, dtype=np.float32) + np.float32(0.1), (2, 2, 1, 1)), np.eye(3, dtype=bool)
     return [
         ("right-hand side", owned, 20, lambda: reference.right_side(deformed, 0, values, weights, motion)),
         ("comparison", owned, 20, lambda: reference.warp(deformed, 0, *compared)),
         ("Hessian", owned, 20, lambda: reference.hessian_blocks(0, weights)),
         ("spline coefficients", count, 16, lambda: bspline_coefficients(image[0], coefficients)),
-        ("unmixing, 3 lights", count, 30, lambda: unmix(channels, known, matrix, needed, lights, lit)),
+        ("unmixing, 3 lights", count, 30, lambda: unmix(channels, known, grid, size, needed, lights, lit)),
     ]
 
 

@@ -216,7 +216,7 @@ def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
 def _camera(files: CaptureFiles, uneven: Sequence[float]) -> dict[str, Any]:
     """Camera settings of a calibration, from the first of its frames, and how even the grey levels of lit ones are;
     levels that nobody stated or tells stay open."""
-    told, frame = files.series.lights[0][0].told(0), next(files.frames())
+    told, frame = files.series.lights[0][0].stored(0), next(files.frames())
     levels = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
     said = {name for name in levels for source in (told, files.stated) if getattr(source, name) is not None}
     kind = "bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome"

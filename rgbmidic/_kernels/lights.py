@@ -1,14 +1,8 @@
-"""Compiled loop that turns camera channels into lights, pixel by pixel.
-
-Compiled loop that turns camera channels into lights with a matrix that varies slowly over the field.
-
-Compiled loops that turn one padded Bayer mosaic into three full channels.
+"""From a Bayer mosaic to channels, from channels to lights, and from the lights' residuals to weights and scores.
 
 The mosaic comes padded by two pixels on every side, mirrored about the border pixel, which keeps the Bayer phase; a
 sample that must not be used is NaN there and spreads to all it takes part in. ``red_row, red_column`` are the position
 of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
-
-Compiled loops over the owned pixels that make weights and scores from the lights' residuals.
 """
 
 import numpy as np
@@ -16,42 +10,15 @@ import numpy as np
 from rgbmidic._kernels.interpolation import _FAST
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
-__all__ = ["PAD", "best_mean", "malvar", "pad_mosaic", "robust_weights", "scores", "unmix", "unmix_field"]
+__all__ = ["PAD", "best_mean", "malvar", "pad_mosaic", "robust_weights", "scores", "unmix"]
 
 BLOCK = 4096
 """Pixels at a time: what a core's fastest cache holds."""
 
 
-@over_ranges("out", axis=1, grain=BLOCK)
-@compiled()
-def unmix(start, stop, channels, valid, matrix, needed, out, out_valid):
-    """``out = matrix @ channels`` at every pixel; invalid, and NaN, where a `needed` channel is invalid.
-
-    channels, valid: (C, P); matrix, needed: (k, C); out, out_valid: (k, P). An invalid channel that is not needed
-    contributes the value it has, NaN nothing.
-    """
-    lights, colours = matrix.shape
-    for first in range(start, stop, BLOCK):
-        last = min(first + BLOCK, stop)
-        for light in range(lights):
-            values, ok = out[light, first:last], out_valid[light, first:last]
-            for p in range(last - first):
-                values[p], ok[p] = 0.0, True
-            for colour in range(colours):
-                factor, counts = matrix[light, colour], needed[light, colour]
-                given, known = channels[colour, first:last], valid[colour, first:last]
-                for p in range(last - first):
-                    values[p] += factor * given[p] if np.isfinite(given[p]) else np.float32(0.0)
-                if counts:
-                    for p in range(last - first):
-                        ok[p] &= known[p]
-            for p in range(last - first):
-                values[p] = values[p] if ok[p] else np.float32(np.nan)
-
-
 @over_ranges("out", axis=1)
 @compiled()
-def unmix_field(start, stop, channels, valid, grid, step, needed, out, out_valid):
+def unmix(start, stop, channels, valid, grid, step, needed, out, out_valid):
     """``out = matrix(x, y) @ channels`` with the matrix interpolated linearly between grid points `step` px apart.
 
     channels, valid: (C, H, W); grid: (GY, GX, k, C) at x, y = 0, step, 2 step ... beyond the last pixel; needed:
@@ -67,7 +34,7 @@ def unmix_field(start, stop, channels, valid, grid, step, needed, out, out_valid
             for x in range(width):
                 values[x], ok[x] = 0.0, True
             for colour in range(colours):
-                counts = needed[light, colour]
+                given, known = channels[colour, y], valid[colour, y]
                 for gx in range((width + step - 1) // step):
                     first, last = gx * step, min((gx + 1) * step, width)
                     above, below = grid[gy, gx, light, colour], grid[gy + 1, gx, light, colour]
@@ -75,10 +42,11 @@ def unmix_field(start, stop, channels, valid, grid, step, needed, out, out_valid
                     above, below = grid[gy, gx + 1, light, colour], grid[gy + 1, gx + 1, light, colour]
                     slope = (above + (below - above) * down - left) / np.float32(step)
                     for x in range(first, last):
-                        value = channels[colour, y, x]
-                        factor = left + slope * np.float32(x - first)
-                        values[x] += factor * value if np.isfinite(value) else np.float32(0.0)
-                        ok[x] &= valid[colour, y, x] or not counts
+                        factor = left + slope * np.float32(np.int32(x - first))
+                        values[x] += factor * given[x] if np.isfinite(given[x]) else np.float32(0.0)
+                if needed[light, colour]:
+                    for x in range(width):
+                        ok[x] &= known[x]
             for x in range(width):
                 values[x] = values[x] if ok[x] else np.float32(np.nan)
 

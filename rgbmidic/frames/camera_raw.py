@@ -32,7 +32,7 @@ _NAMES = "3fr arw cr2 cr3 dcr dng erf fff iiq kdc mef mos mrw nef nrw orf pef ra
 CAMERA_RAW_ENDINGS = tuple(f".{name}" for name in _NAMES.split())
 
 MAXIMUM_FLAT_ROWS = 0.01
-"""Share of rows without any noise above which a camera raw counts as not decoded: defective rows may exist."""
+"""Fraction of rows without any noise above which a camera raw counts as not decoded: defective rows may exist."""
 
 _CAMERA_HEADERS = (
     *(b"II*\0", b"MM\0*"),  # TIFF: DNG, NEF, CR2, ARW, PEF, KDC, ...
@@ -69,8 +69,8 @@ class CameraRaw(FrameSource):
             monochrome = raw.num_colors == 1
         if values.shape != (sizes.height, sizes.width):
             raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
-        told = structure.black_level(sizes.top_margin, sizes.left_margin) if structure else None
-        black = black if told is None else told
+        stated = structure.black_level(sizes.top_margin, sizes.left_margin) if structure else None
+        black = black if stated is None else stated
         as_is = structure is not None and structure.stored_as_is
         _check_filled(values, black, white, stored_as_is=as_is, path=self.path)
         return StoredFrame(
@@ -84,15 +84,15 @@ class CameraRaw(FrameSource):
 
 @contextmanager
 def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
-    """The file opened by LibRaw; what LibRaw raises while it is open becomes a FrameError, what it tells a warning.
+    """Open the file by LibRaw; what LibRaw raises while it is open becomes a FrameError, what it prints a warning.
 
-    Where libjpeg, which unpacks some, tells that the data are broken, that is a FrameError, too.
+    Where libjpeg, which unpacks some, reports that the data are broken, that is a FrameError, too.
     """
     import rawpy
 
     try:
         starts = (os.fsencode(path), *(start.encode() for start in _BROKEN_JPEG + _ODD_JPEG))
-        with complaints(*starts) as told, rawpy.imread(str(path)) as raw:
+        with complaints(*starts) as lines, rawpy.imread(str(path)) as raw:
             needed = 2 * raw.sizes.raw_height * raw.sizes.raw_width
             check_size(path, needed=needed, stored=path.stat().st_size)
             yield raw
@@ -101,22 +101,24 @@ def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
     except NotImplementedError:  # rawpy's answer to filters that repeat neither after 2x2 nor after 6x6 pixels
         raise _not_bayer(path, "that is no mosaic of 2x2 pixels") from None
     except rawpy.LibRawError as error:
-        raise _undecodable(path, error) from None
-    for line in told:
+        reason = error.args[0] if error.args else type(error).__name__
+        reason = reason.decode(errors="replace") if isinstance(reason, bytes) else reason
+        raise damaged(path, f"LibRaw reports: {reason}") from None
+    for line in lines:
         if line.startswith(_BROKEN_JPEG):
-            raise damaged(path, f"libjpeg says: {line}")
-        logger.warning("LibRaw says: %s", line)
+            raise damaged(path, f"libjpeg reports: {line}")
+        logger.warning("LibRaw reports: %s", line)
 
 
 def has_camera_header(path: Path) -> bool:
-    """Whether the file starts as camera raws do.
+    """Return whether the file starts as camera raws do.
 
     LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture.
     """
     try:
         with regular(path).open("rb") as file:
             head = file.read(12)
-    except OSError:  # told by whoever reads the file
+    except OSError:  # reported by whoever reads the file
         return False
     return head.startswith(_CAMERA_HEADERS) or head[4:] == _CR3_HEADER
 
@@ -126,13 +128,8 @@ def _not_bayer(path: Path, what: str) -> FrameError:
     return FrameError(f"{path} has a colour filter array {what}; allowed are the Bayer patterns {allowed}")
 
 
-def _undecodable(path: Path, error: Exception) -> FrameError:
-    text = error.args[0] if error.args else type(error).__name__
-    return damaged(path, f"LibRaw says: {text.decode(errors='replace') if isinstance(text, bytes) else text}")
-
-
 def _colour_cell(raw: rawpy.RawPy, path: Path) -> AnyArray:
-    """Colour numbers of the first visible 2x2 cell; only single-plane sensors, Bayer or without filters, have one."""
+    """Return the colour numbers of the first visible 2x2 cell; only sensors of one plane, Bayer or mono, have one."""
     pattern = raw.raw_pattern
     if raw.raw_type.name != "Flat" or pattern is None:
         raise FrameError(
@@ -166,6 +163,6 @@ def _check_filled(
     flat = (lowest == highest) & (highest < white)
     if stored_as_is:
         flat &= (highest == 0) & (black.min() > 0)
-    share = float(flat.mean())
-    if flat[-1] or share > MAXIMUM_FLAT_ROWS:
-        raise damaged(path, f"{share:.1%} of its rows are empty (one single value, {highest[flat][-1]} in the last)")
+    fraction = float(flat.mean())
+    if flat[-1] or fraction > MAXIMUM_FLAT_ROWS:
+        raise damaged(path, f"{fraction:.1%} of its rows are empty (one single value, {highest[flat][-1]} in the last)")

@@ -1,12 +1,9 @@
-"""What the header of a Phantom movie (.cine) tells, checked before anything large is read.
+"""Phantom movies (.cine): frames as the sensor gave them, each read by itself.
 
-Offsets are those of the structures CINEFILEHEADER, BITMAPINFOHEADER and SETUP of Vision Research's format; SETUP has
-grown over the years, and of it only what a file stores is read.
-
-Phantom movies (.cine): frames as the sensor gave them, each read by itself.
-
-The format is Vision Research's ("The Cine File Format"). Samples come as 8 bit, as 8 to 16 bit in 16-bit containers, or
-packed: 12 bit, or 10 bit in a code that is not linear.
+The format is Vision Research's ("The Cine File Format"); the header is checked before anything large is read. Samples
+come as 8 bit, as 8 to 16 bit in 16-bit containers, or packed: 12 bit, or 10 bit in a code that is not linear. Offsets
+are those of the structures CINEFILEHEADER, BITMAPINFOHEADER and SETUP; SETUP has grown over the years, and of it only
+what a file stores is read.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ import math
 import os
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
@@ -25,11 +22,13 @@ import numpy.typing as npt
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import Recording
 from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import StoredFrame, check_size, damaged
+from rgbmidic.frames.stored import StoredFrame, check_size, damaged, unpack_bits
 from rgbmidic.settings import FrameKind
-from rgbmidic.typing import AnyArray
+from rgbmidic.typing import AnyArray, FloatArray
 
-__all__ = ["CINE_ENDINGS", "CineFile", "CineHeader", "read_header"]
+__all__ = ["CINE_ENDINGS", "CineFile"]
+
+CINE_ENDINGS = (".cine", ".cin", ".cci")
 
 _FILE, _BITMAP = struct.Struct("<2s3HiIi4IQ"), struct.Struct("<I2i2H6I")
 _SETUP = {
@@ -55,17 +54,102 @@ _MOST_BLOCKS, _MOST_FRAMES = 100, 2**25
 """What no file of a camera has: Phantom's own have five blocks, and the largest memories hold some million frames."""
 
 _LEAD, _UNINTERPOLATED = 1, 2
-_BITS = {256: 10, 1024: 12}
+_PACKED_BITS = {256: 10, 1024: 12}
 """Bits of a sample that each code of packed frames means."""
+_CODED_BITS = 10
+"""Bits of the samples that are not linear but codes (`_LINEAR`)."""
 _PATTERNS = {3: "GBRG", 4: "RGGB"}
 _OLD_PATTERNS = (1, 2)
 _GREY_HEADS = 0xF0000000
 _SECOND = 10**9
 
+_STEPS = (
+    "311111111111101111111111111111011111111111111101111111111111110111111111111111101111111111111110111111111111"
+    "111101111111111111110111111111111011111111111111111211111111121111112111121112111211121121121121121211212121"
+    "121212121212122121221212212212212212221222122212222212222222122222222222222222222222322222223222223222322232"
+    "223223223223223232322323232323232323323232332332332332333233323332333332333333332333333333333333333343333333"
+    "343333433334333433433343343433434334343434343434343443434434434434434443444344443444444344444444444444444444"
+    "444444544444544445444544454454454454454545445454545454554545455455455455455545554555545555554555555555555555"
+    "555555555565555556555565556555655655655656556565656565656565656656656566566656665666566665666666665666666666"
+    "666667666666667666676666766676676676676766767676767676767676776767767767776777677767777767777777777767777787"
+    "777777777787777787777877787787787787787878778787878788787878878878878878887888878888878888888888888888888888"
+    "888988888988889888988988988988989898898988"
+)
+_LINEAR = np.full(1024, 4095, dtype=np.uint16)
+_LINEAR[: len(_STEPS) + 1] = np.cumsum([2, *map(int, _STEPS)])
+"""Grey level (12 bit) of each code of packed 10 bit: appendix 1 of the format's description, as hypercine publishes it.
+
+Stored as the steps from one code to the next; the codes above 1014, white, are saturated.
+"""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CineHeader:
-    """What a movie's header tells.
+class CineFile(Movie):
+    """A Phantom .cine file. Flips and rotation are settings of the camera's viewer and left to it."""
+
+    def _header(self) -> _Header:
+        return _header(self.path)
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        header = _header(self.path)
+        height = header.shape[0]
+        stored = range(height - rows.stop, height - rows.start) if header.bottom_up else rows
+        values = _samples(header, *self._lines(header, index, stored))
+        if header.bits == _CODED_BITS:
+            values = _LINEAR[values]
+        return StoredFrame(
+            values=values[::-1] if header.bottom_up else values,
+            kind=header.kind,
+            cfa=header.cfa,
+            black_level=header.black_level,
+            white_level=header.white_level,
+        )
+
+    def _lines(self, header: _Header, index: int, rows: range) -> tuple[npt.NDArray[np.uint8], range]:
+        """Read the lines (n, bytes) that hold some rows of a frame; return them and the rows in them."""
+        start = int(header.pointers[index])
+        with self.path.open("rb") as file:
+            if start < header.first_byte or start + 8 > header.size:
+                raise self._ends(header, index)
+            file.seek(start)
+            annotation = int.from_bytes(file.read(4), "little")
+            if annotation < 8 or start + annotation > header.size:
+                raise damaged(self.path, f"the annotation of frame {index} has {annotation} bytes")
+            file.seek(start + annotation - 4)
+            lines = header.lines(int.from_bytes(file.read(4), "little"))
+            if lines is None:
+                raise damaged(self.path, f"frame {index} has not the size that its header announces")
+            if start + annotation + lines[0] * lines[1] > header.size:
+                raise self._ends(header, index)
+            if lines[0] == 1:  # all samples in a row
+                return np.fromfile(file, dtype=np.uint8, count=lines[1]).reshape(lines), rows
+            file.seek(rows.start * lines[1], 1)
+            part = np.fromfile(file, dtype=np.uint8, count=len(rows) * lines[1])
+            return part.reshape(len(rows), lines[1]), range(len(rows))
+
+    def _ends(self, header: _Header, index: int) -> FrameError:
+        last = min(header.last_whole, index - 1)
+        place = f"after frame {last}" if last >= 0 else "before the first frame"
+        return FrameError(
+            f"{self.path} ends {place} of {len(self)} (0 to {len(self) - 1}): truncated or still being written"
+        )
+
+
+def _samples(header: _Header, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
+    """Return samples (n, W), uint8 or uint16, of some of the rows in the lines that they are stored in."""
+    columns = header.shape[1]
+    if header.bits in (8, 16):
+        samples: AnyArray = lines.view("u1" if header.bits == 8 else "<u2")
+    else:
+        samples = unpack_bits(lines, header.bits)
+    if len(lines) == 1 and header.shape[0] > 1:
+        return samples[0, rows.start * columns : rows.stop * columns].reshape(len(rows), columns)
+    return samples[:, :columns]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Header:
+    """What a movie's header states, levels of codes made linear.
 
     Attributes
     ----------
@@ -76,9 +160,9 @@ class CineHeader:
     bottom_up
         Whether the last row is stored first.
     kind, cfa
-        Pattern of the frame's first pixels; None where the header does not tell.
+        Pattern of the frame's first pixels; None where the header does not state it.
     black_level, white_level
-        Grey levels as the header tells them; no black level where that cannot be.
+        Grey levels (DN) as the header states them, (2, 2) and one; no black level where that cannot be.
     recording
         How the frames were recorded.
     pointers : ndarray, shape (count,), int64
@@ -94,17 +178,12 @@ class CineHeader:
     bottom_up: bool
     kind: FrameKind | None
     cfa: str | None
-    black_level: int | None
-    white_level: int
+    black_level: FloatArray | None
+    white_level: float
     recording: Recording
     pointers: npt.NDArray[np.int64]
     first_byte: int
     size: int
-
-    @property
-    def coded(self) -> bool:
-        """Whether samples are stored in the code of packed 10 bit, which is not linear."""
-        return self.bits == 10
 
     @property
     def last_whole(self) -> int:
@@ -113,7 +192,7 @@ class CineHeader:
         return int(np.argmin(np.append(begun, False))) - 1
 
     def lines(self, size: int) -> tuple[int, int] | None:
-        """Number and bytes of the lines that a frame of `size` bytes is stored in; None where its size cannot be."""
+        """Return number and bytes of the lines that hold a frame of `size` bytes; None where its size cannot be."""
         rows, columns = self.shape
         if size == _needed(self.shape, self.bits):
             return (rows, size // rows) if self.bits in (8, 16) else (1, size)
@@ -121,7 +200,8 @@ class CineHeader:
         return (rows, line) if size == rows * line else None
 
 
-def read_header(path: Path) -> CineHeader:
+@remembered
+def _header(path: Path) -> _Header:
     """Read the header of a movie.
 
     Raises
@@ -139,30 +219,35 @@ def read_header(path: Path) -> CineHeader:
         _, columns, height, _, bit_count, packing, _, _, _, _, levels = _unpacked(path, file, _BITMAP, places[0])
         setup, end = _setup(path, file, places[1])
         kind, cfa = _colours(path, compression, bit_count, setup.get("cfa", 0))
-        bits, shape = _bits(path, bit_count, packing), (abs(height), columns)
+        bits, shape = _PACKED_BITS.get(packing, bit_count), (abs(height), columns)
+        if packing not in _PACKED_BITS and (packing != 0 or bit_count not in (8, 16)):
+            what = f"samples of {bit_count} bit, packed in the way {packing}, which is unknown"
+            raise damaged(path, f"its header announces {what}")
         if min(shape) < 1:
             raise damaged(path, f"its header announces {shape[0]} rows of {shape[1]} pixels")
         check_size(path, needed=2 * math.prod(shape), stored=_needed(shape, bits))
-        depth = _depth(bits, setup.get("bits", 0), levels)
-        black, white, doubt = _levels(setup, depth)
-        pointers = _pointers(path, file, version, count, places[2])
+        if version not in (0, 1):
+            raise damaged(path, f"its header announces the version {version} of the format; known are 0 and 1")
+        pointers = _array(path, file, np.dtype("<i8" if version else "<u4"), count, places[2]).astype(np.int64)
         times, exposures = _stamps(path, file, (end, places[2]), count)
-    return CineHeader(
+    depth = _depth(bits, setup.get("bits", 0), levels)
+    black, white, remarks = _levels(setup, depth)
+    if bits == _CODED_BITS and white < len(_LINEAR):  # levels of 10 bit are codes as the samples are
+        black, white = None if black is None else int(_LINEAR[black]), int(_LINEAR[white])
+    return _Header(
         shape=shape,
         bits=bits,
         bottom_up=height > 0 and bits in (8, 16),
         kind=kind,
         cfa=cfa,
-        black_level=black,
-        white_level=white,
+        black_level=None if black is None else np.full((2, 2), float(black)),
+        white_level=float(white),
         recording=Recording(
             count=count,
             bit_depth=depth,
-            frame_rate=_frame_rate(setup),
-            exposure_ns=_exposure(setup, exposures),
             trigger=-first,
             times_ns=None if times is None else _since(times, trigger),
-            remarks=(*doubt, *_viewer(setup)),
+            **_settings(setup, exposures, remarks),
         ),
         pointers=pointers,
         first_byte=_FILE.size,
@@ -171,7 +256,7 @@ def read_header(path: Path) -> CineHeader:
 
 
 def _needed(shape: tuple[int, int], bits: int) -> int:
-    """Bytes of a frame."""
+    """Return the bytes of a frame."""
     return -(-math.prod(shape) * bits // 8)
 
 
@@ -188,7 +273,7 @@ def _unpacked(path: Path, file: BinaryIO, layout: struct.Struct, start: int) -> 
 
 
 def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]:
-    """The fields that the camera's settings store, and where these end."""
+    """Read the fields that the camera's settings store, and where these end."""
     head = _piece(path, file, start, _LENGTH + 2)
     length = int.from_bytes(head[_LENGTH:], "little")
     if head[_MARK:_LENGTH] != b"ST" or length < len(head):
@@ -204,7 +289,7 @@ def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]
 
 
 def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[FrameKind | None, str | None]:
-    """Kind and pattern; a colour camera's picture that was made grey is neither, nor is one of an unknown code.
+    """Return kind and pattern; a colour camera's picture that was made grey has neither, nor has an unknown code.
 
     Raises
     ------
@@ -232,39 +317,21 @@ def _refuse(path: Path, what: str) -> NoReturn:
     )
 
 
-def _bits(path: Path, bit_count: int, packing: int) -> int:
-    if packing in _BITS:
-        return _BITS[packing]
-    if packing == 0 and bit_count in (8, 16):
-        return bit_count
-    raise damaged(
-        path, f"its header announces samples of {bit_count} bit, packed in the way {packing}, which is unknown"
-    )
-
-
 def _depth(bits: int, real: int, levels: int) -> int:
-    """Bits of a sample, packed 10 bit being a code for 12: the header's number, else as its number of levels needs."""
+    """Return the bits of a sample, 12 for the code of 10: the header's number, else as its number of levels needs."""
     if bits in (10, 12):
         return 12
-    return next((told for told in (real, (levels - 1).bit_length()) if 8 <= told <= bits), bits)
+    return next((depth for depth in (real, (levels - 1).bit_length()) if 8 <= depth <= bits), bits)
 
 
 def _levels(setup: Mapping[str, int], depth: int) -> tuple[int | None, int, tuple[str, ...]]:
-    """Black and white level, and what is wrong with those of the header: some cameras store none, or those of 8 bit."""
+    """Return black and white level, and a remark on those of the header: some cameras store none, or 8-bit ones."""
     largest = 2**depth - 1
     black, white = setup.get("black", 0), setup.get("white", 0)
     if 0 <= black < white <= largest and (white > 255 or depth == 8):
         return black, white, ()
-    told = f"black level {black} and white level {white} of its header do not fit samples of {depth} bit: not used"
-    return None, largest, (told,) if black or white else ()
-
-
-def _pointers(path: Path, file: BinaryIO, version: int, count: int, start: int) -> npt.NDArray[np.int64]:
-    """Where each frame begins: 64 bit, in files of the first version 32."""
-    if version not in (0, 1):
-        raise damaged(path, f"its header announces the version {version} of the format; known are 0 and 1")
-    stored = np.dtype("<i8" if version else "<u4")
-    return _array(path, file, stored, count, start).astype(np.int64)
+    remark = f"black level {black} and white level {white} of its header do not fit samples of {depth} bit: not used"
+    return None, largest, (remark,) if black or white else ()
 
 
 def _array(path: Path, file: BinaryIO, stored: np.dtype[Any], count: int, start: int) -> npt.NDArray[Any]:
@@ -277,7 +344,7 @@ def _array(path: Path, file: BinaryIO, stored: np.dtype[Any], count: int, start:
 def _stamps(
     path: Path, file: BinaryIO, between: tuple[int, int], count: int
 ) -> tuple[npt.NDArray[np.uint64] | None, npt.NDArray[np.uint32] | None]:
-    """Times and exposures (count,) of the frames, as they are stored in tagged blocks; None where there are none."""
+    """Read times and exposures (count,) of the frames from the tagged blocks; None where there are none."""
     found: dict[int, npt.NDArray[Any]] = {}
     place, end = between
     for _ in range(_MOST_BLOCKS):
@@ -296,142 +363,25 @@ def _stamps(
 
 
 def _since(times: npt.NDArray[np.uint64], trigger: int) -> npt.NDArray[np.int64]:
-    """Times in ns from the trigger; both are seconds in fixed point 32.32, whose last two bits tell something else."""
+    """Convert to ns from the trigger; both are seconds in fixed point 32.32, whose last two bits are flags."""
     flags = np.uint64(3)
     ticks = ((times & ~flags) - (np.uint64(trigger) & ~flags)).astype(np.int64)
     return np.asarray((ticks >> 32) * _SECOND + (((ticks & 0xFFFFFFFF) * _SECOND + 2**31) >> 32))
 
 
-def _frame_rate(setup: Mapping[str, float]) -> float | None:
+def _settings(
+    setup: Mapping[str, Any], exposures: npt.NDArray[np.uint32] | None, remarks: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return frame rate, exposure and remarks: the exposure as stamped (0.32 fixed point seconds), else as set."""
     rates = (setup.get(name, 0.0) for name in ("frame_rate", "frame_rate_32", "frame_rate_16"))
-    return next((float(rate) for rate in rates if math.isfinite(rate) and rate > 0), None)
-
-
-def _exposure(setup: Mapping[str, int], exposures: npt.NDArray[np.uint32] | None) -> int | None:
-    """Exposure in ns: as stamped (0.32 fixed point seconds), else as it was set."""
     stamped = 0 if exposures is None else (int(np.sort(exposures)[len(exposures) // 2]) * _SECOND + 2**31) >> 32
     us = setup.get("shutter_us", 0) or setup.get("shutter_us_16", 0)
-    return stamped or setup.get("shutter_ns", 0) or 1000 * us or None
-
-
-def _viewer(setup: Mapping[str, int]) -> tuple[str, ...]:
-    """What the camera's viewer does with the picture, which the samples know nothing of."""
-    names = ("flip_horizontally", "flip_vertically", "rotate")
-    done = [name.replace("_", " ") for name in names if setup.get(name, 0)]
-    return (
-        (f"the viewer's settings are left out ({', '.join(done)}): frames are as the sensor gave them",) if done else ()
-    )
-
-
-CINE_ENDINGS = (".cine", ".cin", ".cci")
-
-_STEPS = (
-    "311111111111101111111111111111011111111111111101111111111111110111111111111111101111111111111110111111111111"
-    "111101111111111111110111111111111011111111111111111211111111121111112111121112111211121121121121121211212121"
-    "121212121212122121221212212212212212221222122212222212222222122222222222222222222222322222223222223222322232"
-    "223223223223223232322323232323232323323232332332332332333233323332333332333333332333333333333333333343333333"
-    "343333433334333433433343343433434334343434343434343443434434434434434443444344443444444344444444444444444444"
-    "444444544444544445444544454454454454454545445454545454554545455455455455455545554555545555554555555555555555"
-    "555555555565555556555565556555655655655656556565656565656565656656656566566656665666566665666666665666666666"
-    "666667666666667666676666766676676676676766767676767676767676776767767767776777677767777767777777777767777787"
-    "777777777787777787777877787787787787787878778787878788787878878878878878887888878888878888888888888888888888"
-    "888988888988889888988988988988989898898988"
-)
-_LINEAR = np.full(1024, 4095, dtype=np.uint16)
-_LINEAR[: len(_STEPS) + 1] = np.cumsum([2, *map(int, _STEPS)])
-"""Grey level (12 bit) of each code of packed 10 bit: appendix 1 of the format's description, as hypercine publishes it.
-
-Stored as the steps from one code to the next; the codes above 1014, white, are saturated.
-"""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CineFile(Movie):
-    """A Phantom .cine file. Flips and rotation are settings of the camera's viewer and left to it."""
-
-    def _recording(self) -> Recording:
-        return _header(self.path).recording
-
-    def _shape(self) -> tuple[int, int]:
-        return _header(self.path).shape
-
-    def _stored(self, index: int) -> StoredFrame:
-        return self._rows(index, range(self._shape()[0]))
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        header = _header(self.path)
-        height = header.shape[0]
-        stored = range(height - rows.stop, height - rows.start) if header.bottom_up else rows
-        values = _samples(header, *self._lines(header, index, stored))
-        if header.coded:
-            values = _LINEAR[values]
-        return StoredFrame(
-            values=values[::-1] if header.bottom_up else values,
-            kind=header.kind,
-            cfa=header.cfa,
-            black_level=None if header.black_level is None else np.full((2, 2), float(header.black_level)),
-            white_level=float(header.white_level),
-        )
-
-    def _lines(self, header: CineHeader, index: int, rows: range) -> tuple[npt.NDArray[np.uint8], range]:
-        """The lines (n, bytes) that some rows of a frame are stored in, behind its annotation, and the rows in them."""
-        start = int(header.pointers[index])
-        with self.path.open("rb") as file:
-            if start < header.first_byte or start + 8 > header.size:
-                raise self._ends(header, index)
-            file.seek(start)
-            annotation = int.from_bytes(file.read(4), "little")
-            if annotation < 8 or start + annotation > header.size:
-                raise damaged(self.path, f"the annotation of frame {index} has {annotation} bytes")
-            file.seek(start + annotation - 4)
-            lines = header.lines(int.from_bytes(file.read(4), "little"))
-            if lines is None:
-                raise damaged(self.path, f"frame {index} has not the size that its header announces")
-            if start + annotation + lines[0] * lines[1] > header.size:
-                raise self._ends(header, index)
-            if lines[0] == 1:  # all samples in a row
-                return np.fromfile(file, dtype=np.uint8, count=lines[1]).reshape(lines), rows
-            file.seek(rows.start * lines[1], 1)
-            part = np.fromfile(file, dtype=np.uint8, count=len(rows) * lines[1])
-            return part.reshape(len(rows), lines[1]), range(len(rows))
-
-    def _ends(self, header: CineHeader, index: int) -> FrameError:
-        last = min(header.last_whole, index - 1)
-        place = f"after frame {last}" if last >= 0 else "before the first frame"
-        return FrameError(
-            f"{self.path} ends {place} of {len(self)} (0 to {len(self) - 1}): truncated or still being written"
-        )
-
-
-@remembered
-def _header(path: Path) -> CineHeader:
-    header = read_header(path)
-    if not header.coded or header.white_level >= len(_LINEAR):
-        return header
-    # levels of 10 bit are codes as the samples are
-    black = None if header.black_level is None else int(_LINEAR[header.black_level])
-    return replace(header, black_level=black, white_level=int(_LINEAR[header.white_level]))
-
-
-def _samples(header: CineHeader, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
-    """Samples (n, W), uint8 or uint16, of some of the rows in the lines that they are stored in."""
-    columns = header.shape[1]
-    if header.bits in (8, 16):
-        samples: AnyArray = lines.view("u1" if header.bits == 8 else "<u2")
-    else:
-        samples = _unpack(lines, header.bits)
-    if len(lines) == 1 and header.shape[0] > 1:
-        return samples[0, rows.start * columns : rows.stop * columns].reshape(len(rows), columns)
-    return samples[:, :columns]
-
-
-def _unpack(lines: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint16]:
-    """Samples of 10 or 12 bit that follow one another without gaps, the first in the highest bits; lines start anew."""
-    size = bits // 2
-    padded = np.pad(lines, ((0, 0), (0, -lines.shape[1] % size)))
-    groups = padded.reshape(len(lines), -1, size).astype(np.uint16)
-    samples = np.empty((*groups.shape[:2], 8 * size // bits), dtype=np.uint16)
-    for place in range(samples.shape[2]):
-        byte, bit = divmod(place * bits, 8)
-        samples[..., place] = (groups[..., byte] << 8 | groups[..., byte + 1]) >> (16 - bit - bits) & (2**bits - 1)
-    return samples.reshape(len(lines), -1)
+    turned = [name for name in ("flip_horizontally", "flip_vertically", "rotate") if setup.get(name, 0)]
+    if turned:
+        names = ", ".join(turned).replace("_", " ")
+        remarks += (f"the viewer's settings are left out ({names}): frames are as the sensor gave them",)
+    return {
+        "frame_rate": next((float(rate) for rate in rates if math.isfinite(rate) and rate > 0), None),
+        "exposure_ns": stamped or setup.get("shutter_ns", 0) or 1000 * us or None,
+        "remarks": remarks,
+    }

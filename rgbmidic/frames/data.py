@@ -1,7 +1,4 @@
-"""Raw frames as the camera recorded them: the first step of docs/conventions.md.
-
-How and when the frames of a file were recorded, and which are lost between them.
-"""
+"""Raw frames as the camera recorded them, the first step of docs/conventions.md, and how and when it recorded them."""
 
 from __future__ import annotations
 
@@ -54,12 +51,12 @@ class Window:
 
     @classmethod
     def whole(cls, frame: tuple[int, int]) -> Window:
-        """All of a frame."""
+        """Return the window that is all of a frame."""
         return cls(origin=(0, 0), shape=frame, frame=frame)
 
     @classmethod
     def around(cls, points: FloatArray, margin: float, frame: tuple[int, int]) -> Window:
-        """What lies within `margin` px of points (N, 2) in x and y, and little more."""
+        """Return what lies within `margin` px of points (N, 2) in x and y, and little more."""
         size = np.array(frame[::-1])
         low = np.clip(np.floor(points.min(axis=0) - margin), 0, size - 1).astype(int) // _GRID * _GRID
         last = np.clip(np.ceil(points.max(axis=0) + margin), low, size - 1).astype(int)
@@ -83,13 +80,13 @@ class Window:
         return range(self.origin[0], self.origin[0] + self.shape[1])
 
     def part_of(self, other: Window) -> tuple[slice, slice]:
-        """Where it lies, rows and columns, in a window that holds all of it."""
+        """Return where it lies, rows and columns, in a window that holds all of it."""
         (left, top), (x, y), (rows, columns) = self.origin, other.origin, self.shape
         return slice(top - y, top - y + rows), slice(left - x, left - x + columns)
 
 
 def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
-    """Channel index (R 0, G 1, B 2) of each position of the 2x2 cell of a Bayer pattern.
+    """Return the channel index (R 0, G 1, B 2) of each position of the 2x2 cell of a Bayer pattern.
 
     Parameters
     ----------
@@ -113,13 +110,26 @@ def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
 
 
 def sampled_channels(cfa: str, shape: tuple[int, ...]) -> npt.NDArray[np.intp]:
-    """Channel index (H, W) that a mosaic of `shape` samples at each pixel."""
+    """Return the channel index (H, W) that a mosaic of `shape` samples at each pixel."""
     rows, columns = shape
     return np.tile(cfa_channels(cfa), (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
 
 
 def shift_cfa(cfa: str, rows: int, columns: int) -> str:
-    """Name of the Bayer pattern seen after the first `rows` rows and `columns` columns are cropped away."""
+    """Return the Bayer pattern seen after the first rows and columns are cropped away.
+
+    Parameters
+    ----------
+    cfa
+        One of `BAYER_PATTERNS`.
+    rows, columns
+        How many are cropped away.
+
+    Returns
+    -------
+    str
+        One of `BAYER_PATTERNS`.
+    """
     cell = np.array(list(cfa.upper())).reshape(2, 2)
     return "".join(np.roll(cell, (-rows, -columns), axis=(0, 1)).ravel())
 
@@ -196,7 +206,7 @@ def _check_levels(black: FloatArray, white: float) -> None:
 
 
 def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.NDArray[np.uint16]], FloatArray]:
-    """Colour planes of a frame: their names, their samples and their black levels.
+    """Return the colour planes of a frame: their names, their samples and their black levels.
 
     Parameters
     ----------
@@ -215,14 +225,14 @@ def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.N
 
 
 _EVEN = 0.1
-"""Share of a period by which stamps may miss whole periods: a clock of 1 MHz does at 100,000 frames a second."""
+"""Fraction of a period by which stamps may miss whole periods: a clock of 1 MHz does at 100,000 frames a second."""
 
 Integers = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recording:
-    """What a file tells of its frames as a sequence; None where it does not tell.
+    """What a file states of its frames as a sequence; None where it does not state it.
 
     Attributes
     ----------
@@ -270,9 +280,18 @@ class Recording:
 
 
 def frame_numbers(times_ns: Integers) -> Integers:
-    """Number of each frame from the first, from when they were taken: whole periods between even stamps.
+    """Return the number of each frame from the first, from when they were taken: whole periods between even stamps.
 
-    Frames that are not taken at even intervals are numbered through: a gap between them tells nothing.
+    Frames that are not taken at even intervals are numbered through: a gap between them means nothing.
+
+    Parameters
+    ----------
+    times_ns : ndarray, shape (count,), int64
+        When each frame was taken.
+
+    Returns
+    -------
+    ndarray, shape (count,), int64
     """
     if len(times_ns) < 3:
         return np.arange(len(times_ns))
@@ -285,7 +304,7 @@ def frame_numbers(times_ns: Integers) -> Integers:
 
 
 def even_times(numbers: range, interval: Fraction) -> Integers:
-    """When frames with these numbers were taken, in ns from number 0, `interval` seconds apart: rounded whole numbers.
+    """Return when frames with these numbers were taken, in ns from number 0, `interval` seconds apart, rounded.
 
     Raises
     ------

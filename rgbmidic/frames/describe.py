@@ -1,4 +1,4 @@
-"""What a reader sees of a file, a folder or a pattern of raw frames, and one of its frames as a plain TIFF."""
+"""Description of a file, a folder or a pattern of raw frames from its headers; one of its frames as a plain TIFF."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SECOND = 1e9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Description:
-    """What a reader sees; None where neither the files nor the user tell it.
+    """What a reader sees; None where neither the files nor the user state it.
 
     Attributes
     ----------
@@ -35,9 +35,9 @@ class Description:
     kind, cfa
         What the frames are, and the Bayer pattern of their first pixels.
     bit_depth
-        Bits of a sample: of the camera where the file tells it, else of the file.
+        Bits of a sample: of the camera where the file states it, else of the file.
     black_level, white_level
-        Grey levels (DN) that a run takes, told or not; four black levels where they differ over the positions of the
+        Grey levels (DN) that a run takes, stated or not; four black levels where they differ over the positions of the
         2x2 cell.
     frame_rate
         Frames per second, as the camera was set.
@@ -50,7 +50,7 @@ class Description:
     first_time_ns, last_time_ns
         When the first and the last frame were taken, in ns from the trigger.
     warnings
-        What else the header tells that a user should know, and why the last frame cannot be read.
+        What else the header states that a user should know, and why the last frame cannot be read.
     """
 
     reader: str
@@ -70,11 +70,11 @@ class Description:
     warnings: tuple[str, ...]
 
     def as_json(self) -> str:
-        """As a JSON object, with null for what is not known."""
+        """Return a JSON object, with null for what is not known."""
         return json.dumps(asdict(self), indent=2)
 
     def as_text(self) -> str:
-        """One line for each thing that is known."""
+        """Return one line for each thing that is known."""
         known = {name: value for name, value in asdict(self).items() if value is not None and name != "warnings"}
         return "\n".join(f"{name:<15}{_text(value)}" for name, value in known.items())
 
@@ -85,7 +85,11 @@ def describe(settings: FrameSettings) -> Description:
     Parameters
     ----------
     settings
-        A file, a folder or a pattern, and what the files do not tell.
+        A file, a folder or a pattern, and what the files do not state.
+
+    Returns
+    -------
+    Description
 
     Raises
     ------
@@ -94,9 +98,14 @@ def describe(settings: FrameSettings) -> Description:
     """
     series = _opened(settings)
     source, recording = series.lights[0][0], series.recording
-    stored = source.told(0)
+    stored = source.stored(0)
     frame, *_ = series.read(0)
     cfa = getattr(frame, "cfa", None)
+    warnings = list(recording.remarks)
+    try:
+        series.read(len(series) - 1)
+    except FrameError as error:  # a movie that is truncated, or still being written
+        warnings.append(str(error))
     numbered = recording.times_ns is not None or recording.numbers is not None or len(series.lights[0]) > 1
     return Description(
         reader=reader_name(source),
@@ -113,7 +122,7 @@ def describe(settings: FrameSettings) -> Description:
         lost_frames=series.lost if numbered else None,
         first_time_ns=series.time_ns(0),
         last_time_ns=series.time_ns(len(series) - 1),
-        warnings=(*recording.remarks, *_last_frame(series)),
+        warnings=tuple(warnings),
     )
 
 
@@ -140,10 +149,10 @@ def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bo
 
 
 def _opened(settings: FrameSettings) -> FrameSeries:
-    """The frames; those of a mosaic whose pattern nobody tells are read as they are, one grey level at every pixel."""
+    """Open the frames; a mosaic whose pattern nobody states is read as it is, one grey level at every pixel."""
     series = open_series(settings)
     if settings.kind is None and settings.cfa is None:
-        stored = series.lights[0][0].told(0)
+        stored = series.lights[0][0].stored(0)
         if stored.kind is None and stored.values.ndim == 2:
             return open_series(replace(settings, kind="monochrome"))
     return series
@@ -158,12 +167,3 @@ def _text(value: object) -> str:
 def _level(black: FloatArray) -> float | tuple[float, ...]:
     levels = tuple(np.unique(black).tolist())
     return levels[0] if len(levels) == 1 else tuple(black.ravel().tolist())
-
-
-def _last_frame(series: FrameSeries) -> tuple[str, ...]:
-    """Why the last frame cannot be read: a movie that is truncated, or still being written."""
-    try:
-        series.read(len(series) - 1)
-    except FrameError as error:
-        return (str(error),)
-    return ()

@@ -1,4 +1,4 @@
-"""The formats that frames are read from, each declared once."""
+"""Formats that frames are read from, each declared once, and the reading of a single frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
 from rgbmidic.frames.stored import Camera
-from rgbmidic.frames.tiff import TiffFile
+from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.frames.tiff_stack import TiffStack, is_tiff_stack
 from rgbmidic.settings import FrameKind, FrameSettings
@@ -39,7 +39,7 @@ class FrameFormat:
     movies
         Endings of its files that are named by themselves: a folder does not stand for movies.
     recognises
-        Whether a file, with what is stated of it, is read as this format; never an error, whatever the file is.
+        Whether a file, with what the user states of it, is read as this format; it raises nothing for any file.
     source
         Its reader; built with `path` and `stated`, it reads nothing yet.
     """
@@ -51,6 +51,10 @@ class FrameFormat:
     movies: tuple[str, ...] = ()
 
 
+def _ends(*endings: str) -> Callable[[Path, FrameSettings], bool]:
+    return lambda path, _: path.suffix.lower() in endings
+
+
 FORMATS = (
     FrameFormat(
         name="headerless .raw and .bin files whose shape and dtype are stated",
@@ -58,32 +62,19 @@ FORMATS = (
         recognises=is_headerless,
         source=HeaderlessFile,
     ),
-    FrameFormat(
-        name="PNG",
-        endings=(".png",),
-        recognises=lambda path, _: path.suffix.lower() == ".png",
-        source=PngFile,
-    ),
+    FrameFormat(name="PNG", endings=(".png",), recognises=_ends(".png"), source=PngFile),
     FrameFormat(
         name="TIFF stacks",
-        endings=(),
-        recognises=lambda path, _: (
-            path.suffix.lower() in (".tif", ".tiff") and not is_dng(path) and is_tiff_stack(path)
-        ),
+        recognises=lambda path, _: path.suffix.lower() in TIFF_ENDINGS and not is_dng(path) and is_tiff_stack(path),
         source=TiffStack,
     ),
     FrameFormat(
         name="TIFF",
-        endings=(".tif", ".tiff"),
-        recognises=lambda path, _: path.suffix.lower() in (".tif", ".tiff") and not is_dng(path),
+        endings=TIFF_ENDINGS,
+        recognises=lambda path, _: path.suffix.lower() in TIFF_ENDINGS and not is_dng(path),
         source=TiffFile,
     ),
-    FrameFormat(
-        name="Phantom .cine",
-        movies=CINE_ENDINGS,
-        recognises=lambda path, _: path.suffix.lower() in CINE_ENDINGS,
-        source=CineFile,
-    ),
+    FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, recognises=_ends(*CINE_ENDINGS), source=CineFile),
     FrameFormat(
         name="camera raws (DNG, NEF, CR2, ARW, ...)",
         endings=CAMERA_RAW_ENDINGS,
@@ -92,31 +83,17 @@ FORMATS = (
     ),
     FrameFormat(
         name="Photron .mraw with .cihx or .cih",
-        endings=(),
-        recognises=lambda path, _: path.suffix.lower() in MRAW_ENDINGS,
-        source=MrawFile,
         movies=MRAW_ENDINGS,
+        recognises=_ends(*MRAW_ENDINGS),
+        source=MrawFile,
     ),
-    FrameFormat(
-        name="NorPix .seq",
-        endings=(),
-        recognises=lambda path, _: path.suffix.lower() == ".seq",
-        source=SeqFile,
-        movies=(".seq",),
-    ),
-    FrameFormat(
-        name="stacks in .npy files",
-        endings=(),
-        recognises=lambda path, _: path.suffix.lower() == ".npy",
-        source=NpyFile,
-        movies=(".npy",),
-    ),
+    FrameFormat(name="NorPix .seq", movies=(".seq",), recognises=_ends(".seq"), source=SeqFile),
+    FrameFormat(name="stacks in .npy files", movies=(".npy",), recognises=_ends(".npy"), source=NpyFile),
     FrameFormat(
         name="stacks in HDF5 files",
-        endings=(),
+        movies=HDF5_ENDINGS,
         recognises=lambda path, _: Path(split_dataset(path)[0]).suffix.lower() in HDF5_ENDINGS,
         source=Hdf5File,
-        movies=HDF5_ENDINGS,
     ),
 )
 """The first that recognises a file reads it."""
@@ -124,38 +101,41 @@ FORMATS = (
 FRAME_ENDINGS = tuple(ending for known in FORMATS for ending in known.endings)
 """Endings (lower case) of the files that count as frames when a folder is listed."""
 
-
-_ADVICE = {
+_ADVICE = (
     (
-        ".mp4",
-        ".avi",
-        ".mov",
-        ".mkv",
-        ".wmv",
-    ): "a movie whose frames are compressed or demosaiced, so that its samples are "
-    "no longer the sensor's: give the camera's own file, or export from it DNG or 16-bit TIFF, without demosaicing",
-    tuple(ending for known in FORMATS for ending in known.movies): "a movie or a stack: a folder stands for frames in "
-    "files of their own; name the movie itself, or a pattern",
-    (".jpg", ".jpeg", ".bmp", ".gif", ".heic", ".webp"): "a picture that is no raw frame: let the camera record DNG or "
-    "16-bit TIFF, without demosaicing",
-    (".raw", ".bin"): "a file without a camera's header: state its shape and dtype (frames.shape and frames.dtype, or "
-    "--shape and --dtype)",
-}
+        (".mp4", ".avi", ".mov", ".mkv", ".wmv"),
+        "a movie whose frames are compressed or demosaiced, so that its samples are no longer the sensor's: give the "
+        "camera's own file, or export from it DNG or 16-bit TIFF, without demosaicing",
+    ),
+    (
+        tuple(ending for known in FORMATS for ending in known.movies),
+        "a movie or a stack: a folder stands for frames in files of their own; name the movie itself, or a pattern",
+    ),
+    (
+        (".jpg", ".jpeg", ".bmp", ".gif", ".heic", ".webp"),
+        "a picture that is no raw frame: let the camera record DNG or 16-bit TIFF, without demosaicing",
+    ),
+    (
+        (".raw", ".bin"),
+        "a file without a camera's header: state its shape and dtype (frames.shape and frames.dtype, or --shape and "
+        "--dtype)",
+    ),
+)
 """By endings, what files are that are no frames, and what to do."""
 
 
 def advice(path: Path) -> str:
-    """What a file is that is no frame, and what to do; empty where that is not known."""
-    return next((text for endings, text in _ADVICE.items() if path.suffix.lower() in endings), "")
+    """Return what a file is that is no frame, and what to do; empty where that is not known."""
+    return next((text for endings, text in _ADVICE if path.suffix.lower() in endings), "")
 
 
 class _UnknownFile(FrameSource):
-    """A file that no format recognises: reading it says which are."""
+    """A file that no format recognises: reading it raises an error that lists the formats."""
 
     def _shape(self) -> NoReturn:
         if text := advice(self.path):
             raise FrameError(f"{self.path} is {text}")
-        with self.path.open("rb"):  # one that cannot be opened is told as that
+        with self.path.open("rb"):  # one that cannot be opened is reported as that
             allowed = ", ".join(known.name for known in FORMATS)
         raise FrameError(f"{self.path} is not a frame that rgbmidic reads; allowed are {allowed}")
 
@@ -164,16 +144,21 @@ class _UnknownFile(FrameSource):
 
 
 def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None = None) -> FrameSource:
-    """The file as a source of frames; a missing or damaged one is told when it is read.
+    """Return the file as a source of frames; a missing or damaged one is reported when it is read.
 
     Parameters
     ----------
     path
         Frame file.
     stated
-        What the user says of it (`path` and `reference` are not used); it must agree with what the file tells.
+        What the user states of it (`path` and `reference` are not used); it must agree with what the file states.
     camera
-        What a calibration knows of it; it must agree with both, and fills in what neither tells.
+        What a calibration states of it; it must agree with both, and fills in what neither states.
+
+    Returns
+    -------
+    FrameSource
+        Of the first of `FORMATS` that recognises the file.
     """
     path = Path(path)
     source = next((known.source for known in FORMATS if known.recognises(path, stated)), _UnknownFile)
@@ -181,7 +166,7 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
 
 
 def reader_name(source: FrameSource) -> str:
-    """Name of the format that a source is read as."""
+    """Return the name of the format that a source is read as."""
     return next((known.name for known in FORMATS if known.source is type(source)), "unknown")
 
 
@@ -197,19 +182,19 @@ def read_frame(
 ) -> Mosaic | ChannelFrame:
     """Read one raw frame.
 
-    Camera raws (LibRaw) tell everything themselves. TIFF and PNG tell size and number of channels; headerless ``.raw``
-    and ``.bin`` files tell nothing. What is stated and also told by the file must agree.
+    Camera raws (LibRaw) state everything themselves. TIFF and PNG state size and number of channels; headerless
+    ``.raw`` and ``.bin`` files state nothing. What the caller states and what the file states must agree.
 
     Parameters
     ----------
     path
         Frame file.
     kind
-        None: what the file tells (three channels: ``"rgb"``), else ``"bayer"``.
+        None: what the file states (three channels: ``"rgb"``), else ``"bayer"``.
     cfa
-        Bayer pattern of the first visible pixels; needed for a mosaic whose file does not tell it.
+        Bayer pattern of the first visible pixels; needed for a mosaic whose file does not state it.
     black_level, white_level
-        Grey levels (DN); where neither stated nor told 0 and the largest value of the sample type.
+        Grey levels (DN); where nobody states them 0 and the largest value of the sample type.
     shape, dtype
         Rows and columns, and sample type (``"uint8"``, ``"uint16"`` little-endian, ``">u2"`` big-endian) of headerless
         files.

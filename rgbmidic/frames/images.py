@@ -1,12 +1,7 @@
-"""Pictures decoded by OpenCV.
+"""Files of one picture: PNG and headerless samples in, plain 16-bit TIFF and raw Bayer DNG out.
 
-PNG files: grey or RGB, 8 or 16 bit.
-
-Files that hold nothing but the samples of one frame, row by row.
-
-Frames out: uncompressed Bayer DNG that LibRaw reads back bit by bit, and plain 16-bit TIFF.
-
-The DNG tags follow the Adobe DNG specification 1.4, chapter 4.
+PNG is decoded by OpenCV, with every checksum verified. The DNG tags follow the Adobe DNG specification 1.4, chapter 4;
+LibRaw reads the frames back bit by bit.
 """
 
 from __future__ import annotations
@@ -37,7 +32,19 @@ _PLACE = re.compile(r"^\[ERROR\S*\] global \S+ \S+ ")
 
 
 def decode(content: bytes, path: Path) -> AnyArray:
-    """Samples as stored, (H, W) or (H, W, C), three channels in the order R, G, B; `path` is for messages.
+    """Decode a picture with OpenCV.
+
+    Parameters
+    ----------
+    content
+        The file's bytes.
+    path
+        The file, for messages.
+
+    Returns
+    -------
+    ndarray, shape (H, W) or (H, W, C)
+        Samples as stored; three channels in the order R, G, B.
 
     Raises
     ------
@@ -48,14 +55,14 @@ def decode(content: bytes, path: Path) -> AnyArray:
 
     previous = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
-        with complaints(b"libpng error", b"libpng warning", b"[ERROR", b"> ") as told:
+        with complaints(b"libpng error", b"libpng warning", b"[ERROR", b"> ") as lines:
             # OpenCV opens no non-ASCII names on Windows, hence decoding from memory
             image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     finally:
         cv2.utils.logging.setLogLevel(previous)
-    errors = [line for line in told if not line.startswith("libpng warning")]  # of parts that are not used
+    errors = [line for line in lines if not line.startswith("libpng warning")]  # of parts that are not used
     if image is None or errors:  # libtiff's errors do not always keep OpenCV from giving a picture
         raise damaged(path, _PLACE.sub("", errors[0]) if errors else "its image data cannot be decoded")
     return image[..., ::-1] if image.ndim == 3 and image.shape[2] == 3 else image
@@ -92,7 +99,7 @@ class PngFile(FrameSource):
 
 
 def _check_chunks(content: bytes, path: Path) -> None:
-    """An error where a checksum up to IEND is wrong, or the file ends before it."""
+    """Refuse a file with a wrong checksum up to IEND, or that ends before it."""
     start, name, whole = len(_SIGNATURE), b"", memoryview(content)
     while name != b"IEND":
         if start + 12 > len(content):
@@ -107,7 +114,7 @@ def _check_chunks(content: bytes, path: Path) -> None:
 
 
 def is_headerless(path: Path, stated: FrameSettings) -> bool:
-    """Whether the name, or for ``.raw`` a stated shape, says so: cameras of several makers write .raw with a header."""
+    """Return whether a file has no header: .bin, and .raw whose shape is stated, as some cameras' .raw have one."""
     return path.suffix.lower() == ".bin" or (path.suffix.lower() == ".raw" and stated.shape is not None)
 
 
@@ -170,15 +177,23 @@ def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float
             f"a DNG needs at least {MINIMUM_DNG_SIZE} rows and columns (LibRaw refuses smaller ones), "
             f"not {mosaic.values.shape}: {path}"
         )
-    tags = [*_cfa_tags(mosaic, path), *_colour_tags((1.0, 1.0, 1.0) if white_balance is None else white_balance)]
+    balance = (1.0, 1.0, 1.0) if white_balance is None else white_balance
+    tags = [*_cfa_tags(mosaic, path), *_colour_tags(balance)]
     _write(path, mosaic.values, photometric=_PHOTOMETRIC_CFA, extratags=tags, rowsperstrip=mosaic.values.shape[0])
 
 
 def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
     """Write a frame as an uncompressed 16-bit TIFF: (H, W) for a mosaic or monochrome frame, (H, W, 3) for RGB.
 
-    A TIFF does not tell pattern and levels: whoever reads it states them. An existing file is replaced, once the
+    A TIFF holds neither pattern nor levels: whoever reads it states them. An existing file is replaced, once the
     new one is complete.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    frame
+        The raw frame.
     """
     if isinstance(frame, ChannelFrame) and len(frame.values) == 3:
         _write(path, np.ascontiguousarray(np.moveaxis(frame.values, 0, -1)), photometric="rgb")

@@ -1,12 +1,12 @@
-"""Photron's movies: the samples in .mraw and, beside it, what the camera tells of them in .cih or .cihx.
+"""Movies whose samples lie uncompressed at even distances: Photron's .mraw and NorPix StreamPix's .seq.
 
-No layout is published. The names are those of headers that FASTCAM Viewer 3 (.cih, text) and 4 (.cihx, XML inside a
-binary file) wrote; samples of 12 bit are packed as in a file of a Nova S16, those of 10 bit are taken to be so, too.
+Photron publishes no layout of .mraw. The names are those of headers that FASTCAM Viewer 3 (.cih, text) and 4 (.cihx,
+XML inside a binary file) wrote; samples of 12 bit are packed as in a file of a Nova S16, and those of 10 bit are taken
+to be so, too.
 
-NorPix StreamPix's sequences (.seq): uncompressed monochrome or raw samples with a time stamp behind each frame.
-
-Layout: NorPix, "The NorPix Sequence File Format (.seq)", 2015; before version 5 of the header the frames begin behind
-its 1024 bytes, and stamps have no microseconds. No file of a camera was at hand: read are files written by the tests.
+The layout of .seq is that of NorPix, "The NorPix Sequence File Format (.seq)", 2015. Before version 5 of the header the
+frames begin behind its 1024 bytes, and time stamps have no microseconds. No file of a camera was at hand: the reader is
+tested with files that the tests write.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import BinaryIO, NoReturn
+from typing import BinaryIO, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -28,11 +28,42 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import Layout, StoredFrame, damaged, unpack_bits
-from rgbmidic.typing import AnyArray
 
 __all__ = ["MRAW_ENDINGS", "MrawFile", "SeqFile"]
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Header:
+    """What is known of the frames of a movie.
+
+    `bits` of a sample are stored `shift` above the lowest of `stored_bits`, in the byte `order` of numpy; `oldest` is
+    the place in the file of the frame that was recorded first.
+    """
+
+    shape: tuple[int, int]
+    stored_bits: int
+    order: Literal["<", ">"] = "<"
+    bits: int
+    shift: int
+    cfa: str | None = None
+    oldest: int = 0
+    layout: Layout
+    recording: Recording
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame."""
+        data = self.layout.read(path, (index + self.oldest) % self.layout.count, rows, self.shape[0])
+        if self.stored_bits in (8, 16):
+            values = np.frombuffer(data, dtype=f"{self.order}u{self.stored_bits // 8}")
+        else:
+            values = unpack_bits(data, self.stored_bits)
+        values = (values >> self.shift).reshape(len(rows), -1)
+        return StoredFrame(values=values, kind="bayer" if self.cfa else None, cfa=self.cfa, bits=self.bits)
+
+
+# Photron .mraw
 
 MRAW_ENDINGS = (".mraw", ".cihx", ".cih")
 
@@ -64,76 +95,50 @@ _LARGEST = 2**40
 class MrawFile(Movie):
     """A movie of a Photron camera, named by its samples or by its header, of monochrome or raw samples.
 
-    The header does not tell the Bayer pattern: its colour type "Raw" occurs on monochrome cameras, too.
+    The header does not state the Bayer pattern: its colour type "Raw" occurs on monochrome cameras, too.
     """
 
     def __post_init__(self) -> None:
         if self.path.suffix.lower() != ".mraw":
             object.__setattr__(self, "path", _beside(self.path, ".mraw") or self.path.with_suffix(".mraw"))
 
-    def _recording(self) -> Recording:
-        return self._header().recording
-
-    def _shape(self) -> tuple[int, int]:
-        return self._header().shape
-
-    def _stored(self, index: int) -> StoredFrame:
-        return self._rows(index, range(self._shape()[0]))
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        header = self._header()
-        values = header.samples(header.layout.read(self.path, index, rows, header.shape[0]))
-        return StoredFrame(values=values, bits=header.bits)
-
     def _header(self) -> _Header:
         found = _beside(self.path, *MRAW_ENDINGS[1:])
         if found is None:
             raise FrameError(f"{self.path} needs its header {self.path.stem}.cihx or {self.path.stem}.cih beside it")
-        return _header(found)
+        return _mraw_header(found)
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        return self._header().read(self.path, index, rows)
 
 
 def _beside(path: Path, *endings: str) -> Path | None:
-    """The file of the same name with the first of these endings that exists, in lower or upper case."""
+    """Find the file of the same name with the first of these endings that exists, in lower or upper case."""
     spelled = (path.with_suffix(text) for ending in endings for text in (ending, ending.upper()))
     return next((other for other in spelled if other.is_file()), None)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Header:
-    """What is known of the frames; `bits` of a sample are stored `shift` above the lowest of `stored_bits`."""
-
-    shape: tuple[int, int]
-    stored_bits: int
-    bits: int
-    shift: int
-    layout: Layout
-    recording: Recording
-
-    def samples(self, data: bytes) -> AnyArray:
-        if self.stored_bits in (8, 16):
-            values: AnyArray = np.frombuffer(data, dtype=f"<u{self.stored_bits // 8}")
-        else:
-            values = unpack_bits(data, self.stored_bits)
-        return (values >> self.shift).reshape(-1, self.shape[1])
-
-
 @remembered
-def _header(path: Path) -> _Header:
+def _mraw_header(path: Path) -> _Header:
     with path.open("rb") as file:
         content = file.read(_HEADER_BYTES)
     entries = _Entries(path=path, found=_xml(content, path) if path.suffix.lower() == ".cihx" else _lines(content))
     rows, columns = entries.whole("Image Height"), entries.whole("Image Width")
     stored_bits = _stored_bits(entries)
-    depth = entries.whole("EffectiveBit Depth", stored_bits)
+    depth, side = entries.whole("EffectiveBit Depth", stored_bits), entries.text("EffectiveBit Side", "Lower").lower()
     size, rest = divmod(rows * columns * stored_bits, 8)
     if min(rows, columns) < 1 or rest:
         raise damaged(path, f"it announces {rows} rows of {columns} samples of {stored_bits} bit")
     count = entries.whole("Total Frame")
+    if side not in ("lower", "higher", "upper") or not 8 <= depth <= 16:
+        raise damaged(path, f'it announces {depth} effective bits, "{side}"; allowed are lower and higher')
+    if side == "lower" and depth > stored_bits:
+        logger.warning("%s holds the lower %d of %d bits: brighter samples are lost", path, stored_bits, depth)
     return _Header(
         shape=(rows, columns),
         stored_bits=stored_bits,
         bits=min(stored_bits, depth),
-        shift=_shift(entries, stored_bits, depth),
+        shift=0 if side == "lower" else max(stored_bits - depth, 0),
         layout=Layout.checked(path, count=count, start=0, size=size),
         recording=_recording(entries, count, depth),
     )
@@ -146,22 +151,25 @@ class _Entries:
     path: Path
     found: Mapping[str, str]
 
+    def text(self, name: str, default: str = "") -> str:
+        return self.found.get(name, default)
+
     def whole(self, name: str, default: int | None = None) -> int:
-        text = self.found.get(name, "" if default is None else str(default))
+        text = self.text(name, "" if default is None else str(default))
         if not re.fullmatch(r"-?[0-9]{1,13}", text) or abs(int(text)) > _LARGEST:
-            raise damaged(self.path, f'its "{name}" is "{text}"' if text else f'it does not tell "{name}"')
+            raise damaged(self.path, f'its "{name}" is "{text}"' if text else f'it does not state "{name}"')
         return int(text)
 
     def number(self, name: str) -> Fraction | None:
-        """A positive number; None where there is none."""
-        text = self.found.get(name, "")
+        """Return a positive number; None where there is none."""
+        text = self.text(name)
         if not _NUMBER.fullmatch(text) or re.search("/0+$", text):
             return None
         return Fraction(text) or None
 
 
 def _lines(content: bytes) -> dict[str, str]:
-    """Entries "name : value" of the first header: a movie that was saved again carries the older ones behind."""
+    """Find the entries "name : value" of the first header: a movie that was saved again carries the older ones too."""
     found: dict[str, str] = {}
     for line in content.decode("latin-1").splitlines():
         name, colon, value = line.partition(":")
@@ -183,10 +191,11 @@ def _xml(content: bytes, path: Path) -> dict[str, str]:
 
 
 def _stored_bits(entries: _Entries) -> int:
-    kind, bits = entries.found.get("Color Type", ""), entries.whole("Color Bit")
+    """Return the bits that a sample is stored in; refuse what are not the sensor's own samples."""
+    kind, bits = entries.text("Color Type"), entries.whole("Color Bit")
     if kind.lower() not in ("mono", "raw") or bits in (24, 30, 36, 48):
         raise FrameError(
-            f'{entries.path} tells {bits} bit of colour type "{kind}": its samples are no longer the sensor\'s; save '
+            f'{entries.path} states {bits} bit of colour type "{kind}": its samples are no longer the sensor\'s; save '
             "the movie as raw (Bayer) or monochrome"
         )
     if bits not in (8, 10, 12, 16):
@@ -194,120 +203,86 @@ def _stored_bits(entries: _Entries) -> int:
     return bits
 
 
-def _shift(entries: _Entries, stored_bits: int, depth: int) -> int:
-    """Bits of a stored sample below those that the camera's converter gave."""
-    side = entries.found.get("EffectiveBit Side", "Lower").lower()
-    if side not in ("lower", "higher", "upper") or not 8 <= depth <= 16:
-        raise damaged(entries.path, f'it announces {depth} effective bits, "{side}"; allowed are lower and higher')
-    if side == "lower" and depth > stored_bits:
-        logger.warning("%s holds the lower %d of %d bits: brighter samples are lost", entries.path, stored_bits, depth)
-    return 0 if side == "lower" else max(stored_bits - depth, 0)
-
-
 def _recording(entries: _Entries, count: int, depth: int) -> Recording:
-    """Frames count from the trigger, and every `step`-th is stored."""
+    """Return how the frames were recorded: they count from the trigger, and every `step`-th is stored."""
     step = max(entries.whole("Save Step", 1), 1)
     first = entries.whole("Start Frame", 0) - entries.whole("Correct Trigger Frame", 0)
+    numbers = range(first, first + count * step, step)
     rate, shutter = entries.number("Record Rate(fps)"), entries.number("Shutter Speed(s)")
     exposure = entries.number("Shutter Type2(nsec)") or (10**9 * shutter if shutter else None)
+    try:
+        times = None if rate is None else even_times(numbers, 1 / rate)
+    except OverflowError:
+        text = f"it announces frames up to number {numbers[-1]} at {float(rate or 0)} per second"
+        raise damaged(entries.path, text) from None
     return Recording(
         count=count,
         bit_depth=depth,
         frame_rate=None if rate is None else float(rate),
         exposure_ns=None if exposure is None else round(exposure),
         trigger=-first // step,
-        times_ns=None if rate is None else _times_ns(range(first, first + count * step, step), rate, entries.path),
+        times_ns=times,
     )
 
 
-def _times_ns(numbers: range, rate: Fraction, path: Path) -> Integers:
-    try:
-        return even_times(numbers, 1 / rate)
-    except OverflowError:
-        raise damaged(path, f"it announces frames up to number {numbers[-1]} at {float(rate)} per second") from None
+# NorPix .seq
 
-
-_MAGIC = 0xFEED
-_HEADER = struct.Struct("<I24xi4x512x6I3Id16xi8xI32xI364x")
+_SEQ_MAGIC = 0xFEED
+_SEQ_FIELDS = struct.Struct("<I24xi4x512x6I3Id16xi8xI32xI364x")
 """Magic; version; width, height, bits stored, bits used, bytes, format; frames, origin, distance; rate; pattern;
 compression; oldest frame."""
 
-_RAW = {
-    100: ("<u2", False),
-    101: ("<u2", False),
-    112: ("<u2", True),
-    113: ("<u2", True),
-    114: (">u2", True),
-    115: (">u2", True),
+_RAW: dict[int, tuple[Literal["<", ">"], bool]] = {
+    100: ("<", False),
+    101: ("<", False),
+    112: ("<", True),
+    113: ("<", True),
+    114: (">", True),
+    115: (">", True),
 }
-"""Monochrome and raw Bayer formats: samples above 8 bit, and whether their highest bit is the type's highest."""
-
+"""Monochrome and raw Bayer formats: byte order, and whether a sample's highest bit is the highest of its type."""
 _BAYER = (101, 113, 115)
-_PATTERNS = {1: "GRBG", 2: "BGGR", 3: "RGGB"}
-"""By NorPix's `eHBayerPatternOrigin`; 0, green beside blue, is also what a header holds that tells no pattern."""
-
 _PACKED = range(131, 135)
+_PATTERNS = {1: "GRBG", 2: "BGGR", 3: "RGGB"}
+"""By NorPix's `eHBayerPatternOrigin`; 0, green beside blue, is also what a header holds that states no pattern."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeqFile(Movie):
-    """An uncompressed sequence of StreamPix."""
+    """An uncompressed sequence of StreamPix, of monochrome or raw samples with a time stamp behind each frame."""
 
-    def _recording(self) -> Recording:
-        return _seq_header(self.path).recording
-
-    def _shape(self) -> tuple[int, int]:
-        return _seq_header(self.path).shape
-
-    def _stored(self, index: int) -> StoredFrame:
-        return self._rows(index, range(self._shape()[0]))
+    def _header(self) -> _Header:
+        return _seq_header(self.path)
 
     def _rows(self, index: int, rows: range) -> StoredFrame:
-        header = _seq_header(self.path)
-        place = (index + header.oldest) % header.layout.count
-        data = header.layout.read(self.path, place, rows, header.shape[0])
-        values = np.frombuffer(data, dtype=header.dtype).reshape(len(rows), -1) >> header.shift
-        return StoredFrame(values=values, kind="bayer" if header.cfa else None, cfa=header.cfa, bits=header.bits)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _SeqHeader:
-    """What is known of the frames; `oldest` is the place in the file of the frame that was recorded first."""
-
-    shape: tuple[int, int]
-    dtype: str
-    bits: int
-    shift: int
-    cfa: str | None
-    oldest: int
-    layout: Layout
-    recording: Recording
+        return self._header().read(self.path, index, rows)
 
 
 @remembered
-def _seq_header(path: Path) -> _SeqHeader:
+def _seq_header(path: Path) -> _Header:
     with path.open("rb") as file:
-        content = file.read(_HEADER.size)
-        if len(content) < _HEADER.size or int.from_bytes(content[:4], "little") != _MAGIC:
+        content = file.read(_SEQ_FIELDS.size)
+        if len(content) < _SEQ_FIELDS.size or int.from_bytes(content[:4], "little") != _SEQ_MAGIC:
             raise damaged(path, "it does not begin as a NorPix sequence")
-        return _parsed(content, file, path)
-
-
-def _parsed(content: bytes, file: BinaryIO, path: Path) -> _SeqHeader:
-    fields = _HEADER.unpack(content)
-    _, version, columns, rows, stored_bits, bits, size, form, count, _, stride, rate, pattern, compression, oldest = (
-        fields
-    )
-    _check_raw(path, form, compression)
-    if not columns or not rows or stored_bits not in (8, 16) or not 1 <= bits <= stored_bits:
-        raise damaged(path, f"it announces {rows} rows of {columns} samples, {bits} of {stored_bits} bits")
-    if size != rows * columns * stored_bits // 8 or oldest >= max(count, 1):
-        raise damaged(path, f"it announces {size} bytes for {rows} rows of {columns} samples of {stored_bits} bits")
-    layout = Layout.checked(path, count=count, start=8192 if version >= 5 else 1024, size=size, stride=stride)
-    dtype, upper = _RAW[form]
-    return _SeqHeader(
+        _, version, columns, rows, stored_bits, bits, size, form, *others = _SEQ_FIELDS.unpack(content)
+        count, _, stride, rate, pattern, compression, oldest = others
+        if compression or form not in _RAW:
+            what = f"holds colours (format {form}): its samples are no longer the sensor's, and it"
+            what = f"holds packed samples (format {form})" if form in _PACKED else what
+            what = f"is compressed (method {compression})" if compression else what
+            advice = "export it uncompressed, 8 or 16 bit, monochrome or raw Bayer"
+            raise FrameError(f"{path} {what} and is not read: {advice}")
+        if not columns or not rows or stored_bits not in (8, 16) or not 1 <= bits <= stored_bits:
+            raise damaged(path, f"it announces {rows} rows of {columns} samples, {bits} of {stored_bits} bits")
+        if size != rows * columns * stored_bits // 8 or oldest >= max(count, 1):
+            raise damaged(path, f"it announces {size} bytes for {rows} rows of {columns} samples of {stored_bits} bits")
+        layout = Layout.checked(path, count=count, start=8192 if version >= 5 else 1024, size=size, stride=stride)
+        times = _stamps_ns(file, layout, oldest, "<iHH" if version >= 5 else "<iH")
+    order, upper = _RAW[form]
+    return _Header(
         shape=(rows, columns),
-        dtype=dtype if stored_bits == 16 else "u1",
+        stored_bits=stored_bits,
+        order=order,
         bits=bits,
         shift=stored_bits - bits if upper else 0,
         cfa=_PATTERNS.get(pattern) if form in _BAYER else None,
@@ -317,26 +292,13 @@ def _parsed(content: bytes, file: BinaryIO, path: Path) -> _SeqHeader:
             count=count,
             bit_depth=bits,
             frame_rate=rate if math.isfinite(rate) and rate > 0 else None,
-            times_ns=_seq_times_ns(file, layout, oldest, "<iHH" if version >= 5 else "<iH"),
+            times_ns=times,
         ),
     )
 
 
-def _check_raw(path: Path, form: int, compression: int) -> None:
-    if compression:
-        _refuse(path, f"is compressed (method {compression})")
-    if form in _PACKED:
-        _refuse(path, f"holds packed samples (format {form})")
-    if form not in _RAW:
-        _refuse(path, f"holds colours (format {form}): its samples are no longer the sensor's, and it")
-
-
-def _refuse(path: Path, what: str) -> NoReturn:
-    raise FrameError(f"{path} {what} and is not read: export it uncompressed, 8 or 16 bit, monochrome or raw Bayer")
-
-
-def _seq_times_ns(file: BinaryIO, layout: Layout, oldest: int, stamp: str) -> Integers | None:
-    """Time of every frame from the first; None where the file ends before the last stamp or they do not grow."""
+def _stamps_ns(file: BinaryIO, layout: Layout, oldest: int, stamp: str) -> Integers | None:
+    """Read the time of every frame from the first; None where the file ends before the last or they do not grow."""
     size = struct.calcsize(stamp)
     behind = layout.start + layout.size
     if layout.stride < layout.size + size or file.seek(0, 2) < behind + (layout.count - 1) * layout.stride + size:

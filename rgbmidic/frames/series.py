@@ -63,7 +63,7 @@ class FrameSeries:
         object.__setattr__(self, "chosen", self.chosen or range(len(self)))
 
     def __len__(self) -> int:
-        """Number of mechanical states."""
+        """Return the number of mechanical states."""
         return len(self.begins)
 
     @property
@@ -81,7 +81,7 @@ class FrameSeries:
 
     @property
     def recording(self) -> Recording:
-        """How the frames were recorded, as the first file tells it."""
+        """How the frames were recorded, as the first file states it."""
         return self.lights[0][0].recording
 
     @property
@@ -112,24 +112,27 @@ class FrameSeries:
         return tuple(source.read(inner, window) for source, inner in self._locate(index))
 
     def gone(self) -> str:
-        """The lights of which no file exists any more: first file and number of files; empty where there is none."""
+        """Name the lights of which no file exists any more, by first file and number of files; else empty."""
         exists = os.path.exists  # which raises nothing, whatever the disk says
         lost = [sources for sources in self.lights if not any(exists(source.path) for source in sources)]
         return "; ".join(f"{sources[0].path} and all {len(sources)} files of its series" for sources in lost)
 
     def name(self, index: int) -> str:
-        """Name of state `index`; of several lights in succession joined by " + "."""
+        """Return the name of state `index`; those of several lights in succession joined by " + "."""
         return " + ".join(source.name(inner) for source, inner in self._locate(index))
 
     def time_ns(self, index: int) -> int | None:
-        """When state `index` was taken (the first light's frame), in ns from the trigger; None where no file tells."""
+        """Return when state `index` was taken (the first light's frame), in ns from the trigger; None: not stated."""
         source, inner = next(self._locate(index))
         times = source.recording.times_ns
         return None if times is None else int(times[inner])
 
     def inputs(self, index: int, window: Window | None = None) -> dict[str, str]:
-        """Path and fingerprint of every file that state `index` comes from; where a `window` of it is read, that of
-        the sampled content (`file_fingerprint`), so that the file is not read whole for it."""
+        """Return path and fingerprint of every file that state `index` comes from.
+
+        Where a `window` of it is read, the fingerprint is that of the sampled content (`file_fingerprint`), so that the
+        file is not read whole for it.
+        """
         in_part = window is not None and not window.is_whole
         sources = (source for source, _ in self._locate(index))
         return {
@@ -137,9 +140,12 @@ class FrameSeries:
         }
 
     def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
-        """SHA-256 of the names and the sampled content (`file_fingerprint`) of all files, in their order, and the names
-        of those that count with their name alone: those that cannot be read, which fail their own frames only, and
-        those named as `unread` when the fingerprint was made that this one is compared with."""
+        """Return the SHA-256 of names and sampled content of all files, and the names of those that count without it.
+
+        The sampled content is that of `file_fingerprint`, the order that of the files. With their name alone count
+        those that cannot be read, which fail their own frames only, and those named as `unread` when the fingerprint
+        was made that this one is compared with.
+        """
         digest, without = hashlib.sha256(), []
         for source in (source for sources in self.lights for source in sources):
             name, content = legible(source.path.name), "unread"
@@ -152,7 +158,7 @@ class FrameSeries:
         return digest.hexdigest(), tuple(without)
 
     def _locate(self, index: int) -> Iterator[tuple[FrameSource, int]]:
-        """Source, and frame in it, of every light of a state."""
+        """Return source, and frame in it, of every light of a state."""
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in a series of {len(self)}")
         begin = self.begins[index]
@@ -174,21 +180,30 @@ def open_series(
     base
         Folder that relative paths start from.
     camera
-        What a calibration knows of them; it must agree with files and settings, and fills in what neither tells.
+        What a calibration states of them; it must agree with files and settings, and fills in what neither states.
     in_order
         Whether the frames follow one another in time, so that numbers missing in their names or in the camera's count
-        are told (as a warning) and kept as gaps in `FrameSeries.numbers`.
+        are reported (as a warning) and kept as gaps in `FrameSeries.numbers`.
+
+    Returns
+    -------
+    FrameSeries
 
     Raises
     ------
     FrameError
         No file matches, a movie's header is damaged, a frame has another size than the first, the lights have different
         frames, or a reference frame or the first or last frame does not exist. A damaged file of one frame is left for
-        `FrameSeries.read` to tell.
+        `FrameSeries.read` to report.
     """
     files = [list_frames(text, base) for text in settings.path]
-    lights = tuple(_sources(paths, settings, camera) for paths in files)
-    _check_counts(settings, lights)
+    opened = [[open_source(path, settings, camera) for path in paths] for paths in files]
+    # a movie in two files, samples and header, is one source where a pattern matches both
+    lights = tuple(tuple({source.path: source for source in sources}.values()) for sources in opened)
+    counts = [sum(map(len, sources)) for sources in lights]
+    if len(set(counts)) > 1:
+        numbers_given = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
+        raise FrameError(f"lights fired in succession need equal numbers of frames; given are {numbers_given}")
     numbers = _numbers(settings, lights) if in_order else ()
     if settings.lights > 1:
         begins, numbers = _turns(numbers or range(sum(map(len, lights[0]))), settings.lights)
@@ -199,14 +214,8 @@ def open_series(
     return replace(series, chosen=_chosen(settings, len(series)))
 
 
-def _sources(paths: Sequence[Path], settings: FrameSettings, camera: Camera | None) -> tuple[FrameSource, ...]:
-    """One for each file; a movie in two files, samples and header, is one source where a pattern matches both."""
-    sources = [open_source(path, settings, camera) for path in paths]
-    return tuple({source.path: source for source in sources}.values())
-
-
 def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """First frame and number of every state of which no light's frame is lost, where the lights fire in turn."""
+    """Return first frame and number of every state of which no light's frame is lost, where the lights fire in turn."""
     place = {number: index for index, number in enumerate(numbers)}
     whole = [
         (place[number], number // lights)
@@ -220,7 +229,7 @@ def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[
 
 
 def _chosen(settings: FrameSettings, count: int) -> range:
-    """The states that the settings choose.
+    """Return the states that the settings choose.
 
     Raises
     ------
@@ -234,29 +243,27 @@ def _chosen(settings: FrameSettings, count: int) -> range:
     return range(settings.first, last + 1, settings.step)
 
 
-def _check_counts(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -> None:
-    counts = [sum(map(len, sources)) for sources in lights]
-    if len(set(counts)) > 1:
-        told = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
-        raise FrameError(f"lights fired in succession need equal numbers of frames; given are {told}")
-
-
 def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -> Sequence[int]:
-    """Frame numbers that the names or the headers of all lights tell; empty where they tell none."""
+    """Return the frame numbers that the names or the headers of all lights hold; empty where they hold none."""
     found: dict[str, tuple[int, ...]] = {}
     for text, sources in zip(settings.path, lights, strict=True):
         if counts := _counts(sources):
             step = math.gcd(*(count - counts[0] for count in counts)) or 1
             found[text] = tuple((count - counts[0]) // step for count in counts)
-            _tell_gaps(text, counts, step)
+            expected = range(counts[0], counts[-1] + 1, step)
+            # where more numbers are missing than there are, somebody chose some frames
+            if len(counts) < len(expected) <= 2 * len(counts):
+                missing = sorted(set(expected) - set(counts))
+                gaps = f"{len(missing)} in the numbering, {_listed(missing)}; the frames after keep their numbers"
+                logger.warning("frames are missing from %s: %s", text, gaps)
     if len(set(found.values())) > 1:
-        told = "; ".join(f"{text}: {_listed(numbers)}" for text, numbers in found.items())
-        raise FrameError(f"lights fired in succession need the same frames; those there are, counted from 0, {told}")
+        there = "; ".join(f"{text}: {_listed(numbers)}" for text, numbers in found.items())
+        raise FrameError(f"lights fired in succession need the same frames; those there are, counted from 0, {there}")
     return next(iter(found.values()), ())
 
 
 def _counts(sources: Sequence[FrameSource]) -> tuple[int, ...]:
-    """The camera's numbers in a movie's header, else those in the names.
+    """Return the camera's numbers in a movie's header, else those in the names.
 
     Empty where there are none: a counter is the only thing in which the names differ.
     """
@@ -270,15 +277,6 @@ def _counts(sources: Sequence[FrameSource]) -> tuple[int, ...]:
         return ()
     counts = tuple(int(part) for part in differing[0])
     return counts if len(set(counts)) == len(counts) else ()
-
-
-def _tell_gaps(text: str, counts: tuple[int, ...], step: int) -> None:
-    """A warning for missing numbers; where they are more than those that are there, somebody chose some frames."""
-    expected = range(counts[0], counts[-1] + 1, step)
-    if len(counts) < len(expected) <= 2 * len(counts):
-        missing = sorted(set(expected) - set(counts))
-        told = f"{len(missing)} in the numbering, {_listed(missing)}; the frames after keep their numbers"
-        logger.warning("frames are missing from %s: %s", text, told)
 
 
 def _listed(numbers: Sequence[int], most: int = 10) -> str:
@@ -297,7 +295,7 @@ def _check_sizes(series: FrameSeries) -> None:
 
 
 def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]:
-    """Frame files in natural order (frame9 before frame10).
+    """List frame files in natural order (frame9 before frame10).
 
     Parameters
     ----------
@@ -306,6 +304,10 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
         behind an HDF5 file or a pattern of them the dataset may be named, as in ``run.h5:/entry/data``.
     base
         Folder that a relative pattern starts from.
+
+    Returns
+    -------
+    tuple of Path
 
     Raises
     ------
@@ -320,7 +322,7 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
             files = [file for file in found if file.suffix.lower() in FRAME_ENDINGS]
         else:
             found = files = _matching(Path(text), Path(base))
-        files = [file for file in files if not file.is_dir()]  # what else is no file is told when it is read
+        files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read
     except OSError as error:
         raise FrameError(f"the frames {pattern} cannot be looked for: {disk_reason(error)}") from None
     if not files:
@@ -331,7 +333,7 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
 
 
 def _matching(pattern: Path, base: Path) -> list[Path]:
-    """Files that match; what exists of the pattern's beginning is taken literally, brackets included."""
+    """Find files that match; what exists of the pattern's beginning is taken literally, brackets included."""
     parts = list(pattern.parts)
     while parts and (base / parts[0]).exists():
         base /= parts.pop(0)

@@ -1,4 +1,4 @@
-"""What a test's frames are read from: files of one frame or several."""
+"""Sources of a test's frames: files of one frame or of several, read frame by frame or in part."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, wraps
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from rgbmidic.errors import FrameError, disk_reason, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings, regular
 
-__all__ = ["FrameSource", "Movie", "file_fingerprint", "file_hash", "remembered"]
+__all__ = ["FrameSource", "Movie", "MovieHeader", "file_fingerprint", "file_hash", "remembered"]
 
 _T = TypeVar("_T")
 _SAMPLES, _PIECE = 64, 4096
-"""Pieces of a file, and their bytes, that its fingerprint is made of."""
+"""Number of the pieces of a file, and bytes of each (a page of memory), that its fingerprint is made of: 256 KiB are
+read in a millisecond; a movie that was exchanged differs in all of them, one that was cut in its size."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,9 +35,9 @@ class FrameSource(ABC):
     path
         The file; it need not exist before it is read.
     stated
-        What the user says of it.
+        What the user states of it.
     camera
-        What a calibration knows of it.
+        What a calibration states of it.
     """
 
     path: Path
@@ -56,15 +57,15 @@ class FrameSource(ABC):
 
     @property
     def recording(self) -> Recording:
-        """How the frames were recorded, from the header alone; a file of one frame tells nothing and is not read."""
+        """How the frames were recorded, from the header alone; a file of one frame states nothing and is not read."""
         return Recording()
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return self.recording.count
 
     def name(self, index: int) -> str:
-        """What to call a frame in messages and results: the file's name."""
+        """Return the name of a frame in messages and results: the file's name."""
         return legible(self.path.name)
 
     def read(self, index: int, window: Window | None = None) -> Mosaic | ChannelFrame:
@@ -79,23 +80,26 @@ class FrameSource(ABC):
             There is no such frame.
         """
         shape = None if window is None or window.is_whole else window.frame
-        return raw_frame(self.told(index, window), self.stated, self.path, self.camera, shape)
+        return raw_frame(self.stored(index, window), self.stated, self.path, self.camera, shape)
 
-    def told(self, index: int, window: Window | None = None) -> StoredFrame:
-        """The samples of frame `index`, or a part of it, with what the file alone tells; raises as `read` does."""
+    def stored(self, index: int, window: Window | None = None) -> StoredFrame:
+        """Return the samples of frame `index`, or of a part of it, with what the file alone states.
+
+        It raises as `read` does.
+        """
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
         with _on_disk(self.path):
             if window is None or window.is_whole:
                 return self._stored(index)
             if (shape := self._shape()) != window.frame:
-                told = "{} rows of {} pixels, the frames of the test {} of {}".format(*shape, *window.frame)
-                raise FrameError(f"{self.path} has {told}")
+                sizes = "{} rows of {} pixels, the frames of the test {} of {}".format(*shape, *window.frame)
+                raise FrameError(f"{self.path} has {sizes}")
             stored = self._rows(index, window.rows)
         return replace(stored, values=stored.values[:, window.columns.start : window.columns.stop])
 
     def _rows(self, index: int, rows: range) -> StoredFrame:
-        """Some rows of a frame, the first of which is a whole multiple of 4: where a format lets only these be read."""
+        """Read some rows of a frame, the first of which is a whole multiple of 4: alone, where the format allows it."""
         stored = self._stored(index)
         return replace(stored, values=stored.values[rows.start : rows.stop])
 
@@ -104,6 +108,18 @@ class FrameSource(ABC):
 
     @abstractmethod
     def _stored(self, index: int) -> StoredFrame: ...
+
+
+class MovieHeader(Protocol):
+    """What the header of a movie states of all its frames."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of every frame."""
+
+    @property
+    def recording(self) -> Recording:
+        """Number, times and settings of the frames."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,24 +139,33 @@ class Movie(FrameSource):
             The file is missing, or its header is damaged.
         """
         with _on_disk(self.path):
-            return self._recording()
+            return self._header().recording
 
     @property
     def fingerprint(self) -> str:
-        """Of size and samples of the content: a movie is too large to be read whole for it."""
+        """SHA-256 of size and samples of the content: a movie is too large to be read whole for it."""
         return file_fingerprint(self.path)
 
     def name(self, index: int) -> str:
-        """What to call a frame in messages and results: the file's name and the frame's index."""
+        """Return the name of a frame in messages and results: the file's name and the frame's index."""
         return f"{legible(self.path.name)} frame {index}"
 
+    def _shape(self) -> tuple[int, int]:
+        return self._header().shape
+
+    def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
     @abstractmethod
-    def _recording(self) -> Recording: ...
+    def _header(self) -> MovieHeader: ...
+
+    @abstractmethod
+    def _rows(self, index: int, rows: range) -> StoredFrame: ...
 
 
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
-    """Something to read is there, and what the disk refuses becomes a FrameError."""
+    """Check that there is something to read; what the disk refuses becomes a FrameError."""
     try:
         if path.is_symlink() and not path.exists():
             raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
@@ -154,7 +179,7 @@ def _on_disk(path: Path) -> Iterator[None]:
 
 
 def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
-    """What `parse` finds in a file, found once for a file that does not change; an OSError where there is none."""
+    """Decorate `parse` so that a file that does not change is parsed once; an OSError where there is none."""
 
     @lru_cache(maxsize=1024)
     def found(path: Path, size: int, modified: int) -> _T:
@@ -169,7 +194,17 @@ def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
 
 
 def file_hash(path: Path | str) -> str:
-    """SHA-256 of a file, in hexadecimal digits; computed once for a file that does not change.
+    """Return the SHA-256 of a file, in hexadecimal digits; it is computed once for a file that does not change.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
 
     Raises
     ------
@@ -180,7 +215,17 @@ def file_hash(path: Path | str) -> str:
 
 
 def file_fingerprint(path: Path | str) -> str:
-    """SHA-256 of a file's size and of 64 pieces of 4 KiB spread evenly over it: of all of it up to 256 KiB.
+    """Return the SHA-256 of a file's size and of 64 pieces of 4 KiB spread evenly over it: of all of it up to 256 KiB.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
 
     Raises
     ------

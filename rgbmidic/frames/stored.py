@@ -1,8 +1,7 @@
-"""What C libraries write to the process's standard error while they read a file.
+"""Samples as they are stored in a file, checked against what its header, the user and a calibration state of them.
 
-What a file tells of a frame, and how what the user states and a calibration knows join it.
-
-Frames that lie in a file at even distances, and samples that are packed into fewer bytes than they have.
+First what readers share: limits of what is unpacked, frames at even distances, packed samples, the messages of C
+libraries. Then the one place where the statements of file, user and calibration meet (`raw_frame`).
 """
 
 from __future__ import annotations
@@ -41,35 +40,7 @@ __all__ = [
     "unpack_bits",
 ]
 
-_LOCK = threading.Lock()
-
-
-@contextmanager
-def complaints(*starts: bytes) -> Iterator[list[str]]:
-    """A list that holds, afterwards, the lines with one of these starts; other lines (of threads) are passed on.
-
-    Neither rawpy nor OpenCV lets the handlers of LibRaw and libpng be replaced, hence the redirection.
-    """
-    told: list[str] = []
-    with _LOCK, tempfile.TemporaryFile() as file:
-        try:
-            terminal = os.dup(2)
-        except OSError:  # a program without standard error: nothing can reach the user
-            yield told
-            return
-        os.dup2(file.fileno(), 2)
-        try:
-            yield told
-        finally:
-            os.dup2(terminal, 2)
-            file.seek(0)
-            for line in file:
-                if line.startswith(starts):
-                    told.append(line.decode(errors="replace").strip())
-                elif line.strip():
-                    os.write(terminal, line)
-            os.close(terminal)
-
+# What readers share
 
 MAXIMUM_BYTES = 2 * 2**30
 """Largest frame that is unpacked: 1 Gpx of 16 bit, where large sensors have 150 Mpx, or 400 Mpx by shifting."""
@@ -81,14 +52,223 @@ Deflate stores real frames of 8 bit in a quarter (coins in the dark, 4.1), pure 
 in a seventeenth, but empty pictures, which bombs are, in a thousandth.
 """
 
-_T = TypeVar("_T")
-_BLACK_TOLERANCE = 1.0
-"""DN: a file's black levels differ by position, and LibRaw rounds some; less than a grey level is no contradiction.
-Between two files that both round, captures and frames, a whole one is none."""
+MAXIMUM_FRAMES = 2_000_000
+"""Most frames that a header may announce: a camera of 64 GB holds so many of 128x128 pixels of 16 bit."""
+
+
+def damaged(path: Path, reason: object) -> FrameError:
+    """Return the error for a file that cannot be read whole."""
+    return FrameError(f"{path} is damaged or truncated: {reason}")
+
+
+def check_size(path: Path, *, needed: int, stored: int) -> None:
+    """Refuse, before anything is unpacked, a header that announces more than a camera's frame.
+
+    Parameters
+    ----------
+    path
+        The file, for messages.
+    needed
+        Bytes of the unpacked samples.
+    stored
+        Bytes that they are stored in.
+
+    Raises
+    ------
+    FrameError
+        They exceed `MAXIMUM_BYTES`, or no frame of a camera can be compressed so much.
+    """
+    if max(needed, stored) > MAXIMUM_BYTES:
+        size = f"{max(needed, stored) / 1e6:.0f} MB of samples; allowed are {MAXIMUM_BYTES / 1e6:.0f} MB"
+        raise FrameError(f"{path} announces {size}")
+    if needed > max(CHECKED_FROM, _COMPRESSION * stored):
+        size = f"{needed / 1e6:.0f} MB of samples in {stored / 1e6:.3g} MB"
+        raise FrameError(f"{path} announces {size}: no frame of a camera can be compressed so much")
+
+
+def check_count(path: Path, count: int) -> None:
+    """Refuse a header that announces no frames or more than a camera's.
+
+    Raises
+    ------
+    FrameError
+        So it does.
+    """
+    if not 1 <= count <= MAXIMUM_FRAMES:
+        raise FrameError(f"{path} announces {count} frames; allowed are 1 to {MAXIMUM_FRAMES}")
+
+
+def cut_short(path: Path, *, whole: int, count: int) -> FrameError:
+    """Return the error for a frame behind the end of a file that holds only the first `whole` of its `count` frames."""
+    where = f"after frame {whole - 1} of {count}" if whole else f"before the first of its {count} frames"
+    return FrameError(f"{path}: the file ends {where}: truncated or still being written")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Where the frames of a file lie.
+
+    Attributes
+    ----------
+    count
+        Number of frames that the header announces; the file may end before.
+    start
+        Byte at which the first begins.
+    size
+        Bytes of the samples of one.
+    stride
+        Bytes from one to the next.
+    """
+
+    count: int
+    start: int
+    size: int
+    stride: int
+
+    @classmethod
+    def checked(cls, path: Path, *, count: int, start: int, size: int, stride: int | None = None) -> Layout:
+        """Check the layout that a header announces; a `stride` that is not given is the size.
+
+        Raises
+        ------
+        FrameError
+            No camera records such frames.
+        """
+        check_count(path, count)
+        if size <= 0 or start < 0 or (stride is not None and stride < size):
+            raise damaged(path, f"its header announces frames of {size} bytes, {stride} apart, from byte {start}")
+        check_size(path, needed=size, stored=size)
+        return cls(count=count, start=start, size=size, stride=size if stride is None else stride)
+
+    def whole(self, file_size: int) -> int:
+        """Return the number of frames that are all in a file of so many bytes."""
+        return min(max((file_size - self.start - self.size) // self.stride + 1, 0), self.count)
+
+    def read(self, path: Path, index: int, rows: range, of: int) -> bytes:
+        """Read the bytes of some `rows` of frame `index`, which has `of` rows of one length.
+
+        Raises
+        ------
+        FrameError
+            The file ends before.
+        """
+        with path.open("rb") as file:
+            begin, size = self.start + index * self.stride, file.seek(0, 2)
+            if size < begin + self.size:
+                raise cut_short(path, whole=self.whole(size), count=self.count)
+            first, last = (self.size * row // of for row in (rows.start, rows.stop))
+            file.seek(begin + first)
+            return file.read(last - first)
+
+
+def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
+    """Unpack samples of 9 to 15 bits that follow one another without a gap, the highest bit of each first.
+
+    Parameters
+    ----------
+    packed : bytes, or ndarray, shape (..., B), uint8
+        Bytes; every line of an array begins with a sample of its own.
+    bits
+        Bits of a sample, an even number.
+
+    Returns
+    -------
+    ndarray, shape (..., N), uint16
+        Groups of samples that end with a byte: 5 bytes hold 4 samples of 10 bits, 3 two of 12. A line that ends within
+        a group is filled up with zeros.
+    """
+    lines = np.frombuffer(packed, dtype=np.uint8) if isinstance(packed, bytes) else packed
+    group = math.lcm(bits, 8)
+    if missing := -lines.shape[-1] % (group // 8):
+        lines = np.pad(lines, [*[(0, 0)] * (lines.ndim - 1), (0, missing)])
+    groups = lines.reshape(*lines.shape[:-1], -1, group // 8)
+    values = np.empty((*groups.shape[:-1], group // bits), dtype=np.uint16)
+    for sample in range(group // bits):
+        byte, begin = divmod(sample * bits, 8)
+        both = groups[..., byte].astype(np.uint16) << 8 | groups[..., byte + 1]
+        values[..., sample] = both >> (16 - bits - begin) & (2**bits - 1)
+    return values.reshape(*lines.shape[:-1], -1)
+
+
+_LOCK = threading.Lock()
+
+
+@contextmanager
+def complaints(*starts: bytes) -> Iterator[list[str]]:
+    """Collect what C libraries write to standard error: the lines with one of these starts.
+
+    The list holds them afterwards; other lines (of threads) are passed on.
+
+    Neither rawpy nor OpenCV lets the handlers of LibRaw and libpng be replaced, hence the redirection.
+    """
+    lines: list[str] = []
+    with _LOCK, tempfile.TemporaryFile() as file:
+        try:
+            terminal = os.dup(2)
+        except OSError:  # a program without standard error: nothing can reach the user
+            yield lines
+            return
+        os.dup2(file.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(terminal, 2)
+            file.seek(0)
+            for line in file:
+                if line.startswith(starts):
+                    lines.append(line.decode(errors="replace").strip())
+                elif line.strip():
+                    os.write(terminal, line)
+            os.close(terminal)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredFrame:
+    """The samples of one frame with what its file states; None where the file does not state it.
+
+    Attributes
+    ----------
+    values : ndarray, shape (H, W) or (H, W, 3), uint8 or uint16
+        Raw grey levels (DN); three channels are R, G, B.
+    kind
+        ``"rgb"`` where the file has three channels; ``"bayer"`` or ``"monochrome"`` only where the file states it.
+    cfa
+        Bayer pattern valid for ``values[0, 0]``.
+    black_level : ndarray, shape (2, 2), or None
+        Black level (DN) of each position of the 2x2 cell.
+    white_level
+        Grey level (DN) of a saturated sample.
+    bits
+        Bits of a sample where they are fewer than those of its type.
+    """
+
+    values: AnyArray
+    kind: FrameKind | None = None
+    cfa: str | None = None
+    black_level: FloatArray | None = None
+    white_level: float | None = None
+    bits: int | None = None
+
+    @classmethod
+    def plain(cls, values: AnyArray, path: Path, cfa: str | None = None) -> StoredFrame:
+        """Return samples (H, W) or (H, W, C) of a picture that states neither levels nor, as a rule, its pattern.
+
+        Raises
+        ------
+        FrameError
+            There are neither one nor three channels.
+        """
+        if values.ndim == 3 and values.shape[2] == 1:
+            values = values[..., 0]
+        if values.ndim == 2:
+            return cls(values=values, kind="bayer" if cfa else None, cfa=cfa)
+        if values.ndim != 3 or values.shape[2] != 3:
+            raise FrameError(f"{path} has samples of shape {values.shape}; allowed are one channel or three (RGB)")
+        return cls(values=values, kind="rgb")
 
 
 class Camera(Protocol):
-    """Who knows the camera that frames come from: a `Calibration`; None where it does not say."""
+    """What is known of the camera that frames come from, as by a `Calibration`; None where it is not known."""
 
     @property
     def name(self) -> str:
@@ -115,79 +295,15 @@ class Camera(Protocol):
         """Rows and columns of its own frames."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoredFrame:
-    """The samples of one frame with what its file tells; None where the file does not say.
+# Statements of the file, the user and a calibration
 
-    Attributes
-    ----------
-    values : ndarray, shape (H, W) or (H, W, 3), uint8 or uint16
-        Raw grey levels (DN); three channels are R, G, B.
-    kind
-        ``"rgb"`` where the file has three channels; ``"bayer"`` or ``"monochrome"`` only where the file says so.
-    cfa
-        Bayer pattern valid for ``values[0, 0]``.
-    black_level : ndarray, shape (2, 2), or None
-        Black level (DN) of each position of the 2x2 cell.
-    white_level
-        Grey level (DN) of a saturated sample.
-    bits
-        Bits of a sample where they are fewer than those of its type.
-    """
+_T = TypeVar("_T")
+_Statement = tuple[Path | str | None, _T | None]
+"""Who states something, None for the user (in TEST.toml or an option), and what; None: nothing."""
 
-    values: AnyArray
-    kind: FrameKind | None = None
-    cfa: str | None = None
-    black_level: FloatArray | None = None
-    white_level: float | None = None
-    bits: int | None = None
-
-    @classmethod
-    def plain(cls, values: AnyArray, path: Path, cfa: str | None = None) -> StoredFrame:
-        """Samples (H, W) or (H, W, C) of a picture that tells neither levels nor, as a rule, its pattern.
-
-        Raises
-        ------
-        FrameError
-            There are neither one nor three channels.
-        """
-        if values.ndim == 3 and values.shape[2] == 1:
-            values = values[..., 0]
-        if values.ndim == 2:
-            return cls(values=values, kind="bayer" if cfa else None, cfa=cfa)
-        if values.ndim != 3 or values.shape[2] != 3:
-            raise FrameError(f"{path} has samples of shape {values.shape}; allowed are one channel or three (RGB)")
-        return cls(values=values, kind="rgb")
-
-
-def damaged(path: Path, reason: object) -> FrameError:
-    """Error for a file that cannot be read whole."""
-    return FrameError(f"{path} is damaged or truncated: {reason}")
-
-
-def check_size(path: Path, *, needed: int, stored: int) -> None:
-    """Refuse, before anything is unpacked, a header that announces more than a camera's frame.
-
-    Parameters
-    ----------
-    path
-        The file, for messages.
-    needed
-        Bytes of the unpacked samples.
-    stored
-        Bytes that they are stored in.
-
-    Raises
-    ------
-    FrameError
-        They exceed `MAXIMUM_BYTES`, or no frame of a camera can be compressed so much.
-    """
-    if max(needed, stored) > MAXIMUM_BYTES:
-        told = f"{max(needed, stored) / 1e6:.0f} MB of samples; allowed are {MAXIMUM_BYTES / 1e6:.0f} MB"
-        raise FrameError(f"{path} announces {told}")
-    if needed > max(CHECKED_FROM, _COMPRESSION * stored):
-        told = f"{needed / 1e6:.0f} MB of samples in {stored / 1e6:.3g} MB"
-        raise FrameError(f"{path} announces {told}: no frame of a camera can be compressed so much")
+_BLACK_TOLERANCE = 1.0
+"""DN: a file's black levels differ by position, and LibRaw rounds some; less than a grey level is no contradiction.
+Between two files that both round, captures and frames, a whole one is none."""
 
 
 def raw_frame(
@@ -197,62 +313,80 @@ def raw_frame(
     camera: Camera | None = None,
     shape: tuple[int, int] | None = None,
 ) -> Mosaic | ChannelFrame:
-    """The checked frame from what the file tells, what the user states and what a calibration knows.
+    """Return the checked frame from what the file, the user and a calibration state.
 
     Every frame passes here, and nowhere else do the three meet: docs/test-file.md has the table. Each fills in what
-    those before it leave open. `shape` is that of the frame where this is a part of it.
+    those before it leave open.
+
+    Parameters
+    ----------
+    stored
+        Samples, with what the file states.
+    stated
+        What the user states.
+    path
+        The file, for messages.
+    camera
+        What a calibration states.
+    shape
+        Rows and columns of the frame where `stored` is a part of it.
+
+    Returns
+    -------
+    Mosaic or ChannelFrame
 
     Raises
     ------
     FrameError
-        Two of them say something and do not agree, or something needed is said by none.
+        Two of them state something and do not agree, or something needed is stated by none.
     """
     shape = shape or (stored.values.shape[0], stored.values.shape[1])
+    dtype = stated.dtype and np.dtype(stated.dtype).newbyteorder("=").name
     _agreed("shape", [(None, stated.shape), (path, shape)])
-    _agreed("dtype", [(None, _native(stated.dtype)), (path, stored.values.dtype.name)])
+    _agreed("dtype", [(None, dtype), (path, stored.values.dtype.name)])
     known = camera.kinds if camera else ()
-    stored = _grey_saved_as_colour(stored, stated.kind or (known[0] if len(known) == 1 else None))
+    if (stated.kind or (known[0] if len(known) == 1 else None)) in ("bayer", "monochrome") and stored.kind == "rgb":
+        first = stored.values[..., :1]
+        if (stored.values == first).all():  # one channel that was saved as three
+            stored = StoredFrame(values=first[..., 0], bits=stored.bits)
     kind = _agreed("kind", [(None, stated.kind), (path, stored.kind)])
     if camera and kind and kind not in known:
         raise _differ("kind", (path if stated.kind is None else None, kind), (camera.name, " or ".join(known)))
     kind = kind or (*known, "bayer")[0]
     if (kind == "rgb") != (stored.values.ndim == 3):
         who = None if stated.kind or camera is None else camera.name
-        raise FrameError(f"{_says(who, 'kind', kind)}, but {path} has {'one channel' if kind == 'rgb' else 'three'}")
+        channels = "one channel" if kind == "rgb" else "three"
+        raise FrameError(f"{_sentence(who, 'kind', kind)}, but {path} has {channels}")
     if kind != "bayer" and stated.cfa is not None:
-        told = f"{path} is read as {kind}, which has no colour filter array"
-        raise FrameError(f"cfa is stated as {stated.cfa}, but {told}")
+        reason = f"{path} is read as {kind}, which has no colour filter array"
+        raise FrameError(f"cfa is stated as {stated.cfa}, but {reason}")
     cfa = _pattern(stored, stated, path, camera, shape) if kind == "bayer" else None
     white = _white_level(stored, stated, path, camera)
     black = _black_level(stored, stated, path, camera)
     try:
         if cfa is not None:
             return Mosaic(values=stored.values, cfa=cfa, black_level=black, white_level=white)
-        channels = np.moveaxis(np.atleast_3d(stored.values), -1, 0)
-        return ChannelFrame(values=channels, black_level=black.mean(), white_level=white)
+        values = np.moveaxis(np.atleast_3d(stored.values), -1, 0)
+        return ChannelFrame(values=values, black_level=black.mean(), white_level=white)
     except InputError as error:
         raise FrameError(f"{path}: {error}") from None
 
 
-_Said = tuple[Path | str | None, _T | None]
-"""Who says something, None for the user (in TEST.toml or an option), and what; None: nothing."""
-
-
-def _agreed(name: str, said: Sequence[_Said[_T]]) -> _T | None:
-    """What everybody who says something says, the first in front."""
-    there = [(who, value) for who, value in said if value is not None]
+def _agreed(name: str, statements: Sequence[_Statement[_T]]) -> _T | None:
+    """Return what all statements that there are agree on."""
+    there = [(who, value) for who, value in statements if value is not None]
     for first, second in combinations(there, 2):
         if first[1] != second[1]:
             raise _differ(name, first, second)
     return there[0][1] if there else None
 
 
-def _differ(name: str, first: _Said[Any], second: _Said[Any]) -> FrameError:
-    return FrameError(f"{_says(first[0], name, first[1])}, but {second[0]} says {_in_words(second[1])}")
+def _differ(name: str, first: _Statement[Any], second: _Statement[Any]) -> FrameError:
+    return FrameError(f"{_sentence(first[0], name, first[1])}, but {second[0]} states {_in_words(second[1])}")
 
 
-def _says(who: Path | str | None, name: str, value: Any) -> str:
-    return f"{name} is stated as {_in_words(value)}" if who is None else f"{who} says {name} {_in_words(value)}"
+def _sentence(who: Path | str | None, name: str, value: Any) -> str:
+    return f"{name} is stated as {_in_words(value)}" if who is None else f"{who} states {name} {_in_words(value)}"
 
 
 def _in_words(value: Any) -> str:
@@ -261,46 +395,34 @@ def _in_words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _native(dtype: str | None) -> str | None:
-    return dtype and np.dtype(dtype).newbyteorder("=").name
-
-
-def _grey_saved_as_colour(stored: StoredFrame, kind: FrameKind | None) -> StoredFrame:
-    """One channel out of three identical ones, where it is known that the frame has only one."""
-    first = stored.values[..., :1]
-    if kind not in ("bayer", "monochrome") or stored.kind != "rgb" or not (stored.values == first).all():
-        return stored
-    return StoredFrame(values=first[..., 0], bits=stored.bits)
-
-
 def _white_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> float:
-    said: list[_Said[float]] = [(None, stated.white_level), (path, stored.white_level)]
-    said += [(camera.name, camera.white_level)] if camera else []
-    white = _agreed("white_level", said)
+    statements: list[_Statement[float]] = [(None, stated.white_level), (path, stored.white_level)]
+    statements += [(camera.name, camera.white_level)] if camera else []
+    white = _agreed("white_level", statements)
     largest = float(2**stored.bits - 1 if stored.bits else np.iinfo(stored.values.dtype).max)
     if white is not None and white > largest:
-        who = next(who for who, value in said if value is not None)
-        raise FrameError(f"{_says(who, 'white_level', white)}, but the samples of {path} end at {largest:.0f}")
+        who = next(who for who, value in statements if value is not None)
+        raise FrameError(f"{_sentence(who, 'white_level', white)}, but the samples of {path} end at {largest:.0f}")
     return largest if white is None else white
 
 
 def _black_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> FloatArray:
-    told, user, known = stored.black_level, stated.black_level, camera.black_level if camera else None
-    if told is not None and user is not None and not (np.abs(told - user) < _BLACK_TOLERANCE).all():
-        raise _differ("black_level", (None, user), (path, told))
+    in_file, user, known = stored.black_level, stated.black_level, camera.black_level if camera else None
+    if in_file is not None and user is not None and not (np.abs(in_file - user) < _BLACK_TOLERANCE).all():
+        raise _differ("black_level", (None, user), (path, in_file))
     if camera and known is not None:
         if user is not None and abs(user - known) >= _BLACK_TOLERANCE:
             raise _differ("black_level", (None, user), (camera.name, known))
-        if told is not None and abs(told.mean() - known) > _BLACK_TOLERANCE:  # whole numbers both, rounded apart
-            raise _differ("black_level", (path, told), (camera.name, known))
+        if in_file is not None and abs(in_file.mean() - known) > _BLACK_TOLERANCE:  # whole numbers both, rounded apart
+            raise _differ("black_level", (path, in_file), (camera.name, known))
     level = next((value for value in (user, known) if value is not None), 0.0)
-    return np.full((1, 1), level) if told is None else told
+    return np.full((1, 1), level) if in_file is None else in_file
 
 
 def _pattern(
     stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None, shape: tuple[int, int]
 ) -> str:
-    """Bayer pattern of a mosaic of `shape`; a camera's holds where the frames begin in its own."""
+    """Return the Bayer pattern of a mosaic of `shape`; a camera's holds where the frames begin in its own."""
     known, who, origin = camera.cfa if camera else None, camera.name if camera else "", stated.crop_origin
     placed = origin is not None or camera is None or camera.shape in (None, shape)
     if known is not None and origin is not None:
@@ -312,110 +434,7 @@ def _pattern(
         raise FrameError(f"{error}{hint}") from None
     if cfa is None or not (placed or stated.cfa or stored.cfa):
         raise FrameError(
-            f"{path} does not tell its colour filter array: state cfa ({', '.join(BAYER_PATTERNS)}), or kind "
+            f"{path} does not state its colour filter array: state cfa ({', '.join(BAYER_PATTERNS)}), or kind "
             f'"monochrome" where the camera has none{hint}'
         )
     return cfa
-
-
-MAXIMUM_FRAMES = 2_000_000
-"""Most frames that a header may announce: a camera of 64 GB holds so many of 128x128 pixels of 16 bit."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
-    """Where the frames of a file lie.
-
-    Attributes
-    ----------
-    count
-        Number of frames that the header announces; the file may end before.
-    start
-        Byte at which the first begins.
-    size
-        Bytes of the samples of one.
-    stride
-        Bytes from one to the next.
-    """
-
-    count: int
-    start: int
-    size: int
-    stride: int
-
-    @classmethod
-    def checked(cls, path: Path, *, count: int, start: int, size: int, stride: int | None = None) -> Layout:
-        """The layout that a header announces; a `stride` that is not given is the size.
-
-        Raises
-        ------
-        FrameError
-            No camera records such frames.
-        """
-        check_count(path, count)
-        if size <= 0 or start < 0 or (stride is not None and stride < size):
-            raise damaged(path, f"its header announces frames of {size} bytes, {stride} apart, from byte {start}")
-        check_size(path, needed=size, stored=size)
-        return cls(count=count, start=start, size=size, stride=size if stride is None else stride)
-
-    def whole(self, file_size: int) -> int:
-        """Number of frames that are all in a file of so many bytes."""
-        return min(max((file_size - self.start - self.size) // self.stride + 1, 0), self.count)
-
-    def read(self, path: Path, index: int, rows: range, of: int) -> bytes:
-        """The bytes of some `rows` of frame `index`, which has `of` rows of one length.
-
-        Raises
-        ------
-        FrameError
-            The file ends before.
-        """
-        with path.open("rb") as file:
-            begin, size = self.start + index * self.stride, file.seek(0, 2)
-            if size < begin + self.size:
-                raise cut_short(path, whole=self.whole(size), count=self.count)
-            first, last = (self.size * row // of for row in (rows.start, rows.stop))
-            file.seek(begin + first)
-            return file.read(last - first)
-
-
-def check_count(path: Path, count: int) -> None:
-    """Refuse a header that announces no frames or more than a camera's.
-
-    Raises
-    ------
-    FrameError
-        So it does.
-    """
-    if not 1 <= count <= MAXIMUM_FRAMES:
-        raise FrameError(f"{path} announces {count} frames; allowed are 1 to {MAXIMUM_FRAMES}")
-
-
-def cut_short(path: Path, *, whole: int, count: int) -> FrameError:
-    """Error for a frame behind the end of a file that holds only the first `whole` of its `count` frames."""
-    where = f"after frame {whole - 1} of {count}" if whole else f"before the first of its {count} frames"
-    return FrameError(f"{path}: the file ends {where}: truncated or still being written")
-
-
-def unpack_bits(data: bytes, bits: int) -> AnyArray:
-    """Samples of 9 to 15 bits that follow one another without a gap, the highest bit of each first.
-
-    Parameters
-    ----------
-    data
-        A whole number of groups of samples that end with a byte: 5 bytes hold 4 samples of 10 bits, 3 two of 12.
-    bits
-        Bits of a sample, an even number.
-
-    Returns
-    -------
-    ndarray, shape (8 len(data) / bits,), uint16
-    """
-    group = math.lcm(bits, 8)
-    packed = np.frombuffer(data, dtype=np.uint8).reshape(-1, group // 8)
-    values = np.empty((len(packed), group // bits), dtype=np.uint16)
-    for sample in range(group // bits):
-        byte, begin = divmod(sample * bits, 8)
-        both = packed[:, byte].astype(np.uint16) << 8 | packed[:, byte + 1]
-        values[:, sample] = both >> (16 - bits - begin) & (2**bits - 1)
-    return values.ravel()

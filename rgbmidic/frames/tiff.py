@@ -1,4 +1,4 @@
-"""TIFF files: grey or RGB, 8 or 16 bit."""
+"""TIFF files of one image, grey or RGB, 8 or 16 bit; and the reading of a page, for those of several."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     from tifffile import TiffPage
 
-__all__ = ["TiffFile", "checked_page", "page_frame", "page_rows"]
+__all__ = ["TIFF_ENDINGS", "TiffFile", "checked_page", "page_frame", "page_rows"]
+
+TIFF_ENDINGS = (".tif", ".tiff")
 
 _UNCOMPRESSED = 1
 _BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
@@ -57,7 +59,7 @@ class TiffFile(FrameSource):
 
 
 def page_rows(page: TiffPage, path: Path, rows: range) -> AnyArray | None:
-    """Samples of some rows of a checked page; None where it must be unpacked as a whole."""
+    """Read the samples (n, W, C) of some rows of a checked page; None where it must be unpacked as a whole."""
     in_planes = page.planarconfig == 2 and page.samplesperpixel > 1
     if not is_stored_as_is(page) or not page.is_contiguous or in_planes:
         return None
@@ -70,7 +72,7 @@ def page_rows(page: TiffPage, path: Path, rows: range) -> AnyArray | None:
 
 
 def page_frame(page: TiffPage, path: Path, samples: AnyArray | None = None) -> StoredFrame:
-    """The frame of a checked page, from its `samples` where they were read already.
+    """Return the frame of a checked page, from its `samples` where they were read already.
 
     Raises
     ------
@@ -79,7 +81,10 @@ def page_frame(page: TiffPage, path: Path, samples: AnyArray | None = None) -> S
     """
     values = _samples(page, path) if samples is None else samples
     if page.photometric == _PALETTE:
-        _check_grey_table(page, values.dtype, path)
+        table = np.asarray(page.tags[_COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
+        # some cameras' software writes grey images with a table that changes nothing, of 257 i or of 256 i
+        if values.dtype != np.uint8 or not (table // 256 == np.arange(table.shape[1])).all():
+            raise FrameError(f"{path} shows its grey levels through a colour table; save it as a plain grey image")
     elif page.photometric == _MIN_IS_WHITE:
         values = np.iinfo(values.dtype).max - values
     return StoredFrame.plain(values, path, cfa_pattern(page))
@@ -118,7 +123,7 @@ def checked_page(page: TiffPage, path: Path) -> None:
 
 
 def _samples(page: TiffPage, path: Path) -> AnyArray:
-    """Samples of a page as they are stored, (H, W) or (H, W, C)."""
+    """Read the samples of a page as they are stored, (H, W) or (H, W, C)."""
     if page.compression not in (_UNCOMPRESSED, *_BY_TIFFFILE):
         raise _not_read(page, path)
     if page.compression in _BY_TIFFFILE:
@@ -129,7 +134,7 @@ def _samples(page: TiffPage, path: Path) -> AnyArray:
 
 
 def _by_opencv(page: TiffPage, path: Path) -> AnyArray:
-    """Samples of the only page of a file."""
+    """Read the samples of the only page of a file."""
     turned = (tag(page, _ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
     if turned:  # OpenCV turns such samples, some more than others
         raise _not_read(page, path)
@@ -156,12 +161,3 @@ def _check_unpacked(page: TiffPage, path: Path) -> None:
             total += unpacked
     if total < page.nbytes:
         raise damaged(path, f"its image data unpack to {total} bytes, too few for its size")
-
-
-def _check_grey_table(page: TiffPage, dtype: np.dtype[Any], path: Path) -> None:
-    """Some cameras' software writes grey images with a colour table that changes nothing; others are refused."""
-    table = np.asarray(page.tags[_COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
-    ramp = np.arange(table.shape[1])
-    # entries run to 65535: of 257 i and 256 i both are in use
-    if dtype != np.uint8 or not (table // 256 == ramp).all():
-        raise FrameError(f"{path} shows its grey levels through a colour table; save it as a plain grey image")

@@ -1,4 +1,4 @@
-"""The skeleton of TIFF files (DNG, NEF, ARW and other raws are TIFF inside): is all the image data there?
+"""Pages and tags of TIFF files (DNG, NEF, ARW and other raws are TIFF inside), and whether their data is all there.
 
 LibRaw and tifffile both open some truncated files and fill what is missing with zeros, so the extents are checked
 first.
@@ -52,7 +52,7 @@ _ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715
 
 @contextmanager
 def tiff_pages(path: Path) -> Iterator[list[TiffPage]]:
-    """The images of a TIFF file in full resolution, neither thumbnails nor previews.
+    """Open the images of a TIFF file in full resolution, neither thumbnails nor previews.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def tiff_pages(path: Path) -> Iterator[list[TiffPage]]:
 
 @contextmanager
 def tiff_page(path: Path, offset: int) -> Iterator[TiffPage]:
-    """The image that begins at byte `offset` of a TIFF file.
+    """Open the image that begins at byte `offset` of a TIFF file.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def _opened(path: Path) -> Iterator[TiffFile]:
 
 
 def is_dng(path: Path) -> bool:
-    """Whether the tags of the first image say DNG, whatever the file's name says; False for what cannot be read."""
+    """Return whether the first image has the tag of DNG, whatever the file's name; False for what cannot be read."""
     try:
         with regular(path).open("rb") as file:
             head = file.read(8)
@@ -122,7 +122,7 @@ def _pages(tiff: TiffFile) -> Iterator[TiffPage]:
 
 
 def missing_data(page: TiffPage, size: int) -> str | None:
-    """What image data the page announces that a file of `size` bytes does not hold; None where all is there."""
+    """Describe what the page announces that a file of `size` bytes does not hold; None where all is there."""
     parts = list(zip(page.dataoffsets, page.databytecounts, strict=False))
     end = max((offset + count for offset, count in parts), default=0)
     if end > size:
@@ -133,14 +133,14 @@ def missing_data(page: TiffPage, size: int) -> str | None:
 
 
 def is_stored_as_is(page: TiffPage) -> bool:
-    """Whether the page's samples are uncompressed and their bytes are all there."""
+    """Return whether the page's samples are uncompressed and their bytes are all there."""
     bits = page.bitspersample if isinstance(page.bitspersample, int) else page.bitspersample[0]
     needed = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
     return bool(page.compression == _UNCOMPRESSED and sum(page.databytecounts) >= needed)
 
 
 def tag(page: TiffPage, code: int) -> tuple[Any, ...] | None:
-    """Value of a tag as a tuple, or None where the page does not have it."""
+    """Return the value of a tag as a tuple, or None where the page does not have it."""
     if code not in page.tags:
         return None
     value = page.tags[code].value
@@ -148,7 +148,7 @@ def tag(page: TiffPage, code: int) -> tuple[Any, ...] | None:
 
 
 def cfa_pattern(page: TiffPage) -> str | None:
-    """Name of the 2x2 colour filter array in the page's tags, or None where there is none."""
+    """Return the name of the 2x2 colour filter array in the page's tags, or None where there is none."""
     pattern = tag(page, _CFA_PATTERN)
     if pattern is None or tag(page, _CFA_REPEAT) != (2, 2) or not set(pattern) <= {0, 1, 2}:
         return None
@@ -157,14 +157,14 @@ def cfa_pattern(page: TiffPage) -> str | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RawStructure:
-    """What the TIFF skeleton of a camera raw tells beyond LibRaw.
+    """What the TIFF tags of a camera raw state beyond what LibRaw gives.
 
     Attributes
     ----------
     stored_as_is
         Whether the samples are uncompressed and all there, so that zeros in them are real.
     black_cell : ndarray, shape (2, 2), or None
-        DNG black level by position at `origin`; None where no tag says it or says more than a 2x2 cell can hold.
+        DNG black level by position at `origin`; None where no tag states it or states more than a 2x2 cell can hold.
     origin
         First row and column of the DNG's active area on the sensor.
     """
@@ -175,7 +175,7 @@ class RawStructure:
 
     @classmethod
     def read(cls, path: Path) -> RawStructure | None:
-        """Read and check the skeleton; None for files that are not TIFF inside or that only LibRaw can follow.
+        """Read and check the tags; None for files that are not TIFF inside or that only LibRaw can follow.
 
         Raises
         ------
@@ -197,7 +197,7 @@ class RawStructure:
         return structure
 
     def black_level(self, top: int, left: int) -> FloatArray | None:
-        """Black level of each position of the 2x2 cell that starts at row `top`, column `left` of the sensor.
+        """Return the black level of each position of the 2x2 cell that starts at row `top`, column `left`.
 
         LibRaw moves odd margins to the next even row and column without moving the black levels along.
         """

@@ -19,8 +19,7 @@ from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import Layout, StoredFrame, check_count, damaged
 from rgbmidic.frames.tiff import checked_page, page_frame, page_rows
-from rgbmidic.frames.tiff_pages import HEADERS as _HEADERS
-from rgbmidic.frames.tiff_pages import is_stored_as_is, tiff_page
+from rgbmidic.frames.tiff_pages import HEADERS, is_stored_as_is, tiff_page
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
@@ -34,7 +33,7 @@ _PIECE = 512
 _MOST_ENTRIES = 4096
 """Entries of a page beyond which it is no page: those seen have a few dozen."""
 _DESCRIPTION_BYTES = 256 * 2**20
-"""Most bytes of a description: OME tells some 300 for every frame."""
+"""Most bytes of a description: OME uses some 300 for every frame."""
 _SHORT = 3
 _NEW_TYPE, _COLUMNS, _ROWS, _DESCRIPTION = 254, 256, 257, 270
 _UNITS = {
@@ -54,14 +53,8 @@ _UNITS = {
 class TiffStack(Movie):
     """A TIFF file of several frames of one size, in the order of the file."""
 
-    def _recording(self) -> Recording:
-        return _stack(self.path).recording
-
-    def _shape(self) -> tuple[int, int]:
-        return _stack(self.path).shape
-
-    def _stored(self, index: int) -> StoredFrame:
-        return self._rows(index, range(self._shape()[0]))
+    def _header(self) -> _Stack:
+        return _stack(self.path)
 
     def _rows(self, index: int, rows: range) -> StoredFrame:
         stack = _stack(self.path)
@@ -73,10 +66,10 @@ class TiffStack(Movie):
         with tiff_page(self.path, int(stack.offsets[0 if behind_one_page else index])) as page:
             checked_page(page, self.path)
             if (page.imagelength, page.imagewidth) != stack.shape:
-                told = "{} rows of {} pixels, the first {} of {}".format(
+                sizes = "{} rows of {} pixels, the first {} of {}".format(
                     page.imagelength, page.imagewidth, *stack.shape
                 )
-                raise FrameError(f"{self.path}: frame {index} has {told}")
+                raise FrameError(f"{self.path}: frame {index} has {sizes}")
             samples = (
                 _behind(page, self.path, index, stack.recording.count, rows)
                 if behind_one_page
@@ -87,7 +80,7 @@ class TiffStack(Movie):
 
 
 def is_tiff_stack(path: Path) -> bool:
-    """Whether a TIFF file holds several frames; False for what cannot be read."""
+    """Return whether a TIFF file holds several frames; False for what cannot be read."""
     try:
         return _stack(path).recording.count > 1
     except (OSError, FrameError):
@@ -95,7 +88,7 @@ def is_tiff_stack(path: Path) -> bool:
 
 
 def _behind(page: TiffPage, path: Path, index: int, count: int, rows: range) -> AnyArray:
-    """Samples of some rows of a frame of which only the first has a page, as ImageJ stores more than 4 GB."""
+    """Read some rows of a frame of which only the first has a page, as ImageJ stores more than 4 GB."""
     if not is_stored_as_is(page) or not page.is_contiguous:
         raise FrameError(f"{path} announces {count} frames but has one page, whose samples are compressed or in pieces")
     layout = Layout.checked(path, count=count, start=page.dataoffsets[0], size=page.nbytes)
@@ -107,7 +100,7 @@ def _behind(page: TiffPage, path: Path, index: int, count: int, rows: range) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Stack:
-    """Where the pages begin (one, where all frames lie behind the first), size of the first, how many frames when."""
+    """Where the pages begin (one, where all frames lie behind the first), the size of the first, and the recording."""
 
     offsets: Integers
     shape: tuple[int, int]
@@ -144,9 +137,9 @@ class _Pages:
     @classmethod
     def begin(cls, file: BinaryIO, path: Path) -> _Pages:
         head = file.read(4)
-        if head not in _HEADERS:
+        if head not in HEADERS:
             raise damaged(path, "it is not a TIFF file")
-        big = head in _HEADERS[2:]
+        big = head in HEADERS[2:]
         order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
         widths = {"offset": 8, "count": 8, "entry": 20} if big else {"offset": 4, "count": 2, "entry": 12}
         return cls(file=file, size=file.seek(0, 2), order=order, **widths)
@@ -172,7 +165,7 @@ class _Pages:
         return found, False
 
     def content(self, offset: int) -> bytes | None:
-        """Number of entries, entries and offset of the next page; None where that is not in the file."""
+        """Read the number of entries, the entries and the offset of the next page; None where the file ends before."""
         if offset + self.count > self.size:
             return None
         self.file.seek(offset)
@@ -184,13 +177,13 @@ class _Pages:
         return content[:needed] + self.file.read(max(needed - len(content), 0))
 
     def value(self, content: bytes, code: int) -> int:
-        """The one value of an entry; 0 where there is none."""
+        """Return the one value of an entry; 0 where there is none."""
         found = self._entry(content, code)
         width = 2 if self._number(content, found + 2, 2) == _SHORT else 4
         return self._number(content, found + 4 + self.offset, width) if found else 0
 
     def text(self, content: bytes, code: int) -> str:
-        """Text of an entry; empty where there is none."""
+        """Return the text of an entry; empty where there is none."""
         found = self._entry(content, code)
         number = self._number(content, found + 4, self.offset) if found else 0
         start = found + 4 + self.offset
@@ -200,22 +193,20 @@ class _Pages:
         return self.file.read(min(number, _DESCRIPTION_BYTES)).decode(errors="replace").rstrip("\0")
 
     def _entry(self, content: bytes, code: int) -> int:
-        """Where the entry begins; 0 where there is none."""
+        """Return where the entry begins; 0 where there is none."""
         starts = range(self.count, len(content) - self.offset, self.entry)
         return next((start for start in starts if self._number(content, start, 2) == code), 0)
 
     def _reduced(self, content: bytes) -> bool:
-        first = self._number(
-            content, self.count, 2
-        )  # entries come in the order of their codes, and this one's is the lowest
-        return first == _NEW_TYPE and bool(self.value(content, _NEW_TYPE) & 1)
+        # entries come in the order of their codes, and this one's is the lowest
+        return self._number(content, self.count, 2) == _NEW_TYPE and bool(self.value(content, _NEW_TYPE) & 1)
 
     def _number(self, content: bytes, start: int, width: int) -> int:
         return int.from_bytes(content[start : start + width], self.order)
 
 
 def _imagej_times(text: str, count: int) -> Integers | None:
-    """From ImageJ's frame interval, where all images are frames in time."""
+    """Derive times from ImageJ's frame interval, where all images are frames in time."""
     entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
     interval = _fraction(entries.get("finterval", ""))
     others = {"channels", "slices"} & entries.keys()
@@ -225,7 +216,7 @@ def _imagej_times(text: str, count: int) -> Integers | None:
 
 
 def _ome_times(text: str, count: int) -> Integers | None:
-    """From OME's time increment or the time of every plane."""
+    """Derive times from OME's time increment or the time of every plane."""
     if "<OME" not in text[:1000] or "<!ENTITY" in text:
         return None
     try:
@@ -237,8 +228,8 @@ def _ome_times(text: str, count: int) -> Integers | None:
     if pixels.get("TimeIncrement"):
         return _even(_fraction(pixels.get("TimeIncrement", "")), pixels.get("TimeIncrementUnit", "s"), count)
     planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
-    told = [planes.get(str(index), pixels) for index in range(count)]
-    times = [(_fraction(plane.get("DeltaT", "")), _UNITS.get(plane.get("DeltaTUnit", "s"))) for plane in told]
+    each = [planes.get(str(index), pixels) for index in range(count)]
+    times = [(_fraction(plane.get("DeltaT", "")), _UNITS.get(plane.get("DeltaTUnit", "s"))) for plane in each]
     if any(time is None or unit is None for time, unit in times):
         return None
     return np.array([round(time * 10**9 / unit) for time, unit in times if time is not None and unit], dtype=np.int64)

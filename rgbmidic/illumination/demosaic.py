@@ -1,25 +1,19 @@
-"""What every demosaicing method takes and gives.
+"""From a Bayer mosaic to three channels at every pixel.
 
-Demosaicing by fixed linear filters: Malvar, He and Cutler (2004).
+Fixed linear filters (Malvar, He, Cutler 2004) and normalisation assume that the channels show one texture. Under
+coloured lights that holds where the paint is mat and breaks where one light reflects.
 
-No demosaicing: the mosaic divided by each colour's local mean.
-
-Linear prediction of every channel at every pixel from the samples around it (simple kriging).
+The reflection-aware method measures, block by block, how much of each channel's contrast is common and how much
+channel-specific (`rgbmidic.illumination.colour_factors`), and predicts every channel at every pixel from the samples
+around with exactly that trust (simple kriging). A channel in a reflection no longer leaks into the others, its sparkle
+is kept, the coarse lattices of red and blue are filled from what the others see; a coloured specimen, whose channels
+have nothing in common, is reconstructed channel by channel.
 
 The contrast of channel c, divided by its own spread, is ``sqrt(s_c) a + sqrt(1 - s_c) e_c + n_c``: common texture a of
-autocorrelation C, what is private to the channel, and camera noise, with s_c the share of the common texture. The best
-linear prediction of a channel at a pixel from the N x N samples around it has the filter ``(K + V)^-1 k``, with K the
-covariance of the samples, V their noise and k their covariance with what is wanted. It depends on the pixel's phase in
-the 2x2 cell and on the three shares alone, so the filters of a frame are a small table.
-
-Demosaicing that survives reflections: the speckle's own statistics fill in what a colour did not sample.
-
-Usual methods assume that the three channels show one texture. Under coloured lights that holds where the paint is mat
-and breaks where one light reflects. Here it is measured, block by block, how much of each channel's contrast is common
-and how much its own (`rgbmidic.illumination.colour_factors`), and every channel is predicted from all the samples
-around with exactly that trust (`rgbmidic.illumination.demosaic`). A channel in a reflection no longer leaks
-into the others, its own sparkle is kept, the coarse lattices of red and blue are filled from what the others see; a
-coloured specimen, whose channels have nothing in common, is reconstructed channel by channel.
+autocorrelation C, channel-specific component e_c, and camera noise, with s_c the fraction of the common texture. The
+best linear prediction of a channel at a pixel from the N x N samples around it has the filter ``(K + V)^-1 k``, with K
+the covariance of the samples, V their noise and k their covariance with what is wanted. It depends on the pixel's phase
+in the 2x2 cell and on the three fractions alone, so the filters of a frame are a small table.
 """
 
 from __future__ import annotations
@@ -79,7 +73,8 @@ class Demosaicer(Protocol):
     is invalid, and NaN, when a saturated sample took part in it.
     """
 
-    def __call__(self, mosaic: LinearMosaic) -> LinearChannels: ...
+    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
+        """Demosaic a linearised frame."""
 
 
 def check_mosaic(mosaic: LinearMosaic) -> None:
@@ -95,7 +90,7 @@ def check_mosaic(mosaic: LinearMosaic) -> None:
 
 
 def red_position(cfa: str) -> tuple[int, int]:
-    """Row and column of red in the 2x2 cell of a Bayer pattern."""
+    """Return row and column of red in the 2x2 cell of a Bayer pattern."""
     row, column = np.argwhere(cfa_channels(cfa) == 0)[0]
     return int(row), int(column)
 
@@ -116,16 +111,10 @@ class MalvarDemosaicer:
         """Demosaic; see `Demosaicer`."""
         check_mosaic(mosaic)
         values = np.empty((3, *mosaic.values.shape), dtype=np.float32)
-        malvar(_padded(mosaic), *red_position(mosaic.cfa), values)
+        padded = np.empty([side + 2 * PAD for side in mosaic.values.shape], dtype=np.float32)
+        pad_mosaic(np.ascontiguousarray(mosaic.values, dtype=np.float32), np.asarray(mosaic.saturated, bool), padded)
+        malvar(padded, *red_position(mosaic.cfa), values)
         return LinearChannels(values=values, valid=np.isfinite(values), full_scale=mosaic.full_scale)
-
-
-def _padded(mosaic: LinearMosaic) -> FloatImage:
-    """The mosaic (H + 4, W + 4), mirrored about its border pixels, NaN where saturated."""
-    rows, columns = mosaic.values.shape
-    padded = np.empty((rows + 2 * PAD, columns + 2 * PAD), dtype=np.float32)
-    pad_mosaic(np.ascontiguousarray(mosaic.values, dtype=np.float32), np.asarray(mosaic.saturated, bool), padded)
-    return padded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,7 +126,7 @@ class NormalisedMosaic:
     """
 
     def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
-        """Channels that share one image; see `Demosaicer`."""
+        """Return channels that show one image; see `Demosaicer`."""
         check_mosaic(mosaic)
         saturated = np.asarray(mosaic.saturated, bool)
         values = np.where(saturated, np.float32(np.nan), mosaic.values).astype(np.float32)
@@ -150,9 +139,9 @@ class NormalisedMosaic:
 SIZE, WIDE = 5, 7
 """Side of the square of samples that a value is predicted from, and where the colours have nothing in common."""
 LEVELS_PER_OCTAVE = 1
-"""Fineness in which a channel's private variance is rounded; twice as fine measures the same."""
+"""Fineness in which a channel's own variance is rounded; twice as fine measures the same."""
 LARGEST, SMALLEST = 10, -10
-"""Range (powers of two) of the private variance relative to the common one."""
+"""Range (powers of two) of the channel-specific variance relative to the common one: beyond it weights are 0 or 1."""
 OFFSET_VARIANCE = 10.0
 """Variance of an unknown constant under the texture: makes the filter's coefficients sum to one."""
 SPARKLE_VARIANCE = 0.29
@@ -181,16 +170,16 @@ class FilterTable:
 def prediction_filters(
     private: FloatArray, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
 ) -> FilterTable:
-    """The table of filters for tiles whose channels have some private variance.
+    """Return the table of filters for tiles whose channels have some variance of their own.
 
     Parameters
     ----------
     private : (3, h, w)
-        Variance private to each channel in each tile, relative to the common one.
+        Channel-specific variance in each tile, relative to the common one.
     noise : (3,)
         Variance of the camera noise of each channel relative to the channel's own variance.
     texture
-        Autocorrelation of the common texture, and of what is private.
+        Autocorrelation of the common texture, and of the channel-specific component.
     cfa
         Bayer pattern.
     size
@@ -204,8 +193,8 @@ def prediction_filters(
     level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(private, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
     code = (level[0] * 1000 + level[1]) * 1000 + level[2]
     _, first, index = np.unique(code, return_index=True, return_inverse=True)
-    share = 1 / (1 + 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE))
-    taps = _solved(share, np.asarray(noise, dtype=np.float64), texture, cfa, size)
+    fraction = 1 / (1 + 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE))
+    taps = _solved(fraction, np.asarray(noise, dtype=np.float64), texture, cfa, size)
     lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
     return FilterTable(
         index=index.reshape(level.shape[1:]).astype(np.int32),
@@ -214,21 +203,23 @@ def prediction_filters(
     )
 
 
-def _solved(share: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int) -> FloatArray:
-    """Filters (T, 4, 3, size²) for shares (T, 3) of the common texture."""
+def _solved(fraction: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int) -> FloatArray:
+    """Return filters (T, 4, 3, size²) for fractions (T, 3) of the common texture."""
     common, fine = _covariances(texture, size)
     # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
     private = texture.private * common + (1 - texture.private) * fine
-    centre, count = size * size // 2, len(share)
+    centre, count = size * size // 2, len(fraction)
     taps = np.empty((count, 4, 3, size * size))
-    for phase, channel in enumerate(_channels_around(cfa, size)):
-        root, own = np.sqrt(share[:, channel]), np.sqrt(1 - share[:, channel])
+    cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
+    for phase, (p, q) in enumerate(np.ndindex(2, 2)):  # of the centre of the square
+        channel = cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel()
+        root, own = np.sqrt(fraction[:, channel]), np.sqrt(1 - fraction[:, channel])
         same = channel[:, None] == channel[None]
         samples = root[:, :, None] * root[:, None] * common + own[:, :, None] * own[:, None] * (same * private)
         samples[:, np.arange(size * size), np.arange(size * size)] += np.maximum(noise, 1e-8)[channel]
         mine = channel[:, None] == np.arange(3)
-        wanted = root[:, :, None] * np.sqrt(share)[:, None] * common[:, centre, None]
-        wanted += (1 - share)[:, None] * (mine * private[:, centre, None])
+        wanted = root[:, :, None] * np.sqrt(fraction)[:, None] * common[:, centre, None]
+        wanted += (1 - fraction)[:, None] * (mine * private[:, centre, None])
         solution = np.linalg.solve(samples, wanted)
         taps[:, phase] = solution.transpose(0, 2, 1)
     return taps
@@ -236,18 +227,11 @@ def _solved(share: FloatArray, noise: FloatArray, texture: TextureModel, cfa: st
 
 @lru_cache(maxsize=64)
 def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, FloatArray]:
-    """Covariance between the samples of the square: of the texture, and of the sparkle of a reflection."""
+    """Return the covariance between the samples of the square: of the texture, and of the sparkle of a reflection."""
     offset = np.arange(size) - size // 2
     points = np.stack(np.meshgrid(offset, offset, indexing="ij"), -1).reshape(-1, 2)
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
     return texture(apart) + OFFSET_VARIANCE, np.exp(-(apart**2) / (4 * SPARKLE_VARIANCE))
-
-
-@lru_cache(maxsize=64)
-def _channels_around(cfa: str, size: int) -> list[npt.NDArray[np.intp]]:
-    """Channel of each sample of the square, for the four phases of its centre: (0, 0), (0, 1), (1, 0), (1, 1)."""
-    cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
-    return [cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel() for p in (0, 1) for q in (0, 1)]
 
 
 SMALLEST_FRAME = 64
@@ -283,7 +267,7 @@ class ReflectionAwareDemosaicer:
     Attributes
     ----------
     crosstalk : Crosstalk or None
-        Lets the sparkle of one light that several channels see be told from the common texture; None: no crosstalk.
+        Distinguishes the sparkle of one light that several channels see from the common texture; None: no crosstalk.
     texture : TextureModel or None
         The speckle's autocorrelation; None learns it from each frame. Frames of one test should share one.
     """
@@ -296,7 +280,7 @@ class ReflectionAwareDemosaicer:
         return self.reconstruct(mosaic).channels
 
     def reconstruct(self, mosaic: LinearMosaic, mixing: FloatArray | None = None) -> Reconstruction:
-        """Demosaic and tell what was found out.
+        """Demosaic, and return also what was found out.
 
         Parameters
         ----------
@@ -305,6 +289,10 @@ class ReflectionAwareDemosaicer:
         mixing : (n, 3), or None
             Mixtures of the channels to give instead of them; not valid where a channel that matters in one
             (`rgbmidic.illumination.unmix.needed`) is not.
+
+        Returns
+        -------
+        Reconstruction
 
         Raises
         ------
@@ -326,7 +314,10 @@ class ReflectionAwareDemosaicer:
         texture = learn_texture(moments) if self.texture is None else self.texture
         matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
         factors = colour_factors(moments, texture.band, matrix, coloured=texture.private)
-        table = _filters(factors, texture, mosaic.cfa)
+        noise = np.median(factors.noise / (1 + factors.private), axis=(1, 2))
+        # a colour left to itself has only every other sample, so it needs to look farther
+        size = SIZE if texture.private < 0.5 else WIDE
+        table = prediction_filters(_per_tile(factors.private), noise, texture, mosaic.cfa, size=size)
         mixing = np.eye(3) if mixing is None else mixing
         out, unknown = _predict(moments, factors, table, mixing, damaged=damaged)
         valid = np.ones(out.shape, dtype=bool)
@@ -337,15 +328,8 @@ class ReflectionAwareDemosaicer:
         return Reconstruction(channels=channels, texture=texture, factors=factors, mean=moments.mean)
 
 
-def _filters(factors: ColourFactors, texture: TextureModel, cfa: str) -> FilterTable:
-    noise = np.median(factors.noise / (1 + factors.private), axis=(1, 2))
-    # a colour left to itself has only every other sample, so it needs to look farther
-    size = SIZE if texture.private < 0.5 else WIDE
-    return prediction_filters(_per_tile(factors.private), noise, texture, cfa, size=size)
-
-
 def _per_tile(grid: FloatArray) -> FloatArray:
-    """Mean of a grid of blocks over the tiles; the last one may be narrower."""
+    """Average a grid of blocks over the tiles; the last one may be narrower."""
     ratio = TILE // BLOCK
     missing = [(0, 0), *((0, -side % ratio) for side in grid.shape[1:])]
     padded = np.pad(grid, missing, mode="edge") if np.any(missing) else grid
@@ -356,7 +340,7 @@ def _per_tile(grid: FloatArray) -> FloatArray:
 def _predict(
     moments: Moments, factors: ColourFactors, table: FilterTable, mixing: FloatArray, *, damaged: bool
 ) -> tuple[FloatImage, BoolArray]:
-    """Mixtures (n, H, W) of the channels and where samples stayed unknown (H, W)."""
+    """Return mixtures (n, H, W) of the channels and where samples stayed unknown (H, W)."""
     spread, pad = factors.spread.astype(np.float32), table.size // 2
     padded = scaled(moments, np.float32(1) / spread, pad=pad, width=table.index.shape[1] * TILE)
     rows, columns = moments.contrast.shape
@@ -372,7 +356,7 @@ def _predict(
 
 
 def _validity(saturated: BoolArray, unknown: BoolArray, cfa: str) -> BoolArray:
-    """A channel is not known within a pixel of its own saturated samples, none where the texture is not known."""
+    """Return where channels are known: not within a pixel of their saturated samples, nor where texture is unknown."""
     site = sampled_channels(cfa, saturated.shape)
     near = np.ones((3, 3), np.uint8)
     wide = cv2.dilate(unknown.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)

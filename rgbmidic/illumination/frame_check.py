@@ -1,7 +1,7 @@
-"""Whether a raw frame can be of the camera and the lights that were calibrated, from that frame alone.
+"""Checks that a raw frame is of the camera and the lights that were calibrated, from that frame alone.
 
-Every check is one-sided: what a frame cannot tell, its texture for example, passes. docs/inspect.md shows which
-manipulations are found and that good frames pass.
+Every check is one-sided: what a frame does not show, as noise under texture, passes. The constants are measured:
+docs/inspect.md shows which manipulations are found and that good frames pass.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ cell: 1.03 in good scenes, 1.8 and more after bilinear interpolation."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mismatch:
-    """What of a frame contradicts its calibration.
+    """A contradiction between a frame and its calibration.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Mismatch:
     certain : bool
         Whether it cannot be otherwise; else it is doubtful.
     text : str
-        What was found and what the calibration says.
+        What was found and what the calibration states.
     """
 
     check: FrameCheck
@@ -154,10 +154,23 @@ def check_state(
 def mismatches(
     frame: Frame, calibration: Calibration, inside: BoolArray, repeat: Frame | None = None
 ) -> list[Mismatch]:
-    """All that contradicts the calibration in the region `inside` (H, W) of a raw frame.
+    """Find all that contradicts the calibration in the region `inside` of a raw frame.
 
-    A second frame of the same state, at rest, tells the noise without the texture; where it is none, its texture
-    differs and only too little noise is seen.
+    Parameters
+    ----------
+    frame
+        A raw frame.
+    calibration
+        Cropped to the frame.
+    inside : ndarray, shape (H, W), bool
+        The region.
+    repeat
+        The same state once more, at rest, which shows the noise without the texture; if it moved, its texture differs
+        and only too little noise is found.
+
+    Returns
+    -------
+    list of Mismatch
     """
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     top, left = int(rows[0]) // 2 * 2, int(columns[0]) // 2 * 2  # the pattern stays what it is
@@ -171,8 +184,17 @@ def mismatches(
     step = bits & -bits or 1  # all samples are multiples of it
     found: list[Mismatch] = []
     if full_scale >= FINE * step or planes[0].noise is not None:  # else noise may be too little to smooth the histogram
-        uneven, name = _most_uneven(planes, step)
-        found += _levels(name, uneven, calibration.unevenness)
+        each = [unevenness(plane.stored[plane.usable], plane.noise, plane.black, step) for plane in planes]
+        uneven = float(np.nanmax([0.0, *each]))
+        calibrated = calibration.unevenness
+        # some cameras have tables of their own, which their captures show too
+        if calibrated is not None and calibrated <= UNEVEN < uneven:
+            text = (
+                f"grey levels of {planes[int(np.nanargmax(each))].name} are missing or doubled (relative variance of "
+                f"their histogram {uneven:.2g}, in the captures of the calibration {calibrated:.2g}): a gain, white "
+                "balance, gamma or 8-bit table was applied to stored samples"
+            )
+            found.append(Mismatch(check="levels", certain=True, text=text))
         if uneven <= UNEVEN:  # the count of small differences wants samples that take any whole value
             found += _noise(planes, again, step)
     if len(planes) == 4:
@@ -185,11 +207,17 @@ def mismatches(
 
 
 def _planes(frame: Frame, calibration: Calibration, inside: BoolArray, window: tuple[slice, slice]) -> list[_Plane]:
-    """The colour planes in a window of the frame."""
+    """Cut the colour planes in a window out of the frame."""
     step = 2 if isinstance(frame, Mosaic) else 1
     names, stored, black = planes_of(replace(frame, values=frame.values[..., *window]))
     height, width = stored[0].shape
     inner = inside[window][: step * height : step, : step * width : step]
+    noise = dict.fromkeys("RGBM", calibration.noise)
+    if (figures := calibration.camera_noise) is not None:  # of a colour, since cropping exchanges the greens
+        for colour in {name[0] for name in figures.planes}:
+            same = [index for index, name in enumerate(figures.planes) if name[0] == colour]
+            gain, read_noise = figures.gain.value[same].mean(), figures.read_noise.value[same].mean()
+            noise[colour] = NoiseModel(gain=float(gain), read_noise=float(read_noise))
     return [
         _Plane(
             name=name,
@@ -197,27 +225,14 @@ def _planes(frame: Frame, calibration: Calibration, inside: BoolArray, window: t
             usable=inner & (plane < frame.white_level) & (plane > 0),
             stored=plane,
             black=float(level),
-            noise=_noise_of(calibration, name),
+            noise=noise[name[0]],
         )
         for name, plane, level in zip(names, stored, black, strict=True)
     ]
 
 
-def _noise_of(calibration: Calibration, plane: str) -> NoiseModel | None:
-    """The calibrated noise of a plane; of a colour, since cropping exchanges the greens."""
-    figures = calibration.camera_noise
-    if figures is None:
-        return calibration.noise
-    same = [index for index, name in enumerate(figures.planes) if name[0] == plane[0]]
-    if not same:
-        return calibration.noise
-    return NoiseModel(
-        gain=float(figures.gain.value[same].mean()), read_noise=float(figures.read_noise.value[same].mean())
-    )
-
-
 def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None, step: int) -> Iterator[Mismatch]:
-    """Noise that is not on the photon transfer line of the calibration, at some grey level of some plane.
+    """Report noise that is not on the photon transfer line of the calibration, at some grey level of some plane.
 
     Differences ``a - b - c + d`` of four neighbours in a plane hold four times the variance of a sample, and texture.
     What is added to noise only makes small differences rarer (Anderson's inequality: the noise is symmetric, with one
@@ -225,11 +240,19 @@ def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None, step: int)
     They are counted where the other planes are flattest, whose noise is independent. More noise than calibrated looks
     like texture in a single frame; in the difference to a `repeat` of the same state it is doubtful.
     """
-    if any(plane.noise is None for plane in planes) or (repeat and _same(planes, repeat)):
+    if any(plane.noise is None for plane in planes):
         return
+    if repeat and all(np.array_equal(a.stored, b.stored) for a, b in zip(planes, repeat, strict=True)):
+        return  # one frame, stored twice
     difference, mean, variance, usable = _differences(planes)
     square = difference**2 / variance
-    flatness = square.sum(axis=0) - square if len(planes) > 1 else _shifted(square)
+    if len(planes) > 1:
+        flatness = square.sum(axis=0) - square
+    else:  # around each place of the only plane, of differences that share no sample with its own
+        flatness = np.full_like(square, np.inf)
+        flatness[:, 2:-2, 2:-2] = (
+            square[:, :-4, 2:-2] + square[:, 4:, 2:-2] + square[:, 2:-2, :-4] + square[:, 2:-2, 4:]
+        )
     if repeat:
         again, _, more, clear = _differences(repeat)
         difference, variance, usable = difference - again, variance + more, usable & clear
@@ -263,14 +286,9 @@ def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None, step: int)
                 check="noise",
                 certain=ratio > QUIETER,
                 text=f"the noise of {name} at {at:.0f} DN above black is {calibrated / ratio:.2g} DN"
-                f"{'' if repeat else ' or less'}, the calibration says {calibrated:.2g} DN (another camera or gain, "
+                f"{'' if repeat else ' or less'}, the calibration states {calibrated:.2g} DN (another camera or gain, "
                 f"gamma, noise reduction, interpolated samples, black level{other}?)",
             )
-
-
-def _same(planes: Sequence[_Plane], others: Sequence[_Plane]) -> bool:
-    """Whether two frames are one and the same, stored twice."""
-    return all(np.array_equal(a.stored, b.stored) for a, b in zip(planes, others, strict=True))
 
 
 def _small_differences(
@@ -280,10 +298,10 @@ def _small_differences(
     flatness: npt.NDArray[Any],
     step: int,
 ) -> FloatArray:
-    """What is counted in a plane, by grey level and by how flat the others are, (LEVELS, len(FLATTEST), 6).
+    """Count small differences in a plane, by grey level and by how flat the others are, (LEVELS, len(FLATTEST), 6).
 
-    Small differences, how many the calibrated noise gives, the variance of that number, the sums of means and of
-    predicted standard deviations of a sample, and the number of places.
+    The six are their number, the number that the calibrated noise gives, the variance of that number, the sums of means
+    and of predicted standard deviations of a sample, and the number of places.
     """
     out = np.zeros((LEVELS, len(FLATTEST), 6))
     bins = np.searchsorted(np.quantile(mean, np.linspace(0, 1, LEVELS + 1)[1:-1]), mean)
@@ -302,12 +320,12 @@ def _small_differences(
 
 
 def _middle(planes: Sequence[_Plane]) -> tuple[slice, ...]:
-    """At most LARGEST x LARGEST samples; they begin at even ones."""
+    """Return at most LARGEST x LARGEST samples in the middle; they begin at even ones."""
     return tuple(slice(max(side - LARGEST, 0) // 4 * 2, (side + LARGEST) // 2) for side in planes[0].values.shape)
 
 
 def _differences(planes: Sequence[_Plane]) -> tuple[npt.NDArray[Any], ...]:
-    """Difference of 2 x 2 samples, their mean, the difference's predicted variance (P, h, w), and where to use them."""
+    """Return differences of 2 x 2 samples, means, the predicted variance (P, h, w), and where to use them."""
     middle = _middle(planes)
     x = np.stack([plane.values[middle] for plane in planes])
     usable = np.logical_and.reduce([plane.usable[middle] for plane in planes])
@@ -321,42 +339,13 @@ def _differences(planes: Sequence[_Plane]) -> tuple[npt.NDArray[Any], ...]:
     return a - b - c + d, mean, variance.astype(np.float32), whole
 
 
-def _shifted(flatness: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Flatness around each place of the only plane, of differences that share no sample with its own."""
-    out = np.full_like(flatness, np.inf)
-    sides = flatness[:, :-4, 2:-2] + flatness[:, 4:, 2:-2] + flatness[:, 2:-2, :-4] + flatness[:, 2:-2, 4:]
-    out[:, 2:-2, 2:-2] = sides
-    return out
-
-
-def _most_uneven(planes: Sequence[_Plane], step: int) -> tuple[float, str]:
-    """Largest unevenness of the planes' histograms, 0 where none tells it, and the plane's name."""
-    uneven = [unevenness(plane.stored[plane.usable], plane.noise, plane.black, step) for plane in planes]
-    return max(zip(np.nan_to_num(uneven).tolist(), (plane.name for plane in planes), strict=True))
-
-
-def _levels(name: str, uneven: float, calibrated: float | None) -> Iterator[Mismatch]:
-    """Grey levels missing or doubled that were not in the captures: a gain, a gamma or a table, on stored samples.
-
-    Some cameras have tables of their own, which their captures show too.
-    """
-    if calibrated is not None and calibrated <= UNEVEN < uneven:
-        yield Mismatch(
-            check="levels",
-            certain=True,
-            text=f"grey levels of {name} are missing or doubled (relative variance of their histogram {uneven:.2g}, in "
-            f"the captures of the calibration {calibrated:.2g}): a gain, white balance, gamma or 8-bit table was "
-            "applied to stored samples",
-        )
-
-
 def unevenness(
     samples: npt.NDArray[np.uint16], noise: NoiseModel | None = None, black: float = 0.0, step: int = 1
 ) -> float:
-    """Relative variance of the histogram of raw samples about its smooth course, that of counting taken off.
+    """Return the relative variance of the histogram of raw samples about its smooth course, less that of counting.
 
-    0 where it is smooth over `WINDOW` levels as noise makes it, .05 where every 21st level is missing, about 2 where
-    every other one is; NaN where too few samples, or too little noise, tell nothing.
+    It is 0 where the histogram is smooth over `WINDOW` levels as noise makes it, .05 where every 21st level is missing,
+    about 2 where every other one is; NaN where too few samples, or too little noise, leave it open.
 
     Parameters
     ----------
@@ -368,6 +357,10 @@ def unevenness(
         Their black level.
     step
         What all samples of the frame are multiples of.
+
+    Returns
+    -------
+    float
     """
     if samples.size < 1000:
         return float("nan")
@@ -390,20 +383,20 @@ def unevenness(
 
 
 def _block_means(values: npt.NDArray[np.float32], side: int) -> FloatArray:
-    """Means (h, w) over blocks of `side` samples; a border that does not fill a block is left out."""
+    """Average (h, w) over blocks of `side` samples; a border that does not fill a block is left out."""
     rows, columns = (length // side for length in values.shape)
     cut = values[: rows * side, : columns * side]
     return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float64)
 
 
 def _whole_blocks(planes: Sequence[_Plane], side: int) -> BoolArray:
-    """Blocks of `side` samples that are usable in all planes."""
+    """Return the blocks of `side` samples that are usable in all planes."""
     usable = np.logical_and.reduce([plane.usable for plane in planes])
     return np.asarray(_block_means(usable.astype(np.float32), side) == 1)
 
 
 def _greens(planes: Sequence[_Plane]) -> Iterator[Mismatch]:
-    """Two greens that differ from place to place while the two other planes agree: another phase of the pattern."""
+    """Report greens that differ from place to place while the other planes agree: another phase of the pattern."""
     means = [_block_means(plane.values, BLOCK) for plane in planes]
     clear = _whole_blocks(planes, BLOCK)
     clear &= np.min(means, axis=0) > 0
@@ -423,7 +416,7 @@ def _greens(planes: Sequence[_Plane]) -> Iterator[Mismatch]:
 def _lights(
     planes: Sequence[_Plane], crosstalk: Crosstalk, full_scale: float, origin: tuple[int, int]
 ) -> Iterator[Mismatch]:
-    """Lights that the calibrated crosstalk makes negative, or shows with a mirrored texture."""
+    """Report lights that the calibrated crosstalk makes negative, or shows with a mirrored texture."""
     mosaic = len(planes) == 4
     side = BLOCK // 2 if mosaic else BLOCK
     red, *greens, blue = (plane.values for plane in planes)
@@ -446,9 +439,8 @@ def _lights(
         negative = float((light < -NEGATIVE * full_scale)[usable].mean())
         mirrored = float((relative < -MIRRORED * best)[usable].mean()) if common > COMMON else 0.0
         if max(negative, mirrored) > REACH:
-            what = (
-                f"negative on {negative:.0%}" if negative > REACH else f"mirrored (dark for bright) on {mirrored:.0%}"
-            )
+            what = f"mirrored (dark for bright) on {mirrored:.0%}"
+            what = f"negative on {negative:.0%}" if negative > REACH else what
             yield Mismatch(
                 check="lights",
                 certain=True,
@@ -458,7 +450,7 @@ def _lights(
 
 
 def _interpolated(planes: Sequence[_Plane]) -> Iterator[Mismatch]:
-    """Samples that were interpolated from a mosaic: smoother along one axis, or at some places of a 2 x 2 cell.
+    """Report samples that were interpolated from a mosaic: smoother along one axis, or at some places of a 2 x 2 cell.
 
     In a plane of a mosaic, interpolated by another phase of the pattern, mean square second over mean square first
     differences depend on the axis other than in the planes beside it, which show the same texture; in channels that are
@@ -489,8 +481,10 @@ def _interpolated(planes: Sequence[_Plane]) -> Iterator[Mismatch]:
 
 
 def _curvature(x: npt.NDArray[np.float32], usable: BoolArray) -> tuple[FloatArray, float] | None:
-    """Mean square second difference along rows at each place of a 2 x 2 cell (2, 2), and its mean over that of first
-    differences; None where too few samples are usable, or do not vary."""
+    """Return the mean square second difference along rows at each place of a 2 x 2 cell, and its ratio to the first.
+
+    None where too few samples are usable, or do not vary.
+    """
     clear = usable[:, :-2] & usable[:, 1:-1] & usable[:, 2:]
     if clear.sum() < 4000:
         return None

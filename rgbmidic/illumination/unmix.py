@@ -1,9 +1,8 @@
-"""Camera channels to lights: the crosstalk between lights and camera channels undone at every pixel.
+"""Camera channels to one image per light, on one pixel grid: crosstalk and lateral registration undone.
 
-All lights on the pixel grid of the first: lateral colour registration undone.
-
-Light j sees at x + rho_j(x) what the first light sees at x (`Registration`), in the reference and in the deformed state
-alike; sampled there, its image shows every point where the first light's image shows it, before and after.
+Where the camera sees ``channels = A lights``, the lights are ``A^-1 channels`` at every pixel (`unmix`). Light j sees
+at x + rho_j(x) what the first light sees at x (`Registration`), in the reference and in the deformed state alike;
+sampled there (`align`), its image shows every point where the first light's image shows it, before and after.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import numpy as np
 
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic._kernels.lights import unmix as unmix_kernel
-from rgbmidic._kernels.lights import unmix_field as unmix_field_kernel
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.images import IlluminationImages, local_mean
@@ -30,12 +28,18 @@ NEGLIGIBLE = 0.25
 light's own channel does, a neighbour's crosstalk of some 10 % does not. Two lights of three see on where the third
 saturates; what leaks from beyond full scale is smooth or judged by the residual like the rest of a reflection."""
 
+_ALIGNED = 0.002
+"""A light that is nowhere farther than this (px) from the first is left as it is.
+
+Chosen: a fifth of the noise floor of DIC in good images, .01 px.
+"""
+
 GRID = 32
 """Largest distance (px) of the points between which a matrix that varies over the field is interpolated."""
 
 
 def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float = NEGLIGIBLE) -> IlluminationImages:
-    """One image per light from camera channels: ``lights = A^-1 channels`` (pseudo-inverse for k < C).
+    """Return one image per light from camera channels: ``lights = A^-1 channels`` (pseudo-inverse for k < C).
 
     Parameters
     ----------
@@ -63,61 +67,64 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
             f"the crosstalk matrix has {colours} camera channels; the channels given have shape "
             f"{channels.values.shape}, their validity {channels.valid.shape}"
         )
-    matrix = crosstalk.unmixing
-    matters = needed(matrix, negligible)
-    lights, shape = len(matrix), channels.values.shape[1:]
-    values = np.empty((lights, shape[0] * shape[1]), dtype=np.float32)
-    valid = np.empty(values.shape, dtype=bool)
-    flat = np.ascontiguousarray(channels.values, dtype=np.float32).reshape(colours, -1)
-    flat_valid = np.ascontiguousarray(channels.valid, dtype=bool).reshape(colours, -1)
-    if crosstalk.field is None:
-        unmix_kernel(flat, flat_valid, matrix.astype(np.float32), matters, values, valid)
-    else:
-        step = max(min(GRID, min(shape) // 16), 2)
-        grid = _unmixing_grid(crosstalk, shape, step)
-        image = (-1, *shape)
-        unmix_field_kernel(
-            flat.reshape(image),
-            flat_valid.reshape(image),
-            grid,
-            step,
-            matters,
-            values.reshape(image),
-            valid.reshape(image),
-        )
-    return IlluminationImages(
-        values=values.reshape(lights, *shape),
-        valid=valid.reshape(lights, *shape),
-        names=crosstalk.lights,
-        full_scale=channels.full_scale,
-    )
-
-
-def needed(matrix: FloatArray, negligible: float = NEGLIGIBLE) -> BoolArray:
-    """Which channels (k, C) must be valid for a light that ``matrix @ channels`` gives to be."""
-    return np.asarray(np.abs(matrix) > negligible * np.abs(matrix).max(axis=1, keepdims=True))
-
-
-def _unmixing_grid(crosstalk: Crosstalk, shape: tuple[int, ...], step: int) -> FloatImage:
-    """A^-1 at every `step`-th pixel and beyond the last ones, (GY, GX, k, C)."""
-    if crosstalk.field is not None and crosstalk.field.shape != tuple(shape):
+    shape = channels.values.shape[1:]
+    if crosstalk.field is not None and crosstalk.field.shape != shape:
         calibrated = crosstalk.field.shape
         raise InputError(
             f"the crosstalk varies over a field of {calibrated[1]} x {calibrated[0]} px; the frame has {shape[1]} x "
             f"{shape[0]} px: calibrate with frames of the size of the test"
         )
+    # A^-1 at every `step`-th pixel and beyond the last ones, (GY, GX, k, C); one cell of the grid where it is constant
+    step = max(shape) if crosstalk.field is None else max(min(GRID, min(shape) // 16), 2)
     y, x = (step * np.arange((side - 1) // step + 2) for side in shape)
-    return crosstalk.unmixing_at(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
+    grid = crosstalk.unmixing_at(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
+    values = np.empty((len(crosstalk.lights), *shape), dtype=np.float32)
+    valid = np.empty(values.shape, dtype=bool)
+    unmix_kernel(
+        np.ascontiguousarray(channels.values, dtype=np.float32),
+        np.ascontiguousarray(channels.valid, dtype=bool),
+        grid,
+        step,
+        needed(crosstalk.unmixing, negligible),
+        values,
+        valid,
+    )
+    return IlluminationImages(values=values, valid=valid, names=crosstalk.lights, full_scale=channels.full_scale)
 
 
-_NEGLIGIBLE = 0.002
-"""A light that is nowhere farther than this (px) from the first is left as it is."""
+def needed(matrix: FloatArray, negligible: float = NEGLIGIBLE) -> BoolArray:
+    """Find the channels that must be valid for each light that ``matrix @ channels`` gives.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (k, C)
+        A^-1, or what else makes lights of channels.
+    negligible
+        Fraction of the largest entry of a row under which a channel need not be valid.
+
+    Returns
+    -------
+    ndarray, shape (k, C), bool
+    """
+    return np.asarray(np.abs(matrix) > negligible * np.abs(matrix).max(axis=1, keepdims=True))
 
 
 def align(images: IlluminationImages, registration: Registration) -> IlluminationImages:
-    """Bring every light to the first one's pixels by cubic B-spline interpolation.
+    """Warp every light to the first one's pixels by cubic B-spline interpolation.
 
     Pixels whose neighbourhood of interpolation is invalid or outside the image become invalid.
+
+    Parameters
+    ----------
+    images
+        (k, H, W), one per light.
+    registration
+        Lateral registration of the same lights.
+
+    Returns
+    -------
+    IlluminationImages
+        On the pixel grid of the first light.
 
     Raises
     ------
@@ -134,13 +141,13 @@ def align(images: IlluminationImages, registration: Registration) -> Illuminatio
     shifts = registration.displacement(np.stack([x, y], axis=1))
     values = images.values.copy()
     for light, shift in enumerate(shifts):
-        if np.abs(shift).max() > _NEGLIGIBLE:
+        if np.abs(shift).max() > _ALIGNED:
             values[light] = _sample(images.values[light], x + shift[:, 0], y + shift[:, 1])
     return replace(images, values=values, valid=np.isfinite(values))
 
 
 def _sample(image: FloatImage, x: FloatArray, y: FloatArray) -> FloatImage:
-    """Image (H, W) at points (x, y), flat; NaN outside and where the interpolation would touch a NaN."""
+    """Sample an image (H, W) at points (x, y), flat; NaN outside and where the interpolation would touch a NaN."""
     height, width = image.shape
     valid = np.isfinite(image)
     filled = np.where(valid, image, np.nan_to_num(local_mean(image, 3.0), nan=float(np.nanmean(image))))

@@ -32,7 +32,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "test-file.md"
 LIGHTS = ("red", "green", "blue")
 TABLE = PAGE.read_text(encoding="utf-8").partition("## What is said twice")[2]
 ROWS = {row[1]: row[2].split("; ") for row in re.finditer(r"^\| ([\w ]+) \| ([^|]+) \| error", TABLE, re.M)}
-"""Who says what, by the table."""
+"""Who states what, by the table."""
 CAMERA = {
     "kind": ("kind", "bayer", "rgb"),
     "Bayer pattern": ("cfa", "RGGB", "GRBG"),
@@ -240,7 +240,7 @@ def test_black_levels_differ_where_rounding_cannot_tell(told: list[float], known
         frame = raw_frame(stored, stated, Path("f.dng"), camera)
         np.testing.assert_array_equal(frame.black_level, black)  # the file's own are taken
     else:
-        with pytest.raises(FrameError, match=rf"f\.dng says black_level 64, but the calibration says {known}"):
+        with pytest.raises(FrameError, match=rf"f\.dng states black_level 64, but the calibration states {known}"):
             raw_frame(stored, stated, Path("f.dng"), camera)
 
 
@@ -271,7 +271,9 @@ def test_a_later_frame_that_contradicts_the_calibration_fails_alone(tmp_path: Pa
     write_dng(test.frames[1], replace(frame, white_level=3000))
     found = measure(test.settings(), tmp_path / "out")
     assert found.status.tolist() == [Status.CONVERGED, Status.FAILED]
-    assert re.search(r"frame_1\.dng says white_level 3000, but .*calibration\.json says 4095", found.frame(1).reason)
+    assert re.search(
+        r"frame_1\.dng states white_level 3000, but .*calibration\.json states 4095", found.frame(1).reason
+    )
 
 
 def test_a_check_of_a_calibration_holds_captures_and_options_against_it(
@@ -282,7 +284,10 @@ def test_a_check_of_a_calibration_holds_captures_and_options_against_it(
     frame = read_frame(test.frames[0])
     assert isinstance(frame, Mosaic)
     write_dng(test.frames[0], replace(frame, black_level=np.full((2, 2), 300.0)))
-    for options, words in ([], "says black_level 300.* says 64"), (["--black-level", "64"], "stated as 64.*says 300"):
+    for options, words in (
+        ([], "states black_level 300.* states 64"),
+        (["--black-level", "64"], "stated as 64.*states 300"),
+    ):
         assert execute(calibrate.app, [*arguments, *options]) == 2
         assert re.search(words, capsys.readouterr().err)
 

@@ -163,7 +163,7 @@ def test_a_saturated_spot_is_left_out_and_the_rest_measured(bayer, copy, tmp_pat
 @pytest.mark.parametrize(
     ("sections", "error", "message"),
     [
-        ({"frames": {"cfa": "BGGR"}}, FrameError, "cfa is stated as BGGR.*frame_0.dng says RGGB"),
+        ({"frames": {"cfa": "BGGR"}}, FrameError, "cfa is stated as BGGR.*frame_0.dng states RGGB"),
         ({"frames": {"black_level": 80.0}}, FrameError, "black_level is stated as 80"),
         ({"frames": {"white_level": 4000.0}}, FrameError, "white_level is stated as 4000"),
         ({"frames": {"kind": "rgb"}}, FrameError, "kind is stated as rgb"),
@@ -244,7 +244,7 @@ def test_tiff_frames_without_any_pattern_are_refused(tmp_path):
     document = json.loads((test.folder / "calibration.json").read_text())
     del document["camera"]
     (test.folder / "calibration.json").write_text(json.dumps(document))
-    with pytest.raises(FrameError, match=r"frame_0\.tif does not tell its colour filter array"):
+    with pytest.raises(FrameError, match=r"frame_0\.tif does not state its colour filter array"):
         measure(test.settings(), tmp_path / "result")
 
 

@@ -162,7 +162,7 @@ def test_what_libraw_prints_comes_as_one_warning(
 
     monkeypatch.setattr(rawpy, "imread", talks)
     read_frame(dng)
-    assert [record.getMessage() for record in caplog.records] == [f"LibRaw says: {dng}: data corrupted at 1378"]
+    assert [record.getMessage() for record in caplog.records] == [f"LibRaw reports: {dng}: data corrupted at 1378"]
     assert capfd.readouterr().err == "progress of another thread\n"
 
 
@@ -177,7 +177,7 @@ def test_what_libjpeg_prints_makes_a_raw_damaged(
 
     monkeypatch.setattr(rawpy, "imread", talks)
     with pytest.raises(
-        FrameError, match=r"whole\.dng is damaged .*: libjpeg says: Corrupt JPEG data: bad Huffman code"
+        FrameError, match=r"whole\.dng is damaged .*: libjpeg reports: Corrupt JPEG data: bad Huffman code"
     ):
         read_frame(dng)
     assert capfd.readouterr().err == ""
@@ -235,7 +235,7 @@ def test_what_a_camera_raw_tells_need_not_be_stated_but_must_not_be_contradicted
     np.testing.assert_array_equal(read_frame(dng, **stated).values, read_frame(dng).values)
     wrong = {"kind": "rgb", "cfa": "GRBG", "black_level": 60, "white_level": 1023, "shape": (50, 40)}
     for name, value in wrong.items():
-        with pytest.raises(FrameError, match=rf"{name} is stated as .*whole\.dng says"):
+        with pytest.raises(FrameError, match=rf"{name} is stated as .*whole\.dng states"):
             read_frame(dng, **{**stated, name: value})
 
 

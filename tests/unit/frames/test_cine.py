@@ -122,7 +122,7 @@ def test_only_what_the_settings_of_an_old_camera_store_is_read(tmp_path: Path, l
 def test_a_colour_movie_without_a_pattern_needs_it_stated(tmp_path: Path) -> None:
     path = tmp_path / "f.cine"
     source = _movie(path, _frames(8), bits=8, compression=2, levels=(0, 254))
-    with pytest.raises(FrameError, match=r"f\.cine does not tell its colour filter array: state cfa"):
+    with pytest.raises(FrameError, match=r"f\.cine does not state its colour filter array: state cfa"):
         source.read(0)
     frame = open_source(path, FrameSettings(path=("f",), cfa="BGGR")).read(0)
     assert isinstance(frame, Mosaic)

@@ -80,7 +80,7 @@ def test_tiff_that_names_its_pattern(tmp_path: Path) -> None:
     frame = read_frame(tmp_path / "f.tif")
     assert isinstance(frame, Mosaic)
     assert frame.cfa == "GRBG"
-    with pytest.raises(FrameError, match=r"cfa is stated as RGGB.*says GRBG"):
+    with pytest.raises(FrameError, match=r"cfa is stated as RGGB.*states GRBG"):
         read_frame(tmp_path / "f.tif", cfa="RGGB")
 
 
@@ -125,7 +125,7 @@ def test_three_equal_channels_count_as_grey_only_where_that_is_stated(tmp_path: 
 
 def test_a_mosaic_needs_its_pattern(tmp_path: Path) -> None:
     file = _png(tmp_path / "f.png", GREY)
-    with pytest.raises(FrameError, match=r"f\.png does not tell .*RGGB, BGGR, GRBG, GBRG.*monochrome"):
+    with pytest.raises(FrameError, match=r"f\.png does not state .*RGGB, BGGR, GRBG, GBRG.*monochrome"):
         read_frame(file)
     with pytest.raises(InputError, match=r"^cfa.*RGGB, BGGR, GRBG, GBRG.*RGBG"):
         read_frame(file, cfa="RGBG")

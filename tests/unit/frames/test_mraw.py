@@ -204,7 +204,7 @@ def test_a_movie_that_ends_early_gives_its_whole_frames(tmp_path: Path) -> None:
         ({"Image Width": 10**9, "Image Height": 10**9}, "announces .* MB"),
         ({"Total Frame": 4 * 10**9}, r"announces 4000000000 frames; allowed are 1 to 2000000"),
         ({"Total Frame": 0}, "announces 0 frames"),
-        ({"Total Frame": None}, 'does not tell "Total Frame"'),
+        ({"Total Frame": None}, 'does not state "Total Frame"'),
         ({"Start Frame": "9" * 30}, '"Start Frame" is "9'),
         ({"EffectiveBit Side": "Middle"}, '12 effective bits, "middle"; allowed are lower and higher'),
         ({"Record Rate(fps)": "0.000001", "Start Frame": 2**39}, "announces frames up to number"),

@@ -55,7 +55,7 @@ def test_the_header_tells_the_pattern_of_raw_frames(tmp_path: Path, code: int, c
     frame = _source(path).read(0)
     assert isinstance(frame, Mosaic)
     assert frame.cfa == cfa
-    with pytest.raises(FrameError, match=f"cfa is stated as GBRG.*says {cfa}"):
+    with pytest.raises(FrameError, match=f"cfa is stated as GBRG.*states {cfa}"):
         _source(path, cfa="GBRG").read(0)
 
 

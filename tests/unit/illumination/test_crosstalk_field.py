@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from naive_calibration import unmix_field as naive_unmix_field
 
-from rgbmidic._kernels.lights import unmix_field
+from rgbmidic._kernels.lights import unmix as unmix_kernel
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
 from rgbmidic.illumination.linearise import LinearChannels
@@ -36,7 +36,7 @@ def test_kernel_agrees_with_its_twin():
     grid = rng.normal(0, 1, (4, 6, 2, 3)).astype(np.float32)
     needed = np.array([[True, False, True], [True, True, True]])
     out, out_valid = np.empty((2, 21, 37), np.float32), np.empty((2, 21, 37), bool)
-    unmix_field(channels, valid, grid, 8, needed, out, out_valid)
+    unmix_kernel(channels, valid, grid, 8, needed, out, out_valid)
     expected = naive_unmix_field(channels, valid, grid, 8, needed)
     assert (out_valid == np.isfinite(expected)).all()
     assert np.allclose(out, expected, rtol=1e-4, atol=1e-3, equal_nan=True)
