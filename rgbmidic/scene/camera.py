@@ -1,18 +1,20 @@
-"""Point lights: position, power, spectrum, and what the lens does to their colour.
+"""Point lights and the camera of a scene.
 
-The camera of a scene: pin-hole projection, lens blur, colour channels, sensor noise and quantisation.
+Lights have a position, a power, a spectrum and what the lens does to their colour; the camera has a pin-hole
+projection, a lens blur, colour channels, noise and quantisation.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.frames.data import cfa_channels
+from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.crosstalk import Led, Sensitivities, spectral_response
 from rgbmidic.illumination.linearise import NoiseModel
@@ -26,6 +28,7 @@ __all__ = [
     "Camera",
     "Light",
     "Vector",
+    "mosaic_samples",
     "reference_camera",
     "rotation",
     "three_lights",
@@ -35,6 +38,7 @@ NOMINAL_DISTANCE = 600.0
 """Distance (mm) at which a light of power 1 gives an ideal white the camera's `exposure`."""
 
 Vector = tuple[float, float, float]
+Floating = TypeVar("Floating", bound=np.floating)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -264,3 +268,8 @@ def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
     if changes.get("kind") != "monochrome" and "sensitivities" not in changes:
         camera = replace(camera, crosstalk=np.array(REFERENCE_CROSSTALK))
     return replace(camera, **changes)  # type: ignore[arg-type]
+
+
+def mosaic_samples(channels: npt.NDArray[Floating], cfa: str) -> npt.NDArray[Floating]:
+    """Samples (H, W) that a colour filter array takes of channels (3, H, W)."""
+    return np.asarray(np.take_along_axis(channels, sampled_channels(cfa, channels.shape[1:])[None], axis=0)[0])

@@ -1,16 +1,21 @@
-"""Displacement uncertainty expected from a scene, in closed form: nothing is rendered and nothing is solved.
+"""Displacement uncertainty expected before a test, in closed form: nothing is solved.
 
 The covariance of the nodes is ``M^-1 S M^-1`` with M the Hessian of the weighted sum over the lights and S the
-covariance of its right-hand side; with equal white noise it is the well-known ``2 sigma^2 M^-1``. Both are integrals of
-the speckle's gradient spectrum: of the texture alone for M, of its product with the spectrum of what disturbs for S:
+covariance of its right-hand side; with equal white noise it is the well-known ``2 sigma^2 M^-1``. Per pixel, M has the
+density `information` = energy of the speckle's gradient x pull x contrast, with the pull of a light its contrast over
+the variance of its residual (`light_pull`, as the main job weights by default); S has the density `score` of the errors
+of the images times the pulls. From the two densities follows the uncertainty of an inner node of a regular mesh
+(`node_constant`), or of every node of a mesh over which they vary (`expected_std`).
+
+The densities come from a scene (`Instrument`, here) or from a frame (`rgbmidic.lab.inspection.prediction`). Those of a
+scene are integrals of the speckle's gradient spectrum: of the texture alone for M, of its product with the spectrum of
+the errors for S:
 
 - camera noise of both states, through demosaicing and unmixing (the crosstalk's amplification of noise);
 - what demosaicing leaves of the mosaic in the images, which stays with the sensor while the texture moves;
 - the erratic part of the reflections, which changes as facets and droplets turn in and out of the mirror direction.
 
-The elements enter by the consistent mass matrix of a regular TRI3 mesh and the recovery of its nodal values. Images
-are taken to be locally normalised and every light weighted by the inverse variance of its residual, as the main job
-does by default. A plain Gaussian law is taken for the slopes of the wrinkles.
+A plain Gaussian law is taken for the slopes of the wrinkles.
 """
 
 from __future__ import annotations
@@ -21,18 +26,34 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
 
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.assembly import Assembly
+from rgbmidic.correlation.equations import SEEN
+from rgbmidic.correlation.nodes import LOST
+from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset, mass_matrix
 from rgbmidic.illumination.linearise import QUANTISATION
 from rgbmidic.illumination.unmix import NEGLIGIBLE
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.scene.camera import Floating
 from rgbmidic.scene.scene import Scene
-from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cross_spectra, mosaic_disturbances
+from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cross_spectra, separation_spectra
 from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Energies", "Forecast", "Instrument", "channel_mixing", "node_constant", "pixel_size", "trace_change"]
+__all__ = [
+    "Energies",
+    "Forecast",
+    "Instrument",
+    "channel_mixing",
+    "expected_std",
+    "light_pull",
+    "node_constant",
+    "pixel_size",
+    "trace_change",
+]
 
 
 WRINKLE_AREA = 0.085
@@ -58,6 +79,52 @@ def node_constant() -> float:
     # an even number of rows and columns: as many nodes with eight triangles as with four
     inner = (np.abs(mesh.nodes / 10 - side / 2 + 0.5) < side / 4).all(axis=1)
     return float(variance[inner].mean() * mesh.size**2)
+
+
+def light_pull(contrast: npt.NDArray[Floating], residual: npt.NDArray[Floating]) -> npt.NDArray[Floating]:
+    """Contrast of each light over the variance of its residual: its pull on the displacement.
+
+    Parameters
+    ----------
+    contrast, residual : ndarray, shape (k, ...)
+        Contrast of the texture, 0 where the light does not see; variance of the residual in its unit squared.
+
+    Returns
+    -------
+    ndarray, shape (k, ...)
+        0 where the residual is 0 or unknown.
+    """
+    return np.asarray(np.divide(contrast, residual, out=np.zeros_like(contrast), where=residual > 0))
+
+
+def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -> FloatArray:
+    """Standard uncertainty (n, N) of a displacement component at the nodes, px; NaN where they see too little.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    information, *scores : ndarray, shape (E,)
+        Per pixel of each element: of the Hessian, and n variances of the right-hand side.
+    """
+    area = mesh.to_nodes(mesh.areas)
+    density = mesh.to_nodes(information * mesh.areas) / area
+    seen = density > SEEN * np.median(density[density > 0]) if (density > 0).any() else np.zeros(len(density), bool)
+    if not seen.any():
+        return np.full((len(scores), len(density)), np.nan)
+    assembly = Assembly.from_mesh(mesh)
+    mass = ((1 + np.eye(3)) / 12)[..., None] * np.array([1.0, 0.0, 1.0])
+
+    def assembled(values: FloatArray) -> sp.csc_matrix:
+        return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
+
+    # elements that no light sees must not make the system singular
+    solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
+    used = np.asarray(seen[mesh.elements].all(axis=1))
+    recovery = Recovery.over(mesh, used, density, linear_fit_offset(mesh))
+    along_x, colouring = [(recovery.displacement_functionals[0], seen)], NodeColouring.from_mesh(mesh)
+    std = np.stack([functional_std(solve, assembled(score), colouring, along_x)[:, 0] for score in scores])
+    return np.where(seen & (std < LOST), std, np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +225,7 @@ class Instrument:
         patch = SpecklePatch.of(scene, len(spectrum.frequency))
         relief = cross_spectra(np.stack([patch.texture, patch.domes]))
         if camera.kind == "bayer":
-            noise, mosaic = mosaic_disturbances(scene, patch.texture, demosaic)
+            noise, mosaic = separation_spectra(scene, patch.texture, demosaic)
         else:
             unmixing = np.linalg.pinv(channel_mixing(scene))
             noise = np.einsum("jc,kc->cjk", unmixing, unmixing)[..., None, None]
@@ -196,7 +263,7 @@ class Instrument:
         residual = self.variance(self.residual, before, after, change)
         seen = np.isfinite(residual) & ~self.saturated(before) & ~self.saturated(after)
         contrast = np.where(seen, 1 - (before.share + after.share) / 2, 0.0)
-        pull = np.where(seen, contrast / np.where(seen, residual, 1.0), 0.0)
+        pull = light_pull(contrast, residual)
         information = self.energy * pull * contrast
         total = information.sum(axis=0)
         domes = self._dome_factor(after) - self._dome_factor(before)

@@ -23,7 +23,8 @@ WRINKLE_FREQUENCY = 0.525
 """Wrinkles per lattice cell: where the height spectrum of the gradient noise peaks (measured; see the tests)."""
 WRINKLE_SLOPE = 0.704
 """Rms tangential slope of the gradient noise in lattice units (measured; see the tests)."""
-_SQRT6 = math.sqrt(6.0)
+BOUND = math.sqrt(6.0)
+"""Largest deviation of the logarithm of a droplet's diameter, in its standard deviations: a triangular law's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +119,7 @@ class Surface:
     @property
     def droplets_per_area(self) -> float:
         """Droplets per mm2, from the coverage 1 - exp(-number x mean area) of the Boolean model."""
-        a = 2 * self.spread * _SQRT6
+        a = 2 * self.spread * BOUND
         mean_square = (2 * math.sinh(a / 2) / a) ** 2 if a else 1.0
         return -math.log(1 - self.coverage) / (math.pi / 4 * self.droplet**2 * mean_square)
 
@@ -126,7 +127,7 @@ class Surface:
         """What the kernels of `rgbmidic._kernels.render` take: paint, counts and seed."""
         radius = self.droplet / 2
         shell = 0.3 * radius
-        far = radius * math.exp(_SQRT6 * self.spread) + self.softness / 2
+        far = radius * math.exp(BOUND * self.spread) + self.softness / 2
         reach = math.hypot(far, shell)
         cell = 1.5 * (reach + 0.5 * radius)
         counts = _poisson_table(self.droplets_per_area * cell**3 / (2 * shell))

@@ -14,7 +14,7 @@ import numpy as np
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_source
-from rgbmidic.frames.data import ChannelFrame, Mosaic, sampled_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import SMALLEST_FRAME, ReflectionAwareDemosaicer
 from rgbmidic.illumination.frame_check import check_state
@@ -23,17 +23,9 @@ from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseM
 from rgbmidic.illumination.separate import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import align, unmix
-from rgbmidic.lab.inspection.prediction import predict
+from rgbmidic.lab.inspection.prediction import SeparationErrors, predict
 from rgbmidic.lab.inspection.results import BLIND, ChannelSummary, Inspection, LightSummary, Spread
-from rgbmidic.lab.inspection.samples import (
-    Channel,
-    Disturbances,
-    Frame,
-    View,
-    channels_of,
-    noise_estimate,
-    speckle_texture,
-)
+from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture, surroundings
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
@@ -51,6 +43,7 @@ __all__ = [
     "state_frames",
 ]
 
+Frame = Mosaic | ChannelFrame
 Linear = Sequence[LinearMosaic | LinearChannels]
 Progress = Callable[[int, int, str], None]
 
@@ -174,30 +167,33 @@ def inspect_frame(
         region = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1) if region is None else region, shape)
     tell = progress or (lambda done, total, line: None)
     contradictions = check_state(frames, known, region.mask, name, accept=accept)
-    mesh, view = Tri3Mesh.from_region(region, element_size), View.around(region)
-    region = view.region(region)
-    linear = [linearise(view.frame(shot), known.noise) for shot in frames]
+    mesh, window = Tri3Mesh.from_region(region, element_size), surroundings(region)
+    part = window.part_of(Window.whole(shape))
+    region = region.part(*part)
+    cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
+    linear = [linearise(shot, known.noise) for shot in cut]
     channels = channels_of(linear)
     _check_light(channels, region.mask)
     tell(0, 3, "exposure, speckle and noise")
     samples = SampleSummary.of(channels, region.mask, known.noise, linear[0].full_scale)
-    crosstalk = view.crosstalk(known.crosstalk or Crosstalk.identity(("red", "green", "blue")))
+    crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
+    crosstalk = crosstalk.cropped(window.origin, window.shape)
     tell(1, 3, "lights, and what separating them gets wrong")
     names = known.registration.lights if known.registration else ()
-    separated = _separated(linear, crosstalk, demosaic, samples.noise, names, np.random.default_rng(seed))
-    images = separated.images
+    separated, errors = _separated(linear, crosstalk, demosaic, samples.noise, names, np.random.default_rng(seed))
+    images = separated
     if known.registration is not None:
-        images = align(images, known.registration.cropped(view.origin))
+        images = align(images, known.registration.cropped(window.origin))
     tell(2, 3, "uncertainty to expect")
     level, contrast = level_and_contrast(images, contrast_window(samples.facts))
-    index = _reflection_index(separated.images, contrast)
+    index = _reflection_index(separated, contrast)
     prediction = predict(
-        replace(mesh, nodes=mesh.nodes - view.origin),
+        replace(mesh, nodes=mesh.nodes - window.origin),
         region,
         contrast=contrast,
         level=level,
-        disturbances=separated.disturbances,
-        texture=separated.images.texture or samples.texture,
+        errors=errors,
+        texture=separated.texture or samples.texture,
         prefilter=prefilter,
     )
     tell(3, 3, "done")
@@ -208,13 +204,13 @@ def inspect_frame(
         channels=samples.facts,
         lights=light_summaries(images, contrast, index, prediction.alone, region.mask),
         frame_shape=shape,
-        origin=view.origin,
+        origin=window.origin,
         images=images,
         reflection_index=index,
         saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
         region=region.mask,
         hidden=hidden(contrast, region.mask),
-        texture=separated.images.texture,
+        texture=separated.texture,
         noise=samples.noise,
         noise_known=known.noise is not None,
         contradictions=contradictions,
@@ -247,14 +243,6 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
     return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Separated:
-    """The lights of a frame, and what their separation gets wrong."""
-
-    images: IlluminationImages
-    disturbances: Disturbances
-
-
 def _separated(
     linear: Linear,
     crosstalk: Crosstalk,
@@ -262,8 +250,10 @@ def _separated(
     noise: NoiseModel,
     names: Sequence[str],
     random: np.random.Generator,
-) -> _Separated:
-    """Separate a state as the test would; reflection index and speckle of a mosaic are those of the default method.
+) -> tuple[IlluminationImages, SeparationErrors]:
+    """Separate a state as the test would, and draw the errors of that.
+
+    Reflection index and speckle of a mosaic are those of the default method.
 
     `names` are those of lights in succession, where they are known.
     """
@@ -274,15 +264,14 @@ def _separated(
         if method not in ("auto", DEFAULT_METHOD):
             other = separate(first, crosstalk, method)
             images = replace(other, reflection=images.reflection, texture=images.texture)
-        disturbances = Disturbances.of_mosaic(first, model, crosstalk, method, noise, random)
-        return _Separated(images=images, disturbances=disturbances)
+        return images, SeparationErrors.of_mosaic(first, model, crosstalk, method, noise, random)
     full = [frame for frame in linear if isinstance(frame, LinearChannels)]
 
     def lights(frames: Sequence[LinearChannels]) -> IlluminationImages:
         single = len(frames[0].values) == 1
         return IlluminationImages.in_succession(frames, names) if single else unmix(frames[0], crosstalk)
 
-    return _Separated(images=lights(full), disturbances=Disturbances.of_channels(full, lights, noise, random))
+    return lights(full), SeparationErrors.of_channels(full, lights, noise, random)
 
 
 def _reflection_index(images: IlluminationImages, contrast: FloatImage) -> FloatImage | None:
