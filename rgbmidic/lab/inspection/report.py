@@ -11,7 +11,7 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab.demo import check_folder, write_document
+from rgbmidic.lab import check_folder, write_document
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, save_figure
 from rgbmidic.typing import AnyArray, BoolArray

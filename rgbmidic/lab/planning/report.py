@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic._version import __version__
-from rgbmidic.lab.demo import check_folder, write_document
+from rgbmidic.lab import check_folder, write_document
 from rgbmidic.lab.planning.lamps import Proposal
 from rgbmidic.lab.planning.plan import Outlook, Plan
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal, save_figure
