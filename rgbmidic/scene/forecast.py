@@ -129,17 +129,17 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
-    """What a measurement between two states is expected to give; NaN where no light sees.
+    """Uncertainty expected of a measurement between two states; NaN where no light sees.
 
     Attributes
     ----------
     std : ndarray, shape (...)
         Standard uncertainty (px) of u, and of v, at an inner node, from what is random.
     bias : ndarray, shape (...)
-        Root mean square, per component, of the displacement (px) that the droplets' domes feign: their lit sides change
-        when a reflection moves.
+        Root mean square, per component, of the apparent displacement (px) by the droplets' domes: their lit sides
+        change when a reflection moves.
     weight_fraction : ndarray, shape (k, ...)
-        Share of each light in the information about the displacement.
+        Fraction of the information about the displacement that each light gives.
     residual : ndarray, shape (k, ...)
         Standard deviation of the residual of each light, in units of its local mean.
     """
@@ -152,17 +152,17 @@ class Forecast:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Energies:
-    """What a disturbance of unit strength adds to a variance: to that of a pixel, or to that of the right-hand side.
+    """Variance, of a pixel or of the right-hand side, that image errors of unit strength add.
 
     Attributes
     ----------
     noise : ndarray, shape (C, k, k)
         Between the lights' images, of noise of unit variance in the samples of each colour (DN squared).
     mosaic : ndarray, shape (3, k, k)
-        Of what demosaicing leaves in one image at each carrier of the mosaic (alternating along x, along y, along
+        Of the trace of demosaicing in one image at each carrier of the mosaic (alternating along x, along y, along
         both), for lights of equal brightness, in units of their means.
     erratic
-        Of a disturbance that is white before lens and pixel, with a spectrum of 1 px^2.
+        Of an error that is white before lens and pixel, with a spectrum of 1 px^2.
     dome
         Of the slope of the droplets' domes along a random direction.
     contrast
@@ -178,12 +178,12 @@ class Energies:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instrument:
-    """Paint, camera, lights' colours, processing and mesh, reduced to the numbers that the forecast needs.
+    """Paint, camera, colours of the lights, processing and mesh, reduced to the numbers that the forecast needs.
 
     Attributes
     ----------
     scene
-        Where they come from; positions of lamps and body do not enter.
+        Its paint, camera and colours of the lights; positions of lamps and body do not enter.
     element_size
         px.
     energy
@@ -217,6 +217,15 @@ class Instrument:
             Method for a Bayer camera (`rgbmidic.illumination.separate.DEMOSAICERS`).
         prefilter
             Of the solve (`rgbmidic.correlation.images.PREFILTERS`).
+
+        Returns
+        -------
+        Instrument
+
+        Raises
+        ------
+        InputError
+            The paint has no droplets, hence no texture.
         """
         camera = scene.camera
         spectrum = SpeckleSpectrum.of(
@@ -259,6 +268,11 @@ class Instrument:
             Predictions at the same material points.
         change : ndarray, shape (3, ...)
             Of the mosaic's trace between them (`trace_change`), as a mean over the elements of a node.
+
+        Returns
+        -------
+        Forecast
+            At these points.
         """
         residual = self.variance(self.residual, before, after, change)
         seen = np.isfinite(residual) & ~self.saturated(before) & ~self.saturated(after)
@@ -271,25 +285,31 @@ class Instrument:
         with np.errstate(invalid="ignore", divide="ignore"):
             std = np.sqrt(node_constant() * self._score(before, after, change, pull)) / (self.element_size * total)
             bias = np.sqrt((drag**2).sum(axis=0) / 2) / total
-            share = information / total
+            fraction = information / total
         sees = total > 0
         return Forecast(
             std=np.where(sees, std, np.nan),
             bias=np.where(sees, bias, np.nan),
-            weight_fraction=np.where(sees, share, 0.0),
+            weight_fraction=np.where(sees, fraction, 0.0),
             residual=np.where(seen, np.sqrt(np.where(seen, residual, 0.0)), np.nan),
         )
 
     def weights(self, before: Zones, after: Zones, *, known: bool = True) -> FloatImage:
-        """Weights (k, ...) in [0, 1] for the solve: the inverse variance with which each light pulls on the
-        displacement, 1 for the best light at the best point; 0 where it does not see or saturates.
+        """Weights in [0, 1] for the solve: inverse variance of the pull of each light on the displacement.
+
+        The best light at the best point has 1; a light that does not see or saturates has 0.
 
         Parameters
         ----------
         before, after
             Predictions at the same material points.
         known
-            Whether they tell the motion between the states. If not, the reflections are taken to have changed wholly.
+            Whether the motion between the states is known to them. If not, the reflections are taken to have changed
+            wholly.
+
+        Returns
+        -------
+        ndarray, shape (k, ...), float32
         """
         change = np.full((3, *before.share.shape[1:]), 2.0)
         variance = self.variance(self.score, before, after, change, common=float(known))
@@ -312,6 +332,10 @@ class Instrument:
             See `trace_change`.
         common
             1: the two states share their reflections as predicted; 0: they have nothing in common.
+
+        Returns
+        -------
+        ndarray, shape (k, ...)
         """
         variance = self._reflections(energies, before, after, common)
         variance += np.einsum("cjj,c...->j...", energies.mosaic, change)
@@ -330,15 +354,20 @@ class Instrument:
             Predictions of this light alone in its n places.
         brightness : ndarray, shape (k,)
             Mean grey level of every light, for the noise that crosstalk brings.
+
+        Returns
+        -------
+        ndarray, shape (n, ...)
+            In units of the local mean.
         """
         variance = self._reflections(self.score, before, after)
         variance += 2 * float(self.score.mosaic[:, light, light].sum())
         mixing = channel_mixing(self.scene)
         others = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
         for zones in (before, after):
-            for colour, share in enumerate(self.score.noise[:, light, light]):
+            for colour, factor in enumerate(self.score.noise[:, light, light]):
                 samples = self.scene.camera.noise.variance(others[colour] + mixing[colour, light] * zones.level)
-                variance += share * (samples + QUANTISATION) / zones.level**2
+                variance += factor * (samples + QUANTISATION) / zones.level**2
         return np.asarray(variance)
 
     def _score(self, before: Zones, after: Zones, change: FloatArray, pull: FloatArray) -> FloatArray:
@@ -346,9 +375,9 @@ class Instrument:
         square = (np.nan_to_num(self._reflections(self.score, before, after)) * pull**2).sum(axis=0)
         square += np.einsum("cjk,c...,j...,k...->...", self.score.mosaic, change, pull, pull)
         for zones in (before, after):
-            share = np.where(pull > 0, pull / zones.level, 0.0)
+            relative = np.where(pull > 0, pull / zones.level, 0.0)
             samples = np.nan_to_num(self._sample_variance(zones))
-            square += np.einsum("cjk,c...,j...,k...->...", self.score.noise, samples, share, share)
+            square += np.einsum("cjk,c...,j...,k...->...", self.score.noise, samples, relative, relative)
         return np.asarray(square)
 
     def _reflections(self, energies: Energies, before: Zones, after: Zones, common: float = 1.0) -> FloatArray:
@@ -390,14 +419,17 @@ class Instrument:
         return slope, (1 - cover) * facet_variance(surface.white) + cover * facet_variance(surface.black)
 
     def saturated(self, zones: Zones) -> BoolArray:
-        """Where white paint is expected to saturate a channel that the light is seen by, (k, ...)."""
-        surface = self.scene.surface
-        white = surface.white.albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance)
-        channels = _channels(channel_mixing(self.scene), zones.irradiance * white)
+        """Where white paint is expected to saturate a channel that the light needs, (k, ...)."""
+        channels = _channels(channel_mixing(self.scene), self.white_level(zones))
         full = channels > _SATURATED * self.scene.camera.full_scale
         unmixing = np.abs(np.linalg.pinv(channel_mixing(self.scene)))
         needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
         return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)
+
+    def white_level(self, zones: Zones) -> FloatArray:
+        """Grey level (k, ...) of the white paint under each light, DN above black."""
+        albedo = self.scene.surface.white.albedo
+        return zones.irradiance * (albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance))
 
     def _sample_variance(self, zones: Zones) -> FloatArray:
         """Noise variance (C, ...) of one sample of each colour at the mean grey level, DN squared."""

@@ -181,10 +181,10 @@ def cover_covariance(surface: Surface, distance: FloatArray) -> FloatArray:
     size = np.linspace(-1, 1, 61)[1:-1]
     law = (1 - abs(size)) / (1 - abs(size)).sum()
     overlap = np.zeros_like(distance)
-    for value, share in zip(size, law, strict=True):
+    for value, fraction in zip(size, law, strict=True):
         radius = surface.droplet / 2 * math.exp(surface.spread * BOUND * value)
         x = np.clip(distance / (2 * radius), 0, 1)
-        overlap += share * 2 * radius**2 * (np.arccos(x) - x * np.sqrt(1 - x * x))
+        overlap += fraction * 2 * radius**2 * (np.arccos(x) - x * np.sqrt(1 - x * x))
     return np.asarray((1 - surface.coverage) ** 2 * np.expm1(surface.droplets_per_area * overlap))
 
 
@@ -258,14 +258,13 @@ class SpeckleSpectrum:
         """
         return float(2 * ((self.texture * self.prefilter) ** 2).mean() / element_size**2)
 
-    def score(self, disturbance: FloatArray) -> FloatArray:
-        """Variance density of the right-hand side under disturbances with power spectra (..., n, n) before the
-        prefilter."""
-        return np.asarray((self._gradient * self.prefilter**2 * disturbance).mean(axis=(-2, -1)))
+    def score(self, errors: FloatArray) -> FloatArray:
+        """Variance density of the right-hand side under errors with power spectra (..., n, n) before the prefilter."""
+        return np.asarray((self._gradient * self.prefilter**2 * errors).mean(axis=(-2, -1)))
 
-    def residual(self, disturbance: FloatArray) -> FloatArray:
-        """Variance at a pixel, after the prefilter, of disturbances with power spectra (..., n, n)."""
-        return np.asarray((self.prefilter * disturbance).mean(axis=(-2, -1)))
+    def residual(self, errors: FloatArray) -> FloatArray:
+        """Variance at a pixel, after the prefilter, of errors with power spectra (..., n, n)."""
+        return np.asarray((self.prefilter * errors).mean(axis=(-2, -1)))
 
     def pull(self, cross: FloatArray) -> float:
         """Mean product of the gradients along x, after the prefilter, of the texture and of a field with which it has
