@@ -1,6 +1,6 @@
 """Point lights and the camera of a scene.
 
-Lights have a position, a power, a spectrum and what the lens does to their colour; the camera has a pin-hole
+Lights have a position, a power, a spectrum and the aberration of the lens in their colour; the camera has a pin-hole
 projection, a lens blur, colour channels, noise and quantisation.
 """
 
@@ -48,7 +48,7 @@ class Light:
     Attributes
     ----------
     name
-        What the light's image is called.
+        Of the light and of its image.
     position
         (x, y, z) in mm: x right, y down, z away from the camera, origin at the camera.
     power

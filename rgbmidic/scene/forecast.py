@@ -12,7 +12,7 @@ scene are integrals of the speckle's gradient spectrum: of the texture alone for
 the errors for S:
 
 - camera noise of both states, through demosaicing and unmixing (the crosstalk's amplification of noise);
-- what demosaicing leaves of the mosaic in the images, which stays with the sensor while the texture moves;
+- the trace of the mosaic that demosaicing leaves in the images, which stays with the sensor while the texture moves;
 - the erratic part of the reflections, which changes as facets and droplets turn in and out of the mirror direction.
 
 A plain Gaussian law is taken for the slopes of the wrinkles.
@@ -67,8 +67,8 @@ _SATURATED = 0.98
 def node_constant() -> float:
     """Variance of an inner node's value per unit of white noise density and element area: about 1.1.
 
-    On a regular mesh the linear fit has the inverse of the consistent mass matrix (2.6 on its diagonal); of that, what
-    the recovery of the nodal values leaves.
+    On a regular mesh the linear fit has the inverse of the consistent mass matrix (2.6 on its diagonal); the
+    recovery of the nodal values reduces it.
     """
     side = 16
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 10 * side, 10 * side), (10 * side + 1,) * 2), 10)
@@ -134,7 +134,7 @@ class Forecast:
     Attributes
     ----------
     std : ndarray, shape (...)
-        Standard uncertainty (px) of u, and of v, at an inner node, from what is random.
+        Standard uncertainty (px) of u, and of v, at an inner node, from random errors.
     bias : ndarray, shape (...)
         Root mean square, per component, of the apparent displacement (px) by the droplets' domes: their lit sides
         change when a reflection moves.
@@ -392,8 +392,8 @@ class Instrument:
         """Spectrum (px^2) of the erratic part of the change of each light's image (k, ...), in units of its mean.
 
         Facets with Gaussian slopes of variance a^2 per axis reflect ``q = exp(-|s - h|^2/(2 b^2))``; the covariance of
-        q between the half-way slopes h of two states is an integral of Gaussians. What is linear in the slopes is finer
-        than the pixel and is left out: wrinkles have no slope on average.
+        q between the half-way slopes h of two states is an integral of Gaussians. The part linear in the slopes is
+        finer than the pixel and is left out: wrinkles have no slope on average.
         """
         a2, b2 = self._roughness
         parts = [

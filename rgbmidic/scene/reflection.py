@@ -1,4 +1,4 @@
-"""Weights from geometry: where lamps, camera and specimen say that each light reflects (paper, section 3.2).
+"""Weights from geometry: where each light reflects, from the places of lamps, camera and specimen (paper, section 3.2).
 
 The paper's first method. The paint is rough: facets with a narrow specular lobe, tilted at random by the wrinkles. At
 the scale of the speckle it reflects into the facets' lobe convolved with the law of the slopes (P. Beckmann and A.
@@ -31,7 +31,7 @@ __all__ = [
 
 
 LIMIT_DEG = 15.0
-"""Angle between the light and the mirror direction within which the reflection disturbs (paper, Fig. 9)."""
+"""Angle between the light and the mirror direction within which the reflection corrupts the image (paper, Fig. 9)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +108,7 @@ class Reflection:
         return np.asarray(reflectance.specular * lobe / self.half)
 
     def share(self, reflectance: Reflectance) -> FloatArray:
-        """Expected specular share q/(d + q) of the light that reaches the camera, (k, ...), 0 to 1."""
+        """Expected specular fraction q/(d + q) of the light that reaches the camera, (k, ...), 0 to 1."""
         q = self.specular(reflectance)
         return np.asarray(q / (self.diffuse(reflectance) + q))
 

@@ -1,6 +1,6 @@
-"""What stands in front of the camera: bodies, their states, and the scene they make with paint, lights and camera.
+"""A scene: a body before the camera, its states, paint, lights and camera; and SCENE.toml, which describes it.
 
-SCENE.toml: what a virtual experiment shows, read strictly; an unknown key is an error that names it.
+The file is read strictly: an unknown key is an error that names it.
 """
 
 from __future__ import annotations
@@ -213,14 +213,14 @@ BODIES: dict[str, type[Sphere] | type[Cylinder] | type[Plate]] = {
     "plate": Plate,
 }
 Target = Literal["white", "speckled"]
-"""What calibration captures show."""
+"""Targets of the calibration captures."""
 _SIZE = (640, 640)
 _FIELD_KEYS = ("displacement_gradient", "displacement_offset", "displacement_file")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetSettings:
-    """What is written (``[output]``).
+    """Settings of the output (``[output]``).
 
     Attributes
     ----------
@@ -231,13 +231,13 @@ class DatasetSettings:
     calibration_frames
         Frames per light, and dark frames.
     target
-        What the calibration frames show.
+        Of the calibration frames.
     region
         (x0, y0, x1, y1) px for test.toml; None: all that stays in view, less a margin.
     element_size
         px, for test.toml.
     noise_free
-        Write what each light alone gives, too.
+        Write the images of each light alone, too.
     """
 
     format: Literal["dng", "tiff"] = "dng"
@@ -255,7 +255,7 @@ class DatasetSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """A scene, its states in order (the first frame of a data set is the body at rest), and what to write."""
+    """A scene, its states in order (the first frame of a data set is the body at rest), and settings of the output."""
 
     scene: Scene
     states: tuple[State, ...]

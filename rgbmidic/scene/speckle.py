@@ -1,4 +1,4 @@
-"""The speckle of a scene: its spectrum in closed form, and a rendered piece of it for what no formula gives.
+"""The speckle of a scene: its spectrum in closed form, and a rendered piece of it where no formula exists.
 
 The spectrum is that of a Boolean model of discs seen through pixel aperture, lens and prefilter. The rendered piece
 gives the droplets' domes and, taken through the real demosaicing and unmixing, what a Bayer mosaic does to the lights'
@@ -103,8 +103,8 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
     noise : ndarray, shape (3, k, k, n, n)
         Of noise of unit variance in the samples of R, G or B.
     trace : ndarray, shape (3, k, k, n, n)
-        Of what stays with the mosaic when the texture moves, for its three carriers (alternating along x, along y, and
-        along both), in units of each light's mean; lights of equal brightness.
+        Of the part that stays with the mosaic when the texture moves, for its three carriers (alternating along x, y
+        and both), in units of each light's mean; lights of equal brightness.
     """
     camera, crosstalk = scene.camera, scene.camera.true_crosstalk(scene.lights)
     level, amplitude = _LEVEL * camera.full_scale, _NOISE * camera.full_scale

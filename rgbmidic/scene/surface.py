@@ -34,7 +34,7 @@ class Finish:
     Attributes
     ----------
     albedo
-        Share of light scattered diffusely (Lambert).
+        Fraction of light scattered diffusely (Lambert).
     gloss
         Peak of the specular reflection of one facet, in units of the radiance of an ideal white.
     lobe_deg
@@ -64,7 +64,7 @@ class Finish:
 
     @property
     def reflectance(self) -> float:
-        """Share of the light reflected, diffuse + specular: albedo + 8 gloss lobe**2 (lobe in rad)."""
+        """Fraction of the light reflected, diffuse + specular: albedo + 8 gloss lobe**2 (lobe in rad)."""
         return self.albedo + 8 * self.gloss * math.radians(self.lobe_deg) ** 2
 
     def _parameters(self) -> list[float]:
@@ -86,7 +86,7 @@ class Surface:
     spread
         Standard deviation of the logarithm of the diameter (bounded at 2.45 of it).
     coverage
-        Share of the surface that is black, 0 to 0.95; 0 leaves white paint alone.
+        Fraction of the surface that is black, 0 to 0.95; 0 leaves white paint alone.
     softness
         Width over which black fades to white at a droplet's edge (mm).
     dome
@@ -124,7 +124,7 @@ class Surface:
         return -math.log(1 - self.coverage) / (math.pi / 4 * self.droplet**2 * mean_square)
 
     def parameters(self) -> tuple[FloatArray, FloatArray, np.uint32]:
-        """What the kernels of `rgbmidic._kernels.render` take: paint, counts and seed."""
+        """Paint, counts and seed, as the kernels of `rgbmidic._kernels.render` take them."""
         radius = self.droplet / 2
         shell = 0.3 * radius
         far = radius * math.exp(BOUND * self.spread) + self.softness / 2

@@ -210,7 +210,7 @@ def slope_variance(paint: Finish) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Zones:
-    """What each light is expected to do at points of the surface, in one state; NaN where it does not see them.
+    """Reflection and grey level expected of each light at points of the surface, in one state; NaN where it is hidden.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ class Zones:
 
     @property
     def share(self) -> FloatArray:
-        """Specular share (k, ...) of the light that reaches the camera."""
+        """Specular fraction (k, ...) of the light that reaches the camera."""
         return self.geometry.share(self.reflectance)
 
     @property
@@ -258,7 +258,7 @@ def predict_zones(
     lights
         Instead of the scene's, in the same colours.
     reflectance
-        Of the paint, for instance from a goniometry; None: what follows from the scene's facets and wrinkles.
+        Of the paint, for instance from a goniometry; None: that of the scene's facets and wrinkles.
     """
     where = material_points(scene, state) if material is None else material
     zones = zones_on_surface(scene, *placed(scene, where, state), lights=lights, reflectance=reflectance)

@@ -1,7 +1,4 @@
-"""The inspection of one frame: what a user must know before a test.
-
-Figures of the samples and of the lights in a region, from which an inspection is made up.
-"""
+"""Inspection of one frame before a test: figures of its samples and lights in a region, uncertainty to expect."""
 
 from __future__ import annotations
 
@@ -46,6 +43,8 @@ __all__ = [
 Frame = Mosaic | ChannelFrame
 Linear = Sequence[LinearMosaic | LinearChannels]
 Progress = Callable[[int, int, str], None]
+CONTRAST_WIDTH = (10.0, 40.0)
+"""Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
 
 
 def inspect_files(
@@ -66,11 +65,11 @@ def inspect_files(
     files
         One file, or one per light.
     test
-        Settings of a test; its sections say how the frame is read, separated and measured.
+        Settings of a test; its sections state how the frame is read, separated and measured.
     calibration
         Calibration file; instead of the test's.
     frame
-        What the file does not tell (its `path` is not used); instead of the test's.
+        What the file does not state (its `path` is not used); instead of the test's.
     region, element_size
         (x0, y0, x1, y1) and side of the elements in px; instead of the test's, else the whole frame and 25.
     accept
@@ -122,10 +121,10 @@ def inspect_frame(
     accept: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Inspection:
-    """What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect.
+    """Inspect one frame before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect.
 
     The uncertainty is predicted in closed form (`rgbmidic.lab.inspection.prediction`) from the speckle, the contrast
-    of the lights and what separating a frame like this one gets wrong.
+    of the lights and the errors of separating a frame like this one.
 
     Parameters
     ----------
@@ -135,7 +134,7 @@ def inspect_frame(
         Crosstalk, noise and registration as far as they are known. Without crosstalk the channels stand for the lights,
         without noise it is estimated from the frame.
     region
-        What will be measured; None: the whole frame. Of the frame only this and its surroundings are looked at.
+        The region to be measured; None: the whole frame. Of the frame only this and its surroundings are looked at.
     element_size
         Side of the elements in px.
     demosaic, prefilter
@@ -143,11 +142,11 @@ def inspect_frame(
     name
         Of the frame, for reports.
     seed
-        Of what is drawn for the prediction.
+        Of the random numbers of the prediction.
     accept
         Contradictions to the calibration that are accepted, by the names of the checks (`FrameCheck`).
     progress
-        Called with the steps done, their number and what comes next.
+        Called with the steps done, their number and the next one.
 
     Raises
     ------
@@ -165,7 +164,7 @@ def inspect_frame(
     known = (calibration or Calibration()).cropped(None, shape)
     if not isinstance(region, Region):
         region = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1) if region is None else region, shape)
-    tell = progress or (lambda done, total, line: None)
+    report = progress or (lambda done, total, line: None)
     contradictions = check_state(frames, known, region.mask, name, accept=accept)
     mesh, window = Tri3Mesh.from_region(region, element_size), surroundings(region)
     part = window.part_of(Window.whole(shape))
@@ -174,18 +173,18 @@ def inspect_frame(
     linear = [linearise(shot, known.noise) for shot in cut]
     channels = channels_of(linear)
     _check_light(channels, region.mask)
-    tell(0, 3, "exposure, speckle and noise")
+    report(0, 3, "exposure, speckle and noise")
     samples = SampleSummary.of(channels, region.mask, known.noise, linear[0].full_scale)
     crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
     crosstalk = crosstalk.cropped(window.origin, window.shape)
-    tell(1, 3, "lights, and what separating them gets wrong")
+    report(1, 3, "lights, and the errors of their separation")
     names = known.registration.lights if known.registration else ()
     separated, errors = _separated(linear, crosstalk, demosaic, samples.noise, names, np.random.default_rng(seed))
     images = separated
     if known.registration is not None:
         images = align(images, known.registration.cropped(window.origin))
-    tell(2, 3, "uncertainty to expect")
-    level, contrast = level_and_contrast(images, contrast_window(samples.facts))
+    report(2, 3, "uncertainty to expect")
+    level, contrast = level_and_contrast(images, contrast_window(samples.channels))
     index = _reflection_index(separated, contrast)
     prediction = predict(
         replace(mesh, nodes=mesh.nodes - window.origin),
@@ -196,12 +195,12 @@ def inspect_frame(
         texture=separated.texture or samples.texture,
         prefilter=prefilter,
     )
-    tell(3, 3, "done")
+    report(3, 3, "done")
     single = not isinstance(linear[0], LinearMosaic) and len(linear[0].values) == 1
     return Inspection(
         name=name,
         kind="bayer" if isinstance(linear[0], LinearMosaic) else "monochrome" if single else "rgb",
-        channels=samples.facts,
+        channels=samples.channels,
         lights=light_summaries(images, contrast, index, prediction.alone, region.mask),
         frame_shape=shape,
         origin=window.origin,
@@ -275,7 +274,7 @@ def _separated(
 
 
 def _reflection_index(images: IlluminationImages, contrast: FloatImage) -> FloatImage | None:
-    """What the separation tells of reflections, else the contrast that a light lacks to the best one's."""
+    """Reflection index of the separation, else the relative contrast that a light lacks to the best one."""
     index = images.reflection_index()
     if index is not None or len(contrast) == 1:
         return index
@@ -307,15 +306,11 @@ def _check_light(channels: list[Channel], inside: BoolArray) -> None:
         raise InputError("every channel of the region is constant: there is nothing to inspect")
 
 
-CONTRAST_WIDTH = (10.0, 40.0)
-"""Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleSummary:
-    """What the samples of the channels tell: figures, the camera noise, and the autocorrelation of the speckle."""
+    """Figures of the samples of the channels, the camera noise, and the autocorrelation of the speckle."""
 
-    facts: tuple[ChannelSummary, ...]
+    channels: tuple[ChannelSummary, ...]
     noise: NoiseModel
     texture: TextureModel | None
 
@@ -329,12 +324,12 @@ class SampleSummary:
         known = [estimate for estimate in estimates if np.isfinite(estimate)]
         typical = float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
         noise = calibrated or NoiseModel(gain=float("inf"), read_noise=typical)
-        facts = []
+        summaries = []
         for number, channel in enumerate(channels):
             samples = channel.values[inside & np.isfinite(channel.values)] / full_scale
             low, high = np.quantile(samples, [0.05, 0.95])
             level, texture = float(samples.mean()), textures[number]
-            facts.append(
+            summaries.append(
                 ChannelSummary(
                     name=channel.name,
                     mean=level,
@@ -348,7 +343,7 @@ class SampleSummary:
                 )
             )
         sharpest = sorted((texture for texture in textures if texture), key=lambda texture: texture.diameter)
-        return cls(facts=tuple(facts), noise=noise, texture=sharpest[len(sharpest) // 2] if sharpest else None)
+        return cls(channels=tuple(summaries), noise=noise, texture=sharpest[len(sharpest) // 2] if sharpest else None)
 
 
 def contrast_window(channels: tuple[ChannelSummary, ...]) -> float:
@@ -382,11 +377,11 @@ def light_summaries(
     inside: BoolArray,
 ) -> tuple[LightSummary, ...]:
     """Figures of each light in the region, from its contrast, its reflection index and its uncertainty alone."""
-    facts = []
+    summaries = []
     for j, light in enumerate(images.names):
         values, valid = images.values[j][inside], images.valid[j][inside]
         mean = local_mean(images.values[j], CONTRAST_WIDTH[0])[inside]
-        facts.append(
+        summaries.append(
             LightSummary(
                 name=light,
                 mean=float(values[valid].mean() / images.full_scale) if valid.any() else float("nan"),
@@ -397,7 +392,7 @@ def light_summaries(
                 alone=Spread.of(alone[j]),
             )
         )
-    return tuple(facts)
+    return tuple(summaries)
 
 
 def green_difference(mosaic: LinearMosaic) -> float:

@@ -4,7 +4,7 @@ Contrast and energy of the speckle's gradient follow from the frame; the errors 
 reflection-aware model of the frame (local means, slope of each channel on the common texture, channel-specific
 component, autocorrelation of the speckle) describes a random frame with the statistics of the one given. Such a frame
 is drawn with all its channels at every pixel and separated as the test does, behind the four phases of the colour
-filter array: what is the same in all of them moves with the specimen and does no harm, the rest stays with the sensor.
+filter array: what is the same in all of them moves with the specimen, the rest stays with the sensor.
 Camera noise goes the same way. Filtered with the root of the speckle's gradient spectrum, the mean square of the errors
 is the variance of the right-hand side.
 """
@@ -129,7 +129,7 @@ class Prediction:
     std
         Of all lights together.
     noise, mosaic
-        The parts of it from camera noise, and from what the mosaic did not sample.
+        The parts of it from camera noise, and from samples that the mosaic lacks.
     alone : tuple of ndarray
         Of every light alone.
     """
@@ -155,7 +155,7 @@ def predict(
     Parameters
     ----------
     mesh, region
-        What is measured.
+        Mesh of the measurement and its region, in px of the images.
     contrast, level : ndarray, shape (k, H, W)
         Local standard deviation of each light in units of its local mean, 0 where the light is not known; and that
         mean, DN.
@@ -171,8 +171,8 @@ def predict(
     Prediction
     """
     if texture is None:
-        nothing = np.full(len(mesh.nodes), np.nan)
-        return Prediction(std=nothing, noise=nothing, mosaic=nothing, alone=(nothing,) * len(contrast))
+        unknown = np.full(len(mesh.nodes), np.nan)
+        return Prediction(std=unknown, noise=unknown, mosaic=unknown, alone=(unknown,) * len(contrast))
     light = contrast > 0
     spectrum = SpeckleSpectrum.of_texture(texture, size=_GRID, prefilter=prefilter)
     kernel = spectrum.score_kernel(_REACH)
@@ -257,7 +257,7 @@ def _noisy(values: FloatImage, noise: NoiseModel, random: np.random.Generator) -
 
 
 def _smooth(images: FloatImage, inside: BoolArray, width: float) -> FloatImage:
-    """Local means of images (n, H, W) over what lies inside the region, over about an element and its neighbours."""
+    """Local means of images (n, H, W) inside the region, over about an element and its neighbours."""
     return np.stack([np.nan_to_num(local_mean(np.where(inside, image, np.float32(np.nan)), width)) for image in images])
 
 

@@ -22,11 +22,12 @@ __all__ = ["Channel", "channels_of", "noise_estimate", "speckle_texture", "surro
 MEAN_WIDTH = 20.0
 """Standard deviation (px) of the local mean that the contrast is taken against; wide, so as to keep coarse speckle."""
 FARTHEST = 24
-"""Largest distance (px) at which the autocorrelation is looked at."""
+"""Largest distance (px) of the autocorrelation: speckle of up to half of it is found."""
 _WIDTHS = 0.5 * 1.25 ** np.arange(17)
 """Standard deviations (px) of the Gaussians that are fitted to it."""
 _REGRESSED, _FLATTEST = 20_000, 0.05
-"""Samples that are looked at, and the share of them, with the flattest surroundings, that the regression is made on."""
+"""Samples that are looked at, and the fraction of them, with the flattest surroundings, for the
+regression; chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +95,7 @@ def speckle_texture(channel: Channel, inside: BoolArray, noise: NoiseModel | Non
     if noise is not None:
         product[at_zero] -= float((noise.variance(mean[usable]) / mean[usable] ** 2).mean())
     kept = (count > 0.05 * count.max()) & (~at_zero if noise is None else True)
-    narrowest = 0.0 if noise is not None else channel.step / 2  # nothing tells narrower ones from noise
+    narrowest = 0.0 if noise is not None else channel.step / 2  # narrower ones cannot be distinguished from noise
     return _fitted(distance[kept], product[kept], np.asarray(_WIDTHS[narrowest < _WIDTHS], dtype=np.float64))
 
 
@@ -135,8 +136,8 @@ def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
     """Standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
 
     Where its surroundings are bright and flattest, a sample's contrast is predicted from the 24 samples around it, of
-    whatever channel, by linear regression, one for each position in the cell of the mosaic. What is left is the
-    sample's own noise, that of its neighbours through the regression, and texture that they do not tell: fair where
+    any channel, by linear regression, one for each position in the cell of the mosaic. The residual holds the
+    sample's own noise, that of its neighbours through the regression, and texture that they do not predict: fair where
     paint is flat over five samples, too high for finer speckle and in reflections (docs/inspect.md). Its scale is
     1.4826 times the median absolute value.
     """
@@ -165,7 +166,7 @@ def _mean(channel: Channel) -> FloatImage:
 
 
 def _unpredicted(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], step: int) -> FloatImage:
-    """What a regression on the 5 x 5 samples around leaves of the samples of one phase, flat."""
+    """Residual (flat) of the samples of one phase after a regression on the 5 x 5 samples around each."""
     rows, columns = np.nonzero(lattice[2:-2, 2:-2])
     kept = ((rows + 2) % step == phase[0]) & ((columns + 2) % step == phase[1])
     rows, columns = rows[kept], columns[kept]
@@ -184,8 +185,8 @@ def _unpredicted(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], 
     around = np.delete(patches, 12, axis=1)
     system = np.column_stack([around, np.ones(len(around))])
     coefficients = np.linalg.lstsq(system, patches[:, 12], rcond=None)[0]
-    share = np.sqrt(len(patches) / max(len(patches) - system.shape[1], 1))
-    return np.asarray((patches[:, 12] - system @ coefficients) * share, dtype=np.float32)
+    freedom = np.sqrt(len(patches) / max(len(patches) - system.shape[1], 1))
+    return np.asarray((patches[:, 12] - system @ coefficients) * freedom, dtype=np.float32)
 
 
 MARGIN = 96
@@ -196,7 +197,7 @@ model of the frame is averaged (`rgbmidic.lab.inspection.prediction.SETTLED`).""
 def surroundings(region: Region) -> Window:
     """The part of the frame that is looked at: the region and `MARGIN` px around.
 
-    It begins at an even column and row, so that the pattern of a mosaic stays what it is.
+    It begins at an even column and row, so that the pattern of a mosaic stays the same.
     """
     spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0)]
     first = [max(int(span[0]) - MARGIN, 0) // 2 * 2 for span in spans]

@@ -29,7 +29,7 @@ __all__ = [
 AREA_SIZE = (50.0, 100.0)
 """Width and height (px) of the paper's areas."""
 _MEASURED = 0.5
-"""Fraction of an area that must be measured for a figure on it; a choice."""
+"""Fraction of an area that must be measured for a figure on it; chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

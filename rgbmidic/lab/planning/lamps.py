@@ -40,7 +40,7 @@ _WORTHWHILE = 1.02
 """Gain from which lamps are moved; chosen: less is not worth mounting."""
 _AFFORDABLE = 1.2
 """Largest growth of the expected uncertainty for lamps that are moved, which then stand more obliquely: a reflection
-that hardly disturbs need not be fled at any price."""
+that hardly adds to the uncertainty need not be avoided at any price; chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +50,7 @@ class Proposal:
     Attributes
     ----------
     plan
-        What to expect of them.
+        Zones and uncertainty with them.
     gain
         Cost of the present lamps over theirs; 1 where nothing better was found.
     """

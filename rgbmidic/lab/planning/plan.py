@@ -22,12 +22,12 @@ from rgbmidic.typing import BoolArray, FloatArray
 __all__ = ["Outlook", "Plan", "make_plan"]
 
 _POINTS = 80
-"""Points of the prediction along the longer side of the frame."""
+"""Points of the prediction along the longer side of the frame; chosen: zones are far wider than a step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outlook:
-    """What is expected of one state, at points of the reference image; NaN where the body is not seen.
+    """Zones and uncertainty expected in one state, at points of the reference image; NaN where the body is not seen.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Outlook:
     displacement : ndarray, shape (2, h, w)
         px.
     reflects : ndarray, shape (k, h, w), bool
-        Whether the light's specular share exceeds `rgbmidic.scene.zones.REFLECTS` in the reference or in this state.
+        Whether the light's specular fraction exceeds `rgbmidic.scene.zones.REFLECTS` in the reference or in this state.
     lit : ndarray, shape (k, h, w), bool
         Whether the light reaches the point in both.
     saturated : ndarray, shape (k, h, w), bool
@@ -68,16 +68,16 @@ class Outlook:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """A scene with what is expected of it.
+    """A scene with the outlook of each of its states.
 
     Attributes
     ----------
     scene
         Lamps, camera, paint and body.
     instrument
-        What camera, paint and processing make of them.
+        Camera, paint and processing, reduced for the forecast.
     field
-        (x0, y0, x1, y1) in px of the reference image: what is to be measured.
+        (x0, y0, x1, y1) in px of the reference image: the region to be measured.
     x, y : ndarray, shape (h, w)
         Points (px) of the reference image at which everything is predicted.
     inside : ndarray, shape (h, w), bool
@@ -103,7 +103,7 @@ class Plan:
         return replace(self, scene=scene, reference=reference, outlooks=outlooks)
 
     def share(self, mask: BoolArray) -> float:
-        """Share of the field on which a mask (h, w) holds."""
+        """Fraction of the field on which a mask (h, w) holds."""
         return float(mask[self.inside].mean())
 
     @property
@@ -119,12 +119,16 @@ def make_plan(experiment: Experiment) -> Plan:
     Parameters
     ----------
     experiment
-        What `rgbmidic.scene.scene.read_scene` reads; without states, the body at rest is compared with itself.
+        From `rgbmidic.scene.scene.read_scene`; without states, the body at rest is compared with itself.
 
     Raises
     ------
     InputError
         The field does not lie on the body in every state.
+
+    Returns
+    -------
+    Plan
     """
     scene = experiment.scene
     states = list(experiment.states) or [State()]
@@ -180,7 +184,7 @@ def _predict(
 
 
 def _around(values: FloatArray, reach: float) -> FloatArray:
-    """Mean (n, h, w) of what is known within about `reach` points: over the elements of a node."""
+    """Mean (n, h, w) of the known values within about `reach` points: over the elements of a node."""
     known = np.isfinite(values)
     total, weight = (
         np.stack([cv2.GaussianBlur(part, (0, 0), 0.5 * reach) for part in stack])

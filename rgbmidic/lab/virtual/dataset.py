@@ -48,7 +48,7 @@ calibration/README.md states; in the last it saturates."""
 
 
 def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | None = None) -> Path:
-    """Render what a SCENE.toml describes.
+    """Render the virtual test that a SCENE.toml describes.
 
     Written to `out`: ``frames/`` (frame 0 shows the body at rest; a monochrome camera gets one folder per light),
     ``dark/``, ``light_NAME/``, ``flat_1/`` and so on and ``check/`` for `rgbmidic-calibrate`, ``calibration.json`` (the
@@ -244,8 +244,8 @@ def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]
     brightest = float(np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images).max())
     steps = np.random.SeedSequence(seed).spawn(len(EXPOSURES))
     taken = []
-    for share, step in zip(EXPOSURES, steps, strict=True):
-        exposed = images * np.float32(share * scene.camera.full_scale / brightest)
+    for fraction, step in zip(EXPOSURES, steps, strict=True):
+        exposed = images * np.float32(fraction * scene.camera.full_scale / brightest)
         taken.append([record(exposed, scene.camera, scene.lights, seed=int(s)) for s in step.generate_state(count)])
     return taken
 
@@ -258,7 +258,7 @@ def check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int)
     scene
         Its lights and camera.
     images : ndarray, shape (k, H, W)
-        What each light alone gives.
+        Images of each light alone.
     count
         Frames of each kind.
     seed
@@ -289,7 +289,7 @@ def record(
     Parameters
     ----------
     images : (k, H, W)
-        What each light alone gives (`rgbmidic.lab.virtual.render`).
+        Images of each light alone (`rgbmidic.lab.virtual.render`).
     camera
         The camera.
     lights

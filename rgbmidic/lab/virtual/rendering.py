@@ -56,7 +56,7 @@ def samples_needed(scene: Scene) -> int:
 
 
 def render(scene: Scene, state: State | None = None) -> FloatImage:
-    """What each light alone gives, without noise.
+    """Images of each light alone, without noise.
 
     Parameters
     ----------
