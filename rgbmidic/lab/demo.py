@@ -189,7 +189,7 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
 
 
 def _separated(settings: TestSettings) -> list[FloatImage]:
-    """The lights (k, H, W) of every frame."""
+    """Return the lights (k, H, W) of every frame."""
     assert settings.calibration_file is not None
     calibration = Calibration.read(settings.calibration_file)
     separation = Separation(calibration=calibration)

@@ -69,17 +69,18 @@ class Light:
     shift: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (np.isfinite(self.position).all() and self.power >= 0 and math.isfinite(self.power)):
             raise InputError(f"light {self.name}: position must be finite, power not negative: {self}")
         if not abs(self.magnification) < 0.1:
             raise InputError(f"light {self.name}: magnification is a small relative change, not {self.magnification}")
 
     def aimed(self, target: Vector, irradiance: float = 1.0) -> Light:
-        """This light with the power that gives `irradiance` (1: the camera's exposure) at the target."""
+        """Return the light with the power that gives `irradiance` (1: the camera's exposure) at the target."""
         return replace(self, power=irradiance * math.dist(self.position, target) ** 2 / NOMINAL_DISTANCE**2)
 
     def turned(self, angle_deg: float, pivot: Vector, axis: Vector = (0.0, 1.0, 0.0)) -> Light:
-        """This light turned about an axis through a pivot, as on the goniometer of paper section 2.3."""
+        """Return the light turned about an axis through a pivot, as on the goniometer of paper section 2.3."""
         position = rotation(angle_deg, axis) @ (np.array(self.position) - pivot) + pivot
         return replace(self, position=(float(position[0]), float(position[1]), float(position[2])))
 
@@ -173,6 +174,7 @@ class Camera:
     exposure_time: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (len(self.shape) == 2 and min(self.shape) >= 2):
             raise InputError(f"a frame has at least 2 rows and 2 columns, not {self.shape}")
         if self.kind not in ("bayer", "rgb", "monochrome"):
@@ -250,12 +252,12 @@ class Camera:
         return np.eye(3)[:, : len(lights)]
 
     def mixing(self, lights: tuple[Light, ...]) -> FloatArray:
-        """A (C, k) in channels = A . light images; every column's largest entry is 1."""
+        """Return A (C, k) in channels = A . light images; every column's largest entry is 1."""
         matrix = self.response(lights)
         return np.asarray(matrix / matrix.max(axis=0))
 
     def true_crosstalk(self, lights: tuple[Light, ...]) -> Crosstalk:
-        """The crosstalk that a perfect calibration would find."""
+        """Return the crosstalk that a perfect calibration would find."""
         return Crosstalk(matrix=self.mixing(lights), lights=tuple(light.name for light in lights))
 
 
@@ -271,5 +273,5 @@ def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
 
 
 def mosaic_samples(channels: npt.NDArray[Floating], cfa: str) -> npt.NDArray[Floating]:
-    """Samples (H, W) that a colour filter array takes of channels (3, H, W)."""
+    """Return the samples (H, W) that a colour filter array takes of channels (3, H, W)."""
     return np.asarray(np.take_along_axis(channels, sampled_channels(cfa, channels.shape[1:])[None], axis=0)[0])

@@ -98,7 +98,7 @@ def light_pull(contrast: npt.NDArray[Floating], residual: npt.NDArray[Floating])
 
 
 def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -> FloatArray:
-    """Standard uncertainty (n, N) of a displacement component at the nodes, px; NaN where they see too little.
+    """Return the standard uncertainty (n, N) of a displacement component at the nodes, px; NaN where unseen.
 
     Parameters
     ----------
@@ -447,7 +447,7 @@ def trace_change(displacement: FloatArray) -> FloatArray:
 
 
 def pixel_size(scene: Scene) -> float:
-    """mm per px at the body's front point."""
+    """Pixel size on the object, mm per px, at the body's front point."""
     return scene.body.front[2] / scene.camera.focal_px
 
 
@@ -464,8 +464,10 @@ def _channels(mixing: FloatArray, levels: FloatArray) -> FloatArray:
 
 
 def _facet_covariance(first: FloatArray, second: FloatArray, a2: float, b2: float) -> FloatArray:
-    """Covariance of the facets' reflections at two half-way slopes (k, 3, ...), relative to the product of the means,
-    without the part that is linear in the facets' slopes."""
+    """Covariance of the facets' reflections at two half-way slopes (k, 3, ...), relative to the product of the means.
+
+    The part that is linear in the facets' slopes is left out.
+    """
     middle, apart = (first + second) / 2, first - second
 
     def square(vector: FloatArray) -> FloatArray:

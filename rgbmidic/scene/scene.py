@@ -43,6 +43,7 @@ class Sphere:
     centre: Vector = (0.0, 0.0, 641.25)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         _check_size(self.radius, self.radius, self.centre[2] - self.radius)
 
     @property
@@ -70,6 +71,7 @@ class Cylinder:
     tilt_deg: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         _check_size(self.radius, self.length, self.centre[2] - self.radius)
 
     @property
@@ -97,6 +99,7 @@ class Plate:
     tilt_deg: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         _check_size(self.width, self.height, self.centre[2])
 
     @property
@@ -149,7 +152,7 @@ class State:
         return any(self.velocity) or self.spin_deg != 0
 
     def after(self, seconds: float) -> State:
-        """The state some time later, at rest."""
+        """Return the state some time later, at rest."""
         x, y, z = (p + v * seconds for p, v in zip(self.translation, self.velocity, strict=True))
         angle = self.angle_deg + self.spin_deg * seconds
         return replace(self, angle_deg=angle, translation=(x, y, z), velocity=(0.0, 0.0, 0.0), spin_deg=0.0)
@@ -172,20 +175,21 @@ class Scene:
     surface: Surface = field(default_factory=Surface)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         names = [light.name for light in self.lights]
         if not names or len(set(names)) < len(names):
             raise InputError(f"a scene has at least one light, and every light its own name; given are {names}")
         self.camera.response(self.lights)
 
     def light(self, name: str) -> Light:
-        """The light of that name."""
+        """Return the light of that name."""
         for light in self.lights:
             if light.name == name:
                 return light
         raise InputError(f"no light {name!r}; the scene has {', '.join(light.name for light in self.lights)}")
 
     def with_light(self, light: Light) -> Scene:
-        """The same scene with the light of that name exchanged."""
+        """Return the same scene with the light of that name exchanged."""
         self.light(light.name)
         return replace(self, lights=tuple(light if old.name == light.name else old for old in self.lights))
 
@@ -249,6 +253,7 @@ class DatasetSettings:
     noise_free: bool = False
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if self.calibration_frames < 1 or self.element_size <= 0 or self.seed < 0:
             raise InputError("calibration_frames and element_size must be positive, seed not negative")
 
@@ -314,7 +319,7 @@ def _tables(document: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def _build(kind: Any, table: Mapping[str, Any], where: str, base: Path, **ready: Any) -> Any:
-    """An object of a settings class from a table of plain values; `ready` holds fields that are objects already."""
+    """Return an object of a settings class from a table of plain values; `ready` holds fields that are objects."""
     hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in ready}
     check_names(table, hints, "key", f"[{where}]")
     given = {key: convert_value(value, hints[key], f"{where}.{key}", base) for key, value in table.items()}

@@ -64,7 +64,7 @@ class SpecklePatch:
 
     @classmethod
     def of(cls, scene: Scene, size: int) -> SpecklePatch:
-        """A piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
+        """Return a piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
         camera, surface = scene.camera, scene.surface
         pixel = scene.body.front[2] / camera.focal_px
         smooth = replace(
@@ -267,13 +267,17 @@ class SpeckleSpectrum:
         return np.asarray((self.prefilter * errors).mean(axis=(-2, -1)))
 
     def pull(self, cross: FloatArray) -> float:
-        """Mean product of the gradients along x, after the prefilter, of the texture and of a field with which it has
-        the cross spectrum (n, n)."""
+        """Mean product of the gradients along x, after the prefilter, of the texture and of another field.
+
+        `cross` (n, n) is their cross spectrum.
+        """
         return float(((2 * np.pi * self.frequency) ** 2 * self.prefilter * cross).mean())
 
     def score_kernel(self, reach: int) -> FloatImage:
-        """Kernel (2 reach + 1, 2 reach + 1) that filters an image of errors, before the prefilter, so that the mean
-        square of the result is `score` of their spectrum."""
+        """Kernel (2 reach + 1, 2 reach + 1) that filters errors, before the prefilter, into the right-hand side.
+
+        The mean square of the filtered image is `score` of the spectrum of the errors.
+        """
         whole = np.fft.fftshift(np.fft.ifft2(np.sqrt(self.slope * self.texture) * self.prefilter).real)
         near = slice(len(whole) // 2 - reach, len(whole) // 2 + reach + 1)
         return whole[near, near].astype(np.float32)

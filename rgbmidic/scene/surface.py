@@ -52,6 +52,7 @@ class Finish:
     spacing: float = 0.025
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (0 <= self.albedo <= 1 and self.gloss >= 0 and 0 <= self.slope_deg <= 30):
             raise InputError(f"albedo lies in 0 to 1, gloss is not negative, slope_deg is 0 to 30: {self}")
         if not (0 < self.lobe_deg <= 30 and self.spacing > 0):
@@ -105,6 +106,7 @@ class Surface:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (self.droplet > 0 and 0 <= self.spread <= 0.6 and 0 <= self.coverage <= 0.95):
             raise InputError(
                 f"a droplet is larger than 0, its spread 0 to 0.6, the coverage 0 to 0.95; given are droplet "
@@ -220,6 +222,7 @@ class AffineField:
     offset: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         (xx, xy), (yx, yy) = self.gradient
         if not (1 + xx) * (1 + yy) - xy * yx > 0:
             raise InputError(f"a displacement gradient must not turn the plate inside out: {self.gradient}")
@@ -261,6 +264,7 @@ class MeshField:
     displacement: FloatArray
 
     def __post_init__(self) -> None:
+        """Check the values."""
         nodes, values = np.array(self.nodes, dtype=float), np.array(self.displacement, dtype=float)
         elements = np.array(self.elements, dtype=np.int64)
         if nodes.ndim != 2 or nodes.shape[1] != 2 or values.shape != nodes.shape or elements.shape[1:] != (3,):

@@ -148,7 +148,7 @@ def intersect(scene: Scene, state: State, x: FloatArray, y: FloatArray) -> Float
 def region_in_view(
     x: FloatArray, y: FloatArray, displacement: FloatArray, shape: tuple[int, int]
 ) -> tuple[float, float, float, float]:
-    """The largest rectangle about the middle that lies, with a margin, on the body and within the frame in all states.
+    """Return the largest rectangle about the middle on the body and, with a margin, in the frame in all states.
 
     Parameters
     ----------

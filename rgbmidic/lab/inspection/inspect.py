@@ -225,7 +225,7 @@ def inspect_frame(
 
 
 def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) -> FrameSettings:
-    """The test's frame settings, or none, with what else is stated (`FrameSettings`; None: not stated).
+    """Return the test's frame settings, or none, with what else is stated (`FrameSettings`; None: not stated).
 
     Raises
     ------
@@ -347,7 +347,7 @@ class SampleSummary:
 
 
 def contrast_window(channels: tuple[ChannelSummary, ...]) -> float:
-    """Standard deviation (px) of a window that holds many speckles."""
+    """Return the standard deviation (px) of a window that holds many speckles."""
     sizes = [channel.speckle_px for channel in channels if np.isfinite(channel.speckle_px)]
     return float(np.clip(2.5 * np.median(sizes) if sizes else 0.0, *CONTRAST_WIDTH))
 

@@ -150,7 +150,7 @@ def predict(
     texture: TextureModel | None,
     prefilter: str,
 ) -> Prediction:
-    """Standard uncertainty expected of the displacement from a frame to a second state.
+    """Return the standard uncertainty expected of the displacement from a frame to a second state.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def predict(
 
 
 def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
-    """A Gaussian random image (H, W) with the autocorrelation of `texture`, its offset aside."""
+    """Return a Gaussian random image (H, W) with the autocorrelation of `texture`, its offset aside."""
     from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2, rfftfreq
 
     rows, columns = (next_fast_len(side, real=True) for side in shape)
@@ -243,7 +243,7 @@ def _drawn_channels(model: Reconstruction, shape: tuple[int, ...], random: np.ra
 
 
 def _settled(grid: npt.NDArray[np.floating], block: int) -> FloatArray:
-    """A grid (n, h, w) of blocks smoothed over `SETTLED` px, which takes out the scatter of a few speckles per window.
+    """Return a grid (n, h, w) of blocks smoothed over `SETTLED` px, without the scatter of few speckles per window.
 
     The scatter differs from channel to channel, and a frame with a ratio of the channels that scatters would be harder
     to separate than a real one.

@@ -88,7 +88,7 @@ def _text(value: float, digits: int) -> str:
 
 
 def inspection_document(inspection: Inspection) -> dict[str, Any]:
-    """The figures as plain values, for inspection.json; a number that is not known is null."""
+    """Return the figures as plain values, for inspection.json; a number that is not known is null."""
     texture = inspection.texture
     return {
         "schema": "rgbmidic-inspection",

@@ -51,7 +51,7 @@ class Channel:
 
 
 def channels_of(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
-    """The channels of a frame, or of the frames of lights fired in succession."""
+    """Return the channels of a frame, or of the frames of lights fired in succession."""
     channels: list[Channel] = []
     for frame in frames:
         if isinstance(frame, LinearMosaic):
@@ -72,7 +72,7 @@ def channels_of(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
 
 
 def speckle_texture(channel: Channel, inside: BoolArray, noise: NoiseModel | None) -> TextureModel | None:
-    """The autocorrelation of a channel's contrast; None where there is no texture, or no end of it within `FARTHEST`.
+    """Return the autocorrelation of a channel's contrast; None without a texture, or one that ends within `FARTHEST`.
 
     The contrast is the sample over the local mean, less 1. Products of samples of this channel alone enter, so that
     demosaicing has no part in it. The noise is a peak at distance 0, where its variance is subtracted; with unknown
@@ -133,7 +133,7 @@ def _fitted(distance: FloatArray, product: FloatArray, widths: FloatArray) -> Te
 
 
 def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
-    """Standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
+    """Return the standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
 
     Where its surroundings are bright and flattest, a sample's contrast is predicted from the 24 samples around it, of
     any channel, by linear regression, one for each position in the cell of the mosaic. The residual holds the
@@ -195,7 +195,7 @@ model of the frame is averaged (`rgbmidic.lab.inspection.prediction.SETTLED`).""
 
 
 def surroundings(region: Region) -> Window:
-    """The part of the frame that is looked at: the region and `MARGIN` px around.
+    """Return the part of the frame that is looked at: the region and `MARGIN` px around.
 
     It begins at an even column and row, so that the pattern of a mosaic stays the same.
     """

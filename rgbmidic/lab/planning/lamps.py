@@ -65,14 +65,14 @@ class Proposal:
 
 
 def propose_colours(plan: Plan) -> Proposal:
-    """The present lamp directions with the colours exchanged for the best."""
+    """Return the present lamp directions with the colours exchanged for the best."""
     compared = _Compared.of(plan, _directions(plan.scene))
     own = tuple(range(len(plan.scene.lights)))
     return compared.proposal(plan, min(permutations(own), key=compared.cost), affordable=1.0)
 
 
 def propose_lamps(plan: Plan) -> Proposal:
-    """The best directions of a grid over azimuth and inclination, with the best colour for each."""
+    """Return the best directions of a grid over azimuth and inclination, with the best colour for each."""
     present = _directions(plan.scene)
     compared = _Compared.of(plan, np.concatenate([present, _grid()]))
     own = tuple(range(len(present)))
@@ -143,8 +143,10 @@ class _Compared:
                 return choice
 
     def proposal(self, plan: Plan, choice: tuple[int, ...], affordable: float) -> Proposal:
-        """The plan with the lights in the chosen directions, if that gains and the uncertainty does not grow by more
-        than the factor `affordable`."""
+        """Return the plan with the lights in the chosen directions, if that gains.
+
+        The uncertainty must not grow by more than the factor `affordable`.
+        """
         gain = self.cost(range(len(choice))) / self.cost(choice)
         if gain < _WORTHWHILE:
             return Proposal(plan=plan, gain=1.0)
@@ -178,7 +180,7 @@ def _clear(instrument: Instrument, light: int, before: Zones, after: Zones, brig
 
 
 def _directions(scene: Scene) -> FloatArray:
-    """Unit vectors (k, 3) from the body's front point to the lamps."""
+    """Return unit vectors (k, 3) from the body's front point to the lamps."""
     towards = np.array([light.position for light in scene.lights]) - scene.body.front
     return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
 
@@ -192,7 +194,7 @@ def _grid() -> FloatArray:
 
 
 def _placed(light: Light, scene: Scene, direction: FloatArray) -> Light:
-    """The light at its distance from the body's front point, in another direction."""
+    """Return the light at its distance from the body's front point, in another direction."""
     front = np.array(scene.body.front)
     distance = np.linalg.norm(np.array(light.position) - front)
     x, y, z = (front + distance * direction).tolist()

@@ -98,7 +98,7 @@ class Plan:
     outlooks: tuple[Outlook, ...]
 
     def with_lamps(self, scene: Scene) -> Plan:
-        """The same plan with a scene whose lamps stand elsewhere."""
+        """Return the same plan with a scene whose lamps stand elsewhere."""
         reference, outlooks = _predict(scene, self.instrument, self.x, self.y, [o.state for o in self.outlooks])
         return replace(self, scene=scene, reference=reference, outlooks=outlooks)
 

@@ -50,6 +50,8 @@ def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwri
         Name to better lamps.
     out
         Folder; made where it does not exist.
+    overwrite
+        Whether a plan in the folder is replaced.
 
     Raises
     ------
@@ -120,7 +122,7 @@ def summary(plan: Plan) -> str:
 
 
 def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
-    """The plan as plain values, for plan.json; fractions are of the field, a number that is not known is null."""
+    """Return the plan as plain values, for plan.json; fractions are of the field, an unknown number is null."""
     return {
         "schema": "rgbmidic-plan",
         "rgbmidic": __version__,

@@ -156,6 +156,7 @@ def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest:
 
 
 def true_calibration(scene: Scene) -> Calibration:
+    """Return the calibration that a perfect laboratory would find of a scene."""
     camera = scene.camera
     return Calibration(
         crosstalk=None if camera.kind == "monochrome" else camera.true_crosstalk(scene.lights),
@@ -168,7 +169,7 @@ def true_calibration(scene: Scene) -> Calibration:
 
 
 def _test_settings(scene: Scene, settings: DatasetSettings, region: tuple[float, ...]) -> str:
-    """The text of test.toml."""
+    """Return the text of test.toml."""
     camera = scene.camera
     suffix = "dng" if camera.kind == "bayer" and settings.format == "dng" else "tif"
     path = ", ".join(f'"{folder}/*.{suffix}"' for folder in _folders(scene))
@@ -190,7 +191,7 @@ def _save(path: Path, **arrays: npt.ArrayLike) -> None:
 
 
 def target_scene(scene: Scene, target: Target = "white") -> Scene:
-    """The same lights and camera before a flat mat target that fills the field at the body's front point."""
+    """Return the same lights and camera before a flat mat target that fills the field at the body's front point."""
     if target not in ("white", "speckled"):
         raise InputError(f"unknown target {target!r}; allowed are white, speckled")
     mat = Finish(albedo=0.8, gloss=0.0, slope_deg=0.0)
@@ -282,7 +283,7 @@ def record(
     seed: int,
     on: Collection[str] | None = None,
 ) -> Mosaic | ChannelFrame:
-    """The raw frame that the camera takes.
+    """Return the raw frame that the camera takes.
 
     Electrons = Poisson(gain x signal) + normal(read noise); DN = round(electrons/gain + black), clipped at saturation.
 

@@ -177,7 +177,7 @@ def sphere_scene(
     aberration: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **camera: object,
 ) -> Scene:
-    """The speckled 82.5 mm sphere under three coloured lamps; `turned` gives its states.
+    """Return the speckled 82.5 mm sphere under three coloured lamps; `turned` gives its states.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def plate_scene(
     tilt_deg: tuple[float, float] = (float(np.degrees(0.15)), 0.0),
     **settings: Any,
 ) -> Scene:
-    """A flat speckled plate under three coloured lamps; `strained_plate` gives its states.
+    """Return a flat speckled plate under three coloured lamps; `strained_plate` gives its states.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def plate_scene(
 
 
 def paper_scene(*, size: int = 1024, seed: int = 0, colour: bool = False, **camera: object) -> Scene:
-    """The bench of paper section 3.3: two white lamps in succession and a monochrome camera, or three colours at once.
+    """Return the bench of paper section 3.3: a monochrome camera and two white lamps in succession, or three colours.
 
     The lamps stand so far apart that, while the sphere turns from 0 to +14 degrees, the reflection of one never comes
     where the other's was (reflections at -305 and +207 px of the middle, moving by +181 px). The paint is that of
@@ -276,7 +276,7 @@ def paper_scene(*, size: int = 1024, seed: int = 0, colour: bool = False, **came
 
 
 def expose(scene: Scene, state: State | None = None, level: float = 0.97) -> Scene:
-    """The scene with an exposure that brings its brightest pixel, over all channels, to a fraction of full scale."""
+    """Return the scene with the exposure at which the brightest sample of all channels is a fraction of full scale."""
     images = render(scene, state)
     together = np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images)
     brightest = float((images if scene.camera.kind == "monochrome" else together).max())
@@ -285,20 +285,20 @@ def expose(scene: Scene, state: State | None = None, level: float = 0.97) -> Sce
 
 
 def _lamp_at(angle_deg: float, height_deg: float, distance: float = 550.0) -> Vector:
-    """A lamp seen from the front point under an angle from the optical axis, a little above (negative) or below it."""
+    """Return the place of a lamp at an angle from the optical axis, seen from the front point, and a height (down)."""
     angle, height = np.radians(angle_deg), np.radians(height_deg)
     x, z = distance * np.cos(height) * np.sin(angle), DISTANCE - distance * np.cos(height) * np.cos(angle)
     return float(x), float(distance * np.sin(height)), float(z)
 
 
 def turned(angle_deg: float) -> State:
-    """The body turned by an angle about the vertical through its front point (paper, section 2.1)."""
+    """Return the body turned by an angle about the vertical through its front point (paper, section 2.1)."""
     return State(angle_deg=angle_deg)
 
 
 def strained_plate(
     *, shift_px: tuple[float, float] = (0.25, 0.075), strain: float = 0.002, pixel: float = PIXEL
 ) -> State:
-    """A plate stretched by the same strain along x and y and shifted by about `shift_px` in the image."""
+    """Return a plate stretched by the same strain along x and y and shifted by about `shift_px` in the image."""
     offset = (shift_px[0] * pixel, shift_px[1] * pixel)
     return State(displacement=AffineField(gradient=((strain, 0.0), (0.0, strain)), offset=offset))
