@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rgbmidic.errors import ResultError
 
-__all__ = ["check_folder", "write_document"]
+__all__ = ["check_folder", "number_or_none", "write_document"]
 
 
 def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
@@ -27,6 +28,11 @@ def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
         raise ResultError(
             f"{out / taken[0]} is already there; choose another folder, or overwrite it (overwrite=True, --overwrite)"
         )
+
+
+def number_or_none(value: float) -> float | None:
+    """Return a number for a JSON document, which has neither NaN nor infinity: None for these."""
+    return float(value) if math.isfinite(value) else None
 
 
 def write_document(document: Mapping[str, Any], path: Path) -> None:

@@ -289,11 +289,18 @@ def read_scene(path: Path | str) -> Experiment:
 def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
     sections = ("body", "surface", "lights", "camera", "states", "output")
     check_names(document, sections, "section", "the file")
-    body = _body(_table(document, "body"), base)
+    table = _table(document, "body")
+    kind = convert_value(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
+    body: Body = _build(BODIES[kind], table, "body", base)
+    table, paints = _table(document, "surface"), {}
+    for name, albedo in (("white", 0.80), ("black", 0.10)):
+        paint = {"albedo": albedo, **_table(table, name)}
+        table.pop(name, None)
+        paints[name] = _build(Finish, paint, f"surface.{name}", base)
     lights = _tables(document, "lights")
     scene = Scene(
         body=body,
-        surface=_surface(_table(document, "surface"), base),
+        surface=_build(Surface, table, "surface", base, **paints),
         lights=tuple(_light(table, body, base) for table in lights) if lights else three_lights(body.front),
         camera=_camera(_table(document, "camera"), body, base),
     )
@@ -328,22 +335,6 @@ def _build(kind: Any, table: Mapping[str, Any], where: str, base: Path, **ready:
         if required and entry.name not in given and entry.name not in ready:
             raise ConfigurationError(f"{where}.{entry.name} is missing")
     return kind(**given, **ready)
-
-
-def _body(table: dict[str, Any], base: Path) -> Body:
-    kind = convert_value(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
-    body: Body = _build(BODIES[kind], table, "body", base)
-    return body
-
-
-def _surface(table: dict[str, Any], base: Path) -> Surface:
-    paints = {}
-    for name, albedo in (("white", 0.80), ("black", 0.10)):
-        paint = {"albedo": albedo, **_table(table, name)}
-        table.pop(name, None)
-        paints[name] = _build(Finish, paint, f"surface.{name}", base)
-    surface: Surface = _build(Surface, table, "surface", base, **paints)
-    return surface
 
 
 def _light(table: dict[str, Any], body: Body, base: Path) -> Light:
@@ -397,10 +388,7 @@ def _field(given: Mapping[str, Any], body: Body, base: Path) -> InPlaneField | N
         )
     if len(given) > 1:
         raise ConfigurationError("states.displacement_file excludes displacement_gradient and displacement_offset")
-    return _mesh_field(convert_value(given["displacement_file"], Path, "states.displacement_file", base))
-
-
-def _mesh_field(path: Path) -> MeshField:
+    path = convert_value(given["displacement_file"], Path, "states.displacement_file", base)
     try:
         with np.load(regular(path)) as file:
             arrays = {name: file[name] for name in ("nodes", "elements", "displacement")}

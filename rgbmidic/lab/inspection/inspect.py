@@ -172,7 +172,6 @@ def inspect_frame(
     cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
     linear = [linearise(shot, known.noise) for shot in cut]
     channels = channels_of(linear)
-    _check_light(channels, region.mask)
     report(0, 3, "exposure, speckle and noise")
     samples = SampleSummary.of(channels, region.mask, known.noise, linear[0].full_scale)
     crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
@@ -296,16 +295,6 @@ def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     return rows, columns
 
 
-def _check_light(channels: list[Channel], inside: BoolArray) -> None:
-    samples = [channel.values[inside & np.isfinite(channel.values)] for channel in channels]
-    if not all(values.size for values in samples):
-        raise InputError("the region holds no sample of some channel: it must be larger than a cell of the pattern")
-    if all(channel.saturated[inside].sum() == values.size for channel, values in zip(channels, samples, strict=True)):
-        raise InputError("every sample of the region is saturated: there is nothing to inspect")
-    if all(float(np.ptp(values)) == 0 for values in samples):
-        raise InputError("every channel of the region is constant: there is nothing to inspect")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleSummary:
     """Figures of the samples of the channels, the camera noise, and the autocorrelation of the speckle."""
@@ -318,28 +307,56 @@ class SampleSummary:
     def of(
         cls, channels: list[Channel], inside: BoolArray, calibrated: NoiseModel | None, full_scale: float
     ) -> SampleSummary:
-        """Of the samples inside the region; `calibrated` is the noise where it is known."""
+        """Summarise the samples inside the region.
+
+        Parameters
+        ----------
+        channels
+            As they were sampled.
+        inside : ndarray, shape (H, W), bool
+            The region.
+        calibrated
+            The noise where it is known; None: it is estimated.
+        full_scale
+            DN.
+
+        Returns
+        -------
+        SampleSummary
+
+        Raises
+        ------
+        InputError
+            A channel without a sample in the region; all samples saturated, or every channel constant.
+        """
+        samples = [channel.values[inside & np.isfinite(channel.values)] for channel in channels]
+        saturated = [int(channel.saturated[inside].sum()) for channel in channels]
+        if not all(values.size for values in samples):
+            raise InputError("the region holds no sample of some channel: it must be larger than a cell of the pattern")
+        if saturated == [values.size for values in samples]:
+            raise InputError("every sample of the region is saturated: there is nothing to inspect")
+        if all(float(np.ptp(values)) == 0 for values in samples):
+            raise InputError("every channel of the region is constant: there is nothing to inspect")
         textures = [speckle_texture(channel, inside, calibrated) for channel in channels]
         estimates = noise_estimate(channels, inside) if calibrated is None else []
         known = [estimate for estimate in estimates if np.isfinite(estimate)]
         typical = float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
         noise = calibrated or NoiseModel(gain=float("inf"), read_noise=typical)
         summaries = []
-        for number, channel in enumerate(channels):
-            samples = channel.values[inside & np.isfinite(channel.values)] / full_scale
-            low, high = np.quantile(samples, [0.05, 0.95])
-            level, texture = float(samples.mean()), textures[number]
+        for number, (channel, texture) in enumerate(zip(channels, textures, strict=True)):
+            values = samples[number] / full_scale
+            level = float(values.mean())
+            low, high = np.quantile(values, [0.05, 0.95]).tolist()
+            std = estimates[number] if estimates else float(noise.variance(np.array(level * full_scale))) ** 0.5
             summaries.append(
                 ChannelSummary(
                     name=channel.name,
                     mean=level,
-                    low=float(low),
-                    high=float(high),
-                    saturated=float(channel.saturated[inside].sum() / samples.size),
+                    low=low,
+                    high=high,
+                    saturated=saturated[number] / values.size,
                     speckle_px=float("nan") if texture is None else texture.diameter,
-                    noise_dn=estimates[number]
-                    if estimates
-                    else float(noise.variance(np.array(level * full_scale))) ** 0.5,
+                    noise_dn=std,
                 )
             )
         sharpest = sorted((texture for texture in textures if texture), key=lambda texture: texture.diameter)

@@ -11,7 +11,7 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import check_folder, write_document
+from rgbmidic.lab import check_folder, number_or_none, write_document
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, save_figure
 from rgbmidic.typing import AnyArray
@@ -99,11 +99,11 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "element_size_px": inspection.element_size,
         "crosstalk_known": inspection.crosstalk_known,
         "noise_known": inspection.noise_known,
-        "speckle_px": _number(inspection.speckle_px),
+        "speckle_px": number_or_none(inspection.speckle_px),
         "texture": None
         if texture is None
         else {
-            "diameter_px": _number(texture.diameter),
+            "diameter_px": number_or_none(texture.diameter),
             "agreement_of_colours": texture.correlation,
             "channel_specific_fraction": texture.private,
         },
@@ -120,15 +120,11 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
 
 def _plain(summary: Any) -> dict[str, Any]:
     values = {name: getattr(summary, name) for name in summary.__dataclass_fields__ if name != "alone"}
-    return {name: _number(value) if isinstance(value, float) else value for name, value in values.items()}
+    return {name: number_or_none(value) if isinstance(value, float) else value for name, value in values.items()}
 
 
 def _spread(spread: Spread) -> dict[str, float | None]:
-    return {"median": _number(spread.median), "q95": _number(spread.q95)}
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+    return {"median": number_or_none(spread.median), "q95": number_or_none(spread.q95)}
 
 
 def inspection_figure(inspection: Inspection) -> Figure:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic._version import __version__
-from rgbmidic.lab import check_folder, write_document
+from rgbmidic.lab import check_folder, number_or_none, write_document
 from rgbmidic.lab.planning.lamps import Proposal
 from rgbmidic.lab.planning.plan import Outlook, Plan
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal, save_figure
@@ -151,7 +151,7 @@ def _arrangement(plan: Plan) -> dict[str, Any]:
         )
     return {
         "lights": lamps,
-        "std_px": _number(plan.std),
+        "std_px": number_or_none(plan.std),
         "states": [_state(plan, outlook) for outlook in plan.outlooks],
     }
 
@@ -186,10 +186,6 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
 def _rms(values: FloatArray) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if known.size else None
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
