@@ -414,7 +414,7 @@ def plan(
     overwrite: Overwrite = False,
 ) -> None:
     """Where each lamp will reflect, what uncertainty to expect, and where the lamps would stand better."""
-    from rgbmidic.lab.demo import check_folder
+    from rgbmidic.lab import check_folder
     from rgbmidic.lab.planning import report as planning
     from rgbmidic.lab.planning.lamps import propose_colours, propose_lamps
     from rgbmidic.lab.planning.plan import make_plan
@@ -485,7 +485,7 @@ def inspect(
     overwrite: Overwrite = False,
 ) -> None:
     """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
-    from rgbmidic.lab.demo import check_folder
+    from rgbmidic.lab import check_folder
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
     from rgbmidic.settings import read_test
 

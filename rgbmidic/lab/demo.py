@@ -1,66 +1,35 @@
-"""What a report of the laboratory writes into its folder: a JSON document, and nothing over what is there.
-
-The demonstration: a virtual test made, calibrated, measured and compared with its exact truth.
+"""The demonstration: a virtual test made, calibrated, measured and compared with its exact truth.
 
 It goes the way a laboratory goes: raw frames and calibration captures on disk, the two commands, the result folder.
+While the frames are rendered, other processes compile the kernels of the measurement.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rgbmidic._kernels import are_compiled
 from rgbmidic.correlation import correlate
 from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.planning.plan import rehearsed
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import Separation, measure
+from rgbmidic.pipeline import Plan, Separation, measure
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["DemoRow", "check_folder", "run_demo", "write_document"]
-
-
-def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
-    """Refuse a folder in which one of the files would be overwritten.
-
-    Raises
-    ------
-    ResultError
-        `out` is a file, or holds one of the files and `overwrite` is False.
-    """
-    if out.exists() and not out.is_dir():
-        raise ResultError(f"{out} is a file; state a folder")
-    taken = [name for name in files if (out / name).exists()]
-    if taken and not overwrite:
-        raise ResultError(
-            f"{out / taken[0]} is already there; choose another folder, or overwrite it (overwrite=True, --overwrite)"
-        )
-
-
-def write_document(document: Mapping[str, Any], path: Path) -> None:
-    """Write a document as JSON; its folder is made where it does not exist.
-
-    Raises
-    ------
-    ResultError
-        The file cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
-
+__all__ = ["DemoRow", "run_demo"]
 
 Say = Callable[[str], None]
 
@@ -93,6 +62,19 @@ ANGLES = (0.33, 1.0, 2.0, 8.0)
 """Rotations of the sphere, degrees."""
 
 
+_SIZE = 96
+"""Rows and columns of the frames, px: nine elements of the usual size."""
+_REGION = (10, 10, 86, 86)
+_SETTINGS = f"""\
+[frames]
+path = "*.dng"
+[calibration]
+file = "calibration.json"
+[region]
+rectangle = {list(_REGION)}
+"""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoRow:
     """One frame of the demonstration.
@@ -110,7 +92,7 @@ class DemoRow:
     single_px
         Error of each colour alone, with the same solver.
     measured
-        Share of the nodes that are measured.
+        Fraction of the nodes that are measured.
     """
 
     angle_deg: float
@@ -166,7 +148,7 @@ def run_demo(
     states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
     scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")
     say(f"1 of 5: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
-    with rehearsed():
+    with kernels_compiled_meanwhile():
         settings_file = write_dataset(scene, test, progress)
         (test / "calibration.json").rename(test / "true_calibration.json")
         say("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from the captures with one light at a time")
@@ -183,10 +165,15 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
         truth, angles = archive["displacement"].astype(np.float64), archive["angle_deg"]
     mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
     images = _separated(settings)
+    options: dict[str, Any] = {
+        "region": settings.region.rectangle,
+        "element_size": settings.element_size,
+        "normalise": settings.illumination.normalise,
+    }
     rows = []
     for index in range(1, len(result)):
         field = np.stack([result.u[index], result.v[index]], axis=1)
-        alone = [_one_light(images[0][light], images[index][light], settings) for light in range(len(images[0]))]
+        alone = [correlate(*pair, **options).displacement for pair in zip(images[0], images[index], strict=True)]
         std = np.stack([result.u_std[index], result.v_std[index]], axis=1)
         rows.append(
             DemoRow(
@@ -202,7 +189,7 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
 
 
 def _separated(settings: TestSettings) -> list[FloatImage]:
-    """The lights (k, H, W) of every frame."""
+    """Return the lights (k, H, W) of every frame."""
     assert settings.calibration_file is not None
     calibration = Calibration.read(settings.calibration_file)
     separation = Separation(calibration=calibration)
@@ -210,16 +197,64 @@ def _separated(settings: TestSettings) -> list[FloatImage]:
     return [separation(frames.read(index)).values for index in range(len(frames))]
 
 
-def _one_light(reference: FloatImage, deformed: FloatImage, settings: TestSettings) -> FloatArray:
-    """Displacement (N, 2) from one light's images, with the same solver."""
-    return correlate(
-        reference,
-        deformed,
-        region=settings.region.rectangle,
-        element_size=settings.element_size,
-        normalise=settings.illumination.normalise,
-    ).displacement
-
-
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
+
+
+@contextmanager
+def kernels_compiled_meanwhile() -> Iterator[None]:
+    """Compile the kernels of a measurement, while the block runs, by two processes that measure in small.
+
+    One compiles those of the separation, the other those of the solve; the kernels then lie in the cache. Nothing is
+    started where kernels were compiled on this machine before.
+    """
+    if are_compiled():
+        yield
+        return
+    with ExitStack() as stack:
+        quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        commands = [[sys.executable, "-m", __name__, part] for part in _SMALL_MEASUREMENTS]
+        others = [stack.enter_context(subprocess.Popen(command, **quiet)) for command in commands]
+        try:
+            yield
+        except BaseException:
+            for one in others:
+                one.kill()
+            raise
+
+
+def _separate() -> None:
+    """Prepare a measurement of raw frames and separate their lights."""
+    from rgbmidic.frames.data import Mosaic
+    from rgbmidic.frames.images import write_dng
+    from rgbmidic.lab.virtual.dataset import record, true_calibration
+    from rgbmidic.lab.virtual.rendering import sphere_scene
+
+    scene = sphere_scene(size=_SIZE)
+    with tempfile.TemporaryDirectory() as folder:
+        for index in range(2):
+            frame = record(_images(index), scene.camera, scene.lights, seed=index)
+            assert isinstance(frame, Mosaic)
+            write_dng(Path(folder) / f"{index}.dng", frame)
+        true_calibration(scene).write(Path(folder) / "calibration.json")
+        (Path(folder) / "test.toml").write_text(_SETTINGS, encoding="utf-8")
+        plan = Plan.from_settings(read_test(Path(folder) / "test.toml"))
+        plan.separation(plan.series.read(1))
+
+
+def _images(index: int) -> FloatImage:
+    """Blobs under three lights, a fraction of a pixel further from frame to frame."""
+    from scipy.ndimage import gaussian_filter, shift
+
+    blobs = gaussian_filter(np.random.default_rng(0).normal(size=(3, _SIZE, _SIZE)), (0, 1.5, 1.5))
+    moved = shift(blobs, (0, 0, 0.3 * index), mode="nearest")
+    return np.clip(1000 + 2000 * moved, 0, None).astype(np.float32)
+
+
+_SMALL_MEASUREMENTS: dict[str, Callable[[], object]] = {
+    "separation": _separate,
+    "solve": lambda: correlate(_images(0), _images(1), region=_REGION),
+}
+
+if __name__ == "__main__":
+    _SMALL_MEASUREMENTS[sys.argv[1]]()

@@ -1,18 +1,20 @@
-"""Point lights: position, power, spectrum, and what the lens does to their colour.
+"""Point lights and the camera of a scene.
 
-The camera of a scene: pin-hole projection, lens blur, colour channels, sensor noise and quantisation.
+Lights have a position, a power, a spectrum and the aberration of the lens in their colour; the camera has a pin-hole
+projection, a lens blur, colour channels, noise and quantisation.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.frames.data import cfa_channels
+from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.crosstalk import Led, Sensitivities, spectral_response
 from rgbmidic.illumination.linearise import NoiseModel
@@ -26,6 +28,7 @@ __all__ = [
     "Camera",
     "Light",
     "Vector",
+    "mosaic_samples",
     "reference_camera",
     "rotation",
     "three_lights",
@@ -35,6 +38,7 @@ NOMINAL_DISTANCE = 600.0
 """Distance (mm) at which a light of power 1 gives an ideal white the camera's `exposure`."""
 
 Vector = tuple[float, float, float]
+Floating = TypeVar("Floating", bound=np.floating)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +48,7 @@ class Light:
     Attributes
     ----------
     name
-        What the light's image is called.
+        Of the light and of its image.
     position
         (x, y, z) in mm: x right, y down, z away from the camera, origin at the camera.
     power
@@ -65,17 +69,18 @@ class Light:
     shift: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (np.isfinite(self.position).all() and self.power >= 0 and math.isfinite(self.power)):
             raise InputError(f"light {self.name}: position must be finite, power not negative: {self}")
         if not abs(self.magnification) < 0.1:
             raise InputError(f"light {self.name}: magnification is a small relative change, not {self.magnification}")
 
     def aimed(self, target: Vector, irradiance: float = 1.0) -> Light:
-        """This light with the power that gives `irradiance` (1: the camera's exposure) at the target."""
+        """Return the light with the power that gives `irradiance` (1: the camera's exposure) at the target."""
         return replace(self, power=irradiance * math.dist(self.position, target) ** 2 / NOMINAL_DISTANCE**2)
 
     def turned(self, angle_deg: float, pivot: Vector, axis: Vector = (0.0, 1.0, 0.0)) -> Light:
-        """This light turned about an axis through a pivot, as on the goniometer of paper section 2.3."""
+        """Return the light turned about an axis through a pivot, as on the goniometer of paper section 2.3."""
         position = rotation(angle_deg, axis) @ (np.array(self.position) - pivot) + pivot
         return replace(self, position=(float(position[0]), float(position[1]), float(position[2])))
 
@@ -169,6 +174,7 @@ class Camera:
     exposure_time: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (len(self.shape) == 2 and min(self.shape) >= 2):
             raise InputError(f"a frame has at least 2 rows and 2 columns, not {self.shape}")
         if self.kind not in ("bayer", "rgb", "monochrome"):
@@ -246,12 +252,12 @@ class Camera:
         return np.eye(3)[:, : len(lights)]
 
     def mixing(self, lights: tuple[Light, ...]) -> FloatArray:
-        """A (C, k) in channels = A . light images; every column's largest entry is 1."""
+        """Return A (C, k) in channels = A . light images; every column's largest entry is 1."""
         matrix = self.response(lights)
         return np.asarray(matrix / matrix.max(axis=0))
 
     def true_crosstalk(self, lights: tuple[Light, ...]) -> Crosstalk:
-        """The crosstalk that a perfect calibration would find."""
+        """Return the crosstalk that a perfect calibration would find."""
         return Crosstalk(matrix=self.mixing(lights), lights=tuple(light.name for light in lights))
 
 
@@ -264,3 +270,8 @@ def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
     if changes.get("kind") != "monochrome" and "sensitivities" not in changes:
         camera = replace(camera, crosstalk=np.array(REFERENCE_CROSSTALK))
     return replace(camera, **changes)  # type: ignore[arg-type]
+
+
+def mosaic_samples(channels: npt.NDArray[Floating], cfa: str) -> npt.NDArray[Floating]:
+    """Return the samples (H, W) that a colour filter array takes of channels (3, H, W)."""
+    return np.asarray(np.take_along_axis(channels, sampled_channels(cfa, channels.shape[1:])[None], axis=0)[0])

@@ -1,16 +1,21 @@
-"""Displacement uncertainty expected from a scene, in closed form: nothing is rendered and nothing is solved.
+"""Displacement uncertainty expected before a test, in closed form: nothing is solved.
 
 The covariance of the nodes is ``M^-1 S M^-1`` with M the Hessian of the weighted sum over the lights and S the
-covariance of its right-hand side; with equal white noise it is the well-known ``2 sigma^2 M^-1``. Both are integrals of
-the speckle's gradient spectrum: of the texture alone for M, of its product with the spectrum of what disturbs for S:
+covariance of its right-hand side; with equal white noise it is the well-known ``2 sigma^2 M^-1``. Per pixel, M has the
+density `information` = energy of the speckle's gradient x pull x contrast, with the pull of a light its contrast over
+the variance of its residual (`light_pull`, as the main job weights by default); S has the density `score` of the errors
+of the images times the pulls. From the two densities follows the uncertainty of an inner node of a regular mesh
+(`node_constant`), or of every node of a mesh over which they vary (`expected_std`).
+
+The densities come from a scene (`Instrument`, here) or from a frame (`rgbmidic.lab.inspection.prediction`). Those of a
+scene are integrals of the speckle's gradient spectrum: of the texture alone for M, of its product with the spectrum of
+the errors for S:
 
 - camera noise of both states, through demosaicing and unmixing (the crosstalk's amplification of noise);
-- what demosaicing leaves of the mosaic in the images, which stays with the sensor while the texture moves;
+- the trace of the mosaic that demosaicing leaves in the images, which stays with the sensor while the texture moves;
 - the erratic part of the reflections, which changes as facets and droplets turn in and out of the mirror direction.
 
-The elements enter by the consistent mass matrix of a regular TRI3 mesh and the recovery of its nodal values. Images
-are taken to be locally normalised and every light weighted by the inverse variance of its residual, as the main job
-does by default. A plain Gaussian law is taken for the slopes of the wrinkles.
+A plain Gaussian law is taken for the slopes of the wrinkles.
 """
 
 from __future__ import annotations
@@ -21,18 +26,34 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
 
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.assembly import Assembly
+from rgbmidic.correlation.equations import SEEN
+from rgbmidic.correlation.nodes import LOST
+from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset, mass_matrix
 from rgbmidic.illumination.linearise import QUANTISATION
 from rgbmidic.illumination.unmix import NEGLIGIBLE
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.scene.camera import Floating
 from rgbmidic.scene.scene import Scene
-from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cross_spectra, mosaic_disturbances
+from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cross_spectra, separation_spectra
 from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Energies", "Forecast", "Instrument", "channel_mixing", "node_constant", "pixel_size", "trace_change"]
+__all__ = [
+    "Energies",
+    "Forecast",
+    "Instrument",
+    "channel_mixing",
+    "expected_std",
+    "light_pull",
+    "node_constant",
+    "pixel_size",
+    "trace_change",
+]
 
 
 WRINKLE_AREA = 0.085
@@ -46,8 +67,8 @@ _SATURATED = 0.98
 def node_constant() -> float:
     """Variance of an inner node's value per unit of white noise density and element area: about 1.1.
 
-    On a regular mesh the linear fit has the inverse of the consistent mass matrix (2.6 on its diagonal); of that, what
-    the recovery of the nodal values leaves.
+    On a regular mesh the linear fit has the inverse of the consistent mass matrix (2.6 on its diagonal); the
+    recovery of the nodal values reduces it.
     """
     side = 16
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 10 * side, 10 * side), (10 * side + 1,) * 2), 10)
@@ -60,19 +81,65 @@ def node_constant() -> float:
     return float(variance[inner].mean() * mesh.size**2)
 
 
+def light_pull(contrast: npt.NDArray[Floating], residual: npt.NDArray[Floating]) -> npt.NDArray[Floating]:
+    """Contrast of each light over the variance of its residual: its pull on the displacement.
+
+    Parameters
+    ----------
+    contrast, residual : ndarray, shape (k, ...)
+        Contrast of the texture, 0 where the light does not see; variance of the residual in its unit squared.
+
+    Returns
+    -------
+    ndarray, shape (k, ...)
+        0 where the residual is 0 or unknown.
+    """
+    return np.asarray(np.divide(contrast, residual, out=np.zeros_like(contrast), where=residual > 0))
+
+
+def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -> FloatArray:
+    """Return the standard uncertainty (n, N) of a displacement component at the nodes, px; NaN where unseen.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    information, *scores : ndarray, shape (E,)
+        Per pixel of each element: of the Hessian, and n variances of the right-hand side.
+    """
+    area = mesh.to_nodes(mesh.areas)
+    density = mesh.to_nodes(information * mesh.areas) / area
+    seen = density > SEEN * np.median(density[density > 0]) if (density > 0).any() else np.zeros(len(density), bool)
+    if not seen.any():
+        return np.full((len(scores), len(density)), np.nan)
+    assembly = Assembly.from_mesh(mesh)
+    mass = ((1 + np.eye(3)) / 12)[..., None] * np.array([1.0, 0.0, 1.0])
+
+    def assembled(values: FloatArray) -> sp.csc_matrix:
+        return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
+
+    # elements that no light sees must not make the system singular
+    solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
+    used = np.asarray(seen[mesh.elements].all(axis=1))
+    recovery = Recovery.over(mesh, used, density, linear_fit_offset(mesh))
+    along_x, colouring = [(recovery.displacement_functionals[0], seen)], NodeColouring.from_mesh(mesh)
+    std = np.stack([functional_std(solve, assembled(score), colouring, along_x)[:, 0] for score in scores])
+    return np.where(seen & (std < LOST), std, np.nan)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
-    """What a measurement between two states is expected to give; NaN where no light sees.
+    """Uncertainty expected of a measurement between two states; NaN where no light sees.
 
     Attributes
     ----------
     std : ndarray, shape (...)
-        Standard uncertainty (px) of u, and of v, at an inner node, from what is random.
+        Standard uncertainty (px) of u, and of v, at an inner node, from random errors.
     bias : ndarray, shape (...)
-        Root mean square, per component, of the displacement (px) that the droplets' domes feign: their lit sides change
-        when a reflection moves.
+        Root mean square, per component, of the apparent displacement (px) by the droplets' domes: their lit sides
+        change when a reflection moves.
     weight_fraction : ndarray, shape (k, ...)
-        Share of each light in the information about the displacement.
+        Fraction of the information about the displacement that each light gives.
     residual : ndarray, shape (k, ...)
         Standard deviation of the residual of each light, in units of its local mean.
     """
@@ -85,17 +152,17 @@ class Forecast:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Energies:
-    """What a disturbance of unit strength adds to a variance: to that of a pixel, or to that of the right-hand side.
+    """Variance, of a pixel or of the right-hand side, that image errors of unit strength add.
 
     Attributes
     ----------
     noise : ndarray, shape (C, k, k)
         Between the lights' images, of noise of unit variance in the samples of each colour (DN squared).
     mosaic : ndarray, shape (3, k, k)
-        Of what demosaicing leaves in one image at each carrier of the mosaic (alternating along x, along y, along
+        Of the trace of demosaicing in one image at each carrier of the mosaic (alternating along x, along y, along
         both), for lights of equal brightness, in units of their means.
     erratic
-        Of a disturbance that is white before lens and pixel, with a spectrum of 1 px^2.
+        Of an error that is white before lens and pixel, with a spectrum of 1 px^2.
     dome
         Of the slope of the droplets' domes along a random direction.
     contrast
@@ -111,12 +178,12 @@ class Energies:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instrument:
-    """Paint, camera, lights' colours, processing and mesh, reduced to the numbers that the forecast needs.
+    """Paint, camera, colours of the lights, processing and mesh, reduced to the numbers that the forecast needs.
 
     Attributes
     ----------
     scene
-        Where they come from; positions of lamps and body do not enter.
+        Its paint, camera and colours of the lights; positions of lamps and body do not enter.
     element_size
         px.
     energy
@@ -150,6 +217,15 @@ class Instrument:
             Method for a Bayer camera (`rgbmidic.illumination.separate.DEMOSAICERS`).
         prefilter
             Of the solve (`rgbmidic.correlation.images.PREFILTERS`).
+
+        Returns
+        -------
+        Instrument
+
+        Raises
+        ------
+        InputError
+            The paint has no droplets, hence no texture.
         """
         camera = scene.camera
         spectrum = SpeckleSpectrum.of(
@@ -158,7 +234,7 @@ class Instrument:
         patch = SpecklePatch.of(scene, len(spectrum.frequency))
         relief = cross_spectra(np.stack([patch.texture, patch.domes]))
         if camera.kind == "bayer":
-            noise, mosaic = mosaic_disturbances(scene, patch.texture, demosaic)
+            noise, mosaic = separation_spectra(scene, patch.texture, demosaic)
         else:
             unmixing = np.linalg.pinv(channel_mixing(scene))
             noise = np.einsum("jc,kc->cjk", unmixing, unmixing)[..., None, None]
@@ -192,11 +268,16 @@ class Instrument:
             Predictions at the same material points.
         change : ndarray, shape (3, ...)
             Of the mosaic's trace between them (`trace_change`), as a mean over the elements of a node.
+
+        Returns
+        -------
+        Forecast
+            At these points.
         """
         residual = self.variance(self.residual, before, after, change)
         seen = np.isfinite(residual) & ~self.saturated(before) & ~self.saturated(after)
         contrast = np.where(seen, 1 - (before.share + after.share) / 2, 0.0)
-        pull = np.where(seen, contrast / np.where(seen, residual, 1.0), 0.0)
+        pull = light_pull(contrast, residual)
         information = self.energy * pull * contrast
         total = information.sum(axis=0)
         domes = self._dome_factor(after) - self._dome_factor(before)
@@ -204,25 +285,31 @@ class Instrument:
         with np.errstate(invalid="ignore", divide="ignore"):
             std = np.sqrt(node_constant() * self._score(before, after, change, pull)) / (self.element_size * total)
             bias = np.sqrt((drag**2).sum(axis=0) / 2) / total
-            share = information / total
+            fraction = information / total
         sees = total > 0
         return Forecast(
             std=np.where(sees, std, np.nan),
             bias=np.where(sees, bias, np.nan),
-            weight_fraction=np.where(sees, share, 0.0),
+            weight_fraction=np.where(sees, fraction, 0.0),
             residual=np.where(seen, np.sqrt(np.where(seen, residual, 0.0)), np.nan),
         )
 
     def weights(self, before: Zones, after: Zones, *, known: bool = True) -> FloatImage:
-        """Weights (k, ...) in [0, 1] for the solve: the inverse variance with which each light pulls on the
-        displacement, 1 for the best light at the best point; 0 where it does not see or saturates.
+        """Weights in [0, 1] for the solve: inverse variance of the pull of each light on the displacement.
+
+        The best light at the best point has 1; a light that does not see or saturates has 0.
 
         Parameters
         ----------
         before, after
             Predictions at the same material points.
         known
-            Whether they tell the motion between the states. If not, the reflections are taken to have changed wholly.
+            Whether the motion between the states is known to them. If not, the reflections are taken to have changed
+            wholly.
+
+        Returns
+        -------
+        ndarray, shape (k, ...), float32
         """
         change = np.full((3, *before.share.shape[1:]), 2.0)
         variance = self.variance(self.score, before, after, change, common=float(known))
@@ -245,6 +332,10 @@ class Instrument:
             See `trace_change`.
         common
             1: the two states share their reflections as predicted; 0: they have nothing in common.
+
+        Returns
+        -------
+        ndarray, shape (k, ...)
         """
         variance = self._reflections(energies, before, after, common)
         variance += np.einsum("cjj,c...->j...", energies.mosaic, change)
@@ -263,15 +354,20 @@ class Instrument:
             Predictions of this light alone in its n places.
         brightness : ndarray, shape (k,)
             Mean grey level of every light, for the noise that crosstalk brings.
+
+        Returns
+        -------
+        ndarray, shape (n, ...)
+            In units of the local mean.
         """
         variance = self._reflections(self.score, before, after)
         variance += 2 * float(self.score.mosaic[:, light, light].sum())
         mixing = channel_mixing(self.scene)
         others = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
         for zones in (before, after):
-            for colour, share in enumerate(self.score.noise[:, light, light]):
+            for colour, factor in enumerate(self.score.noise[:, light, light]):
                 samples = self.scene.camera.noise.variance(others[colour] + mixing[colour, light] * zones.level)
-                variance += share * (samples + QUANTISATION) / zones.level**2
+                variance += factor * (samples + QUANTISATION) / zones.level**2
         return np.asarray(variance)
 
     def _score(self, before: Zones, after: Zones, change: FloatArray, pull: FloatArray) -> FloatArray:
@@ -279,9 +375,9 @@ class Instrument:
         square = (np.nan_to_num(self._reflections(self.score, before, after)) * pull**2).sum(axis=0)
         square += np.einsum("cjk,c...,j...,k...->...", self.score.mosaic, change, pull, pull)
         for zones in (before, after):
-            share = np.where(pull > 0, pull / zones.level, 0.0)
+            relative = np.where(pull > 0, pull / zones.level, 0.0)
             samples = np.nan_to_num(self._sample_variance(zones))
-            square += np.einsum("cjk,c...,j...,k...->...", self.score.noise, samples, share, share)
+            square += np.einsum("cjk,c...,j...,k...->...", self.score.noise, samples, relative, relative)
         return np.asarray(square)
 
     def _reflections(self, energies: Energies, before: Zones, after: Zones, common: float = 1.0) -> FloatArray:
@@ -296,8 +392,8 @@ class Instrument:
         """Spectrum (px^2) of the erratic part of the change of each light's image (k, ...), in units of its mean.
 
         Facets with Gaussian slopes of variance a^2 per axis reflect ``q = exp(-|s - h|^2/(2 b^2))``; the covariance of
-        q between the half-way slopes h of two states is an integral of Gaussians. What is linear in the slopes is finer
-        than the pixel and is left out: wrinkles have no slope on average.
+        q between the half-way slopes h of two states is an integral of Gaussians. The part linear in the slopes is
+        finer than the pixel and is left out: wrinkles have no slope on average.
         """
         a2, b2 = self._roughness
         parts = [
@@ -323,14 +419,17 @@ class Instrument:
         return slope, (1 - cover) * facet_variance(surface.white) + cover * facet_variance(surface.black)
 
     def saturated(self, zones: Zones) -> BoolArray:
-        """Where white paint is expected to saturate a channel that the light is seen by, (k, ...)."""
-        surface = self.scene.surface
-        white = surface.white.albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance)
-        channels = _channels(channel_mixing(self.scene), zones.irradiance * white)
+        """Where white paint is expected to saturate a channel that the light needs, (k, ...)."""
+        channels = _channels(channel_mixing(self.scene), self.white_level(zones))
         full = channels > _SATURATED * self.scene.camera.full_scale
         unmixing = np.abs(np.linalg.pinv(channel_mixing(self.scene)))
         needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
         return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)
+
+    def white_level(self, zones: Zones) -> FloatArray:
+        """Grey level (k, ...) of the white paint under each light, DN above black."""
+        albedo = self.scene.surface.white.albedo
+        return zones.irradiance * (albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance))
 
     def _sample_variance(self, zones: Zones) -> FloatArray:
         """Noise variance (C, ...) of one sample of each colour at the mean grey level, DN squared."""
@@ -348,7 +447,7 @@ def trace_change(displacement: FloatArray) -> FloatArray:
 
 
 def pixel_size(scene: Scene) -> float:
-    """mm per px at the body's front point."""
+    """Pixel size on the object, mm per px, at the body's front point."""
     return scene.body.front[2] / scene.camera.focal_px
 
 
@@ -365,8 +464,10 @@ def _channels(mixing: FloatArray, levels: FloatArray) -> FloatArray:
 
 
 def _facet_covariance(first: FloatArray, second: FloatArray, a2: float, b2: float) -> FloatArray:
-    """Covariance of the facets' reflections at two half-way slopes (k, 3, ...), relative to the product of the means,
-    without the part that is linear in the facets' slopes."""
+    """Covariance of the facets' reflections at two half-way slopes (k, 3, ...), relative to the product of the means.
+
+    The part that is linear in the facets' slopes is left out.
+    """
     middle, apart = (first + second) / 2, first - second
 
     def square(vector: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Weights from geometry: where lamps, camera and specimen say that each light reflects (paper, section 3.2).
+"""Weights from geometry: where each light reflects, from the places of lamps, camera and specimen (paper, section 3.2).
 
 The paper's first method. The paint is rough: facets with a narrow specular lobe, tilted at random by the wrinkles. At
 the scale of the speckle it reflects into the facets' lobe convolved with the law of the slopes (P. Beckmann and A.
@@ -31,7 +31,7 @@ __all__ = [
 
 
 LIMIT_DEG = 15.0
-"""Angle between the light and the mirror direction within which the reflection disturbs (paper, Fig. 9)."""
+"""Angle between the light and the mirror direction within which the reflection corrupts the image (paper, Fig. 9)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,6 +56,7 @@ class Reflectance:
     width_deg: float
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (self.diffuse > 0 and self.specular >= 0 and 0 < self.width_deg < 45):
             raise InputError(
                 f"a reflectance has a positive diffuse and a non-negative specular part and a width of 0 to 45 degrees;"
@@ -102,13 +103,13 @@ class Reflection:
         return reflectance.diffuse * self.lambert
 
     def specular(self, reflectance: Reflectance) -> FloatArray:
-        """Expected radiance (k, ...) of the specular light under unit irradiance across the rays."""
+        """Return the expected radiance (k, ...) of the specular light under unit irradiance across the rays."""
         square = (self.slopes**2).sum(axis=1)
         lobe = np.exp(-square / (2 * math.radians(reflectance.width_deg) ** 2))
         return np.asarray(reflectance.specular * lobe / self.half)
 
     def share(self, reflectance: Reflectance) -> FloatArray:
-        """Expected specular share q/(d + q) of the light that reaches the camera, (k, ...), 0 to 1."""
+        """Return the expected specular fraction q/(d + q) of the light that reaches the camera, (k, ...), 0 to 1."""
         q = self.specular(reflectance)
         return np.asarray(q / (self.diffuse(reflectance) + q))
 

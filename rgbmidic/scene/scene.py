@@ -1,6 +1,6 @@
-"""What stands in front of the camera: bodies, their states, and the scene they make with paint, lights and camera.
+"""A scene: a body before the camera, its states, paint, lights and camera; and SCENE.toml, which describes it.
 
-SCENE.toml: what a virtual experiment shows, read strictly; an unknown key is an error that names it.
+The file is read strictly: an unknown key is an error that names it.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ class Sphere:
     centre: Vector = (0.0, 0.0, 641.25)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         _check_size(self.radius, self.radius, self.centre[2] - self.radius)
 
     @property
@@ -70,6 +71,7 @@ class Cylinder:
     tilt_deg: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         _check_size(self.radius, self.length, self.centre[2] - self.radius)
 
     @property
@@ -97,6 +99,7 @@ class Plate:
     tilt_deg: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         _check_size(self.width, self.height, self.centre[2])
 
     @property
@@ -149,7 +152,7 @@ class State:
         return any(self.velocity) or self.spin_deg != 0
 
     def after(self, seconds: float) -> State:
-        """The state some time later, at rest."""
+        """Return the state some time later, at rest."""
         x, y, z = (p + v * seconds for p, v in zip(self.translation, self.velocity, strict=True))
         angle = self.angle_deg + self.spin_deg * seconds
         return replace(self, angle_deg=angle, translation=(x, y, z), velocity=(0.0, 0.0, 0.0), spin_deg=0.0)
@@ -172,20 +175,21 @@ class Scene:
     surface: Surface = field(default_factory=Surface)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         names = [light.name for light in self.lights]
         if not names or len(set(names)) < len(names):
             raise InputError(f"a scene has at least one light, and every light its own name; given are {names}")
         self.camera.response(self.lights)
 
     def light(self, name: str) -> Light:
-        """The light of that name."""
+        """Return the light of that name."""
         for light in self.lights:
             if light.name == name:
                 return light
         raise InputError(f"no light {name!r}; the scene has {', '.join(light.name for light in self.lights)}")
 
     def with_light(self, light: Light) -> Scene:
-        """The same scene with the light of that name exchanged."""
+        """Return the same scene with the light of that name exchanged."""
         self.light(light.name)
         return replace(self, lights=tuple(light if old.name == light.name else old for old in self.lights))
 
@@ -213,14 +217,14 @@ BODIES: dict[str, type[Sphere] | type[Cylinder] | type[Plate]] = {
     "plate": Plate,
 }
 Target = Literal["white", "speckled"]
-"""What calibration captures show."""
+"""Targets of the calibration captures."""
 _SIZE = (640, 640)
 _FIELD_KEYS = ("displacement_gradient", "displacement_offset", "displacement_file")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetSettings:
-    """What is written (``[output]``).
+    """Settings of the output (``[output]``).
 
     Attributes
     ----------
@@ -231,13 +235,13 @@ class DatasetSettings:
     calibration_frames
         Frames per light, and dark frames.
     target
-        What the calibration frames show.
+        Of the calibration frames.
     region
         (x0, y0, x1, y1) px for test.toml; None: all that stays in view, less a margin.
     element_size
         px, for test.toml.
     noise_free
-        Write what each light alone gives, too.
+        Write the images of each light alone, too.
     """
 
     format: Literal["dng", "tiff"] = "dng"
@@ -249,13 +253,14 @@ class DatasetSettings:
     noise_free: bool = False
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if self.calibration_frames < 1 or self.element_size <= 0 or self.seed < 0:
             raise InputError("calibration_frames and element_size must be positive, seed not negative")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """A scene, its states in order (the first frame of a data set is the body at rest), and what to write."""
+    """A scene, its states in order (the first frame of a data set is the body at rest), and settings of the output."""
 
     scene: Scene
     states: tuple[State, ...]
@@ -284,11 +289,18 @@ def read_scene(path: Path | str) -> Experiment:
 def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
     sections = ("body", "surface", "lights", "camera", "states", "output")
     check_names(document, sections, "section", "the file")
-    body = _body(_table(document, "body"), base)
+    table = _table(document, "body")
+    kind = convert_value(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
+    body: Body = _build(BODIES[kind], table, "body", base)
+    table, paints = _table(document, "surface"), {}
+    for name, albedo in (("white", 0.80), ("black", 0.10)):
+        paint = {"albedo": albedo, **_table(table, name)}
+        table.pop(name, None)
+        paints[name] = _build(Finish, paint, f"surface.{name}", base)
     lights = _tables(document, "lights")
     scene = Scene(
         body=body,
-        surface=_surface(_table(document, "surface"), base),
+        surface=_build(Surface, table, "surface", base, **paints),
         lights=tuple(_light(table, body, base) for table in lights) if lights else three_lights(body.front),
         camera=_camera(_table(document, "camera"), body, base),
     )
@@ -314,7 +326,7 @@ def _tables(document: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def _build(kind: Any, table: Mapping[str, Any], where: str, base: Path, **ready: Any) -> Any:
-    """An object of a settings class from a table of plain values; `ready` holds fields that are objects already."""
+    """Return an object of a settings class from a table of plain values; `ready` holds fields that are objects."""
     hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in ready}
     check_names(table, hints, "key", f"[{where}]")
     given = {key: convert_value(value, hints[key], f"{where}.{key}", base) for key, value in table.items()}
@@ -323,22 +335,6 @@ def _build(kind: Any, table: Mapping[str, Any], where: str, base: Path, **ready:
         if required and entry.name not in given and entry.name not in ready:
             raise ConfigurationError(f"{where}.{entry.name} is missing")
     return kind(**given, **ready)
-
-
-def _body(table: dict[str, Any], base: Path) -> Body:
-    kind = convert_value(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
-    body: Body = _build(BODIES[kind], table, "body", base)
-    return body
-
-
-def _surface(table: dict[str, Any], base: Path) -> Surface:
-    paints = {}
-    for name, albedo in (("white", 0.80), ("black", 0.10)):
-        paint = {"albedo": albedo, **_table(table, name)}
-        table.pop(name, None)
-        paints[name] = _build(Finish, paint, f"surface.{name}", base)
-    surface: Surface = _build(Surface, table, "surface", base, **paints)
-    return surface
 
 
 def _light(table: dict[str, Any], body: Body, base: Path) -> Light:
@@ -392,10 +388,7 @@ def _field(given: Mapping[str, Any], body: Body, base: Path) -> InPlaneField | N
         )
     if len(given) > 1:
         raise ConfigurationError("states.displacement_file excludes displacement_gradient and displacement_offset")
-    return _mesh_field(convert_value(given["displacement_file"], Path, "states.displacement_file", base))
-
-
-def _mesh_field(path: Path) -> MeshField:
+    path = convert_value(given["displacement_file"], Path, "states.displacement_file", base)
     try:
         with np.load(regular(path)) as file:
             arrays = {name: file[name] for name in ("nodes", "elements", "displacement")}

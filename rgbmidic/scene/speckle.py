@@ -1,10 +1,9 @@
-"""A small piece of a scene's speckle, and what it tells that no formula does.
+"""The speckle of a scene: its spectrum in closed form, and a rendered piece of it where no formula exists.
 
-Its droplets' domes, and what a Bayer mosaic does to the lights' images: the noise that it passes and the trace that it
-leaves. The piece goes through the real demosaicing and unmixing, so any method of `rgbmidic.illumination.separate` is
+The spectrum is that of a Boolean model of discs seen through pixel aperture, lens and prefilter. The rendered piece
+gives the droplets' domes and, taken through the real demosaicing and unmixing, what a Bayer mosaic does to the lights'
+images: the noise that it passes and the trace that it leaves. So any method of `rgbmidic.illumination.separate` is
 described, linear or not.
-
-Spectrum of a speckle in closed form: a Boolean model of discs seen through pixel aperture, lens and prefilter.
 """
 
 from __future__ import annotations
@@ -22,11 +21,20 @@ from rgbmidic.errors import InputError
 from rgbmidic.frames.data import sampled_channels, shift_cfa
 from rgbmidic.illumination.linearise import LinearMosaic
 from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.scene.camera import Floating, mosaic_samples
 from rgbmidic.scene.scene import Scene
-from rgbmidic.scene.surface import Surface
-from rgbmidic.typing import FloatArray
+from rgbmidic.scene.surface import BOUND, Surface
+from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["SpecklePatch", "SpeckleSpectrum", "cover_covariance", "cross_spectra", "mosaic_disturbances"]
+__all__ = [
+    "SpecklePatch",
+    "SpeckleSpectrum",
+    "cover_covariance",
+    "cross_spectra",
+    "separated_phases",
+    "separation_spectra",
+]
 
 _LEVEL = 0.25
 """Fraction of full scale of the mean of each light's image: no sample saturates."""
@@ -56,7 +64,7 @@ class SpecklePatch:
 
     @classmethod
     def of(cls, scene: Scene, size: int) -> SpecklePatch:
-        """A piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
+        """Return a piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
         camera, surface = scene.camera, scene.surface
         pixel = scene.body.front[2] / camera.focal_px
         smooth = replace(
@@ -78,8 +86,8 @@ def _seen(fine: FloatArray, size: int, blur: float) -> FloatArray:
     return np.asarray(np.fft.ifft2(np.fft.fft2(whole) * np.outer(line, line)).real)
 
 
-def mosaic_disturbances(scene: Scene, texture: FloatArray, demosaic: str) -> tuple[FloatArray, FloatArray]:
-    """Cross spectra of what disturbs the lights' images.
+def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tuple[FloatArray, FloatArray]:
+    """Cross spectra of the errors that demosaicing and unmixing leave in the lights' images.
 
     Parameters
     ----------
@@ -95,54 +103,58 @@ def mosaic_disturbances(scene: Scene, texture: FloatArray, demosaic: str) -> tup
     noise : ndarray, shape (3, k, k, n, n)
         Of noise of unit variance in the samples of R, G or B.
     trace : ndarray, shape (3, k, k, n, n)
-        Of what stays with the mosaic when the texture moves, for its three carriers (alternating along x, along y, and
-        along both), in units of each light's mean; lights of equal brightness.
+        Of the part that stays with the mosaic when the texture moves, for its three carriers (alternating along x, y
+        and both), in units of each light's mean; lights of equal brightness.
     """
     camera, crosstalk = scene.camera, scene.camera.true_crosstalk(scene.lights)
-    colours = sampled_channels(camera.cfa, texture.shape)
-    level = _LEVEL * camera.full_scale
-    samples = level * crosstalk.matrix.sum(axis=1)[colours] * texture
+    level, amplitude = _LEVEL * camera.full_scale, _NOISE * camera.full_scale
+    channels = level * crosstalk.matrix.sum(axis=1)[:, None, None] * texture
 
-    def lights(values: FloatArray, cfa: str) -> FloatArray:
+    def lights(samples: FloatArray, cfa: str) -> FloatArray:
         mosaic = LinearMosaic(
-            values=values.astype(np.float32),
-            saturated=np.zeros(values.shape, dtype=bool),
+            values=samples.astype(np.float32),
+            saturated=np.zeros(samples.shape, dtype=bool),
             cfa=cfa,
             full_scale=camera.full_scale,
             noise=camera.noise,
         )
         return separate(mosaic, crosstalk, demosaic).values.astype(np.float64)
 
-    noise = _noise(lights, samples, colours, camera.cfa, _NOISE * camera.full_scale)
-    return noise, _trace(lights, crosstalk.matrix, texture, camera.cfa, level)
-
-
-def _noise(
-    lights: Callable[[FloatArray, str], FloatArray],
-    samples: FloatArray,
-    colours: npt.NDArray[np.intp],
-    cfa: str,
-    amplitude: float,
-) -> FloatArray:
-    random = np.random.default_rng(0)
-    quiet = lights(samples, cfa)
-    spectra = []
+    phases = separated_phases(channels, camera.cfa, lights)
+    samples, colours = mosaic_samples(channels, camera.cfa), sampled_channels(camera.cfa, texture.shape)
+    random, noise = np.random.default_rng(0), []
     for colour in range(3):
-        disturbed = samples + np.where(colours == colour, random.normal(scale=amplitude, size=samples.shape), 0)
-        spectra.append(cross_spectra((lights(disturbed, cfa) - quiet) / amplitude))
-    return np.stack(spectra)
+        noisy = samples + np.where(colours == colour, random.normal(scale=amplitude, size=samples.shape), 0)
+        noise.append(cross_spectra((lights(noisy, camera.cfa) - phases[0]) / amplitude))
+    carriers = [np.tensordot(np.array(signs) / 4, phases / level, axes=1) for signs in _CARRIERS]
+    return np.stack(noise), np.stack([cross_spectra(carrier) for carrier in carriers])
 
 
-def _trace(
-    lights: Callable[[FloatArray, str], FloatArray], matrix: FloatArray, texture: FloatArray, cfa: str, level: float
-) -> FloatArray:
-    """The texture under the four phases of the mosaic: what is the same in all of them moves with the texture."""
-    phases = []
-    for rows, columns in np.ndindex(2, 2):
-        name = shift_cfa(cfa, rows, columns)
-        phases.append(lights(level * matrix.sum(axis=1)[sampled_channels(name, texture.shape)] * texture, name) / level)
-    parts = [np.tensordot(np.array(signs) / 4, phases, axes=1) for signs in _CARRIERS]
-    return np.stack([cross_spectra(part) for part in parts])
+def separated_phases(
+    channels: npt.NDArray[Floating],
+    cfa: str,
+    lights: Callable[[npt.NDArray[Floating], str], npt.NDArray[Floating]],
+) -> npt.NDArray[Floating]:
+    """Lights separated from a state behind the four phases of a colour filter array.
+
+    What is the same in all four moves with the specimen; the rest stays with the sensor.
+
+    Parameters
+    ----------
+    channels : ndarray, shape (3, H, W)
+        The state with all its channels at every pixel.
+    cfa
+        Pattern of the first phase.
+    lights
+        Separates a mosaic (H, W) with its pattern into lights (k, H, W).
+
+    Returns
+    -------
+    ndarray, shape (4, k, H, W)
+        In the order of the shifts (row, column) = (0, 0), (0, 1), (1, 0), (1, 1).
+    """
+    patterns = [shift_cfa(cfa, row, column) for row, column in np.ndindex(2, 2)]
+    return np.stack([lights(mosaic_samples(channels, pattern), pattern) for pattern in patterns])
 
 
 def cross_spectra(fields: FloatArray) -> FloatArray:
@@ -156,7 +168,6 @@ def cross_spectra(fields: FloatArray) -> FloatArray:
     return np.asarray(products.real / (window**2).sum())
 
 
-_SQRT6 = math.sqrt(6.0)
 _FINE = 4
 """Samples per pixel on which the droplets' covariance is tabulated."""
 
@@ -170,10 +181,10 @@ def cover_covariance(surface: Surface, distance: FloatArray) -> FloatArray:
     size = np.linspace(-1, 1, 61)[1:-1]
     law = (1 - abs(size)) / (1 - abs(size)).sum()
     overlap = np.zeros_like(distance)
-    for value, share in zip(size, law, strict=True):
-        radius = surface.droplet / 2 * math.exp(surface.spread * _SQRT6 * value)
+    for value, fraction in zip(size, law, strict=True):
+        radius = surface.droplet / 2 * math.exp(surface.spread * BOUND * value)
         x = np.clip(distance / (2 * radius), 0, 1)
-        overlap += share * 2 * radius**2 * (np.arccos(x) - x * np.sqrt(1 - x * x))
+        overlap += fraction * 2 * radius**2 * (np.arccos(x) - x * np.sqrt(1 - x * x))
     return np.asarray((1 - surface.coverage) ** 2 * np.expm1(surface.droplets_per_area * overlap))
 
 
@@ -203,7 +214,7 @@ class SpeckleSpectrum:
         """Spectrum of a painted surface; `pixel` in mm, `blur` the lens blur in px."""
         if not surface.coverage > 0:
             raise InputError("a surface without droplets (coverage 0) has no texture to correlate")
-        widest = surface.droplet * math.exp(_SQRT6 * surface.spread) / pixel
+        widest = surface.droplet * math.exp(BOUND * surface.spread) / pixel
         n = int(np.clip(2 ** math.ceil(math.log2(6 * widest)), 128, 1024))
         step = np.fft.fftfreq(n * _FINE, 1 / n)
         distance = pixel * np.hypot(step[:, None], step)
@@ -211,9 +222,23 @@ class SpeckleSpectrum:
         inside = np.r_[: n // 2, -(n // 2) : 0]
         frequency = np.asarray(np.fft.fftfreq(n), dtype=np.float64)
         edge = surface.softness / pixel / math.sqrt(20)  # standard deviation of a smooth step's derivative
-        filtered = _outer(_prefilter_transfer(prefilter, frequency))
-        texture = _contrast(surface) ** 2 * fine[np.ix_(inside, inside)] * _optics(frequency, math.hypot(blur, edge))
-        return cls(frequency=frequency, texture=texture, optics=_optics(frequency, blur), prefilter=filtered)
+        white, black, cover = surface.white.albedo, surface.black.albedo, surface.coverage
+        contrast = (white - black) / max(white + cover * (black - white), 1e-9)
+        texture = contrast**2 * fine[np.ix_(inside, inside)] * _optics(frequency, math.hypot(blur, edge))
+        return cls(
+            frequency=frequency,
+            texture=texture,
+            optics=_optics(frequency, blur),
+            prefilter=_prefilter_transfer(prefilter, frequency),
+        )
+
+    @classmethod
+    def of_texture(cls, texture: TextureModel, *, size: int, prefilter: str) -> SpeckleSpectrum:
+        """Spectrum of unit variance of a texture as images show it (its optics count as 1), on `size` frequencies."""
+        frequency = np.asarray(np.fft.fftfreq(size), dtype=np.float64)
+        spectrum = texture.spectrum(np.hypot(frequency[:, None], frequency))
+        transfer = _prefilter_transfer(prefilter, frequency)
+        return cls(frequency=frequency, texture=spectrum, optics=np.ones_like(spectrum), prefilter=transfer)
 
     @property
     def energy(self) -> float:
@@ -233,19 +258,29 @@ class SpeckleSpectrum:
         """
         return float(2 * ((self.texture * self.prefilter) ** 2).mean() / element_size**2)
 
-    def score(self, disturbance: FloatArray) -> FloatArray:
-        """Variance density of the right-hand side under disturbances with power spectra (..., n, n) before the
-        prefilter."""
-        return np.asarray((self._gradient * self.prefilter**2 * disturbance).mean(axis=(-2, -1)))
+    def score(self, errors: FloatArray) -> FloatArray:
+        """Variance density of the right-hand side under errors with power spectra (..., n, n) before the prefilter."""
+        return np.asarray((self._gradient * self.prefilter**2 * errors).mean(axis=(-2, -1)))
 
-    def residual(self, disturbance: FloatArray) -> FloatArray:
-        """Variance at a pixel, after the prefilter, of disturbances with power spectra (..., n, n)."""
-        return np.asarray((self.prefilter * disturbance).mean(axis=(-2, -1)))
+    def residual(self, errors: FloatArray) -> FloatArray:
+        """Variance at a pixel, after the prefilter, of errors with power spectra (..., n, n)."""
+        return np.asarray((self.prefilter * errors).mean(axis=(-2, -1)))
 
     def pull(self, cross: FloatArray) -> float:
-        """Mean product of the gradients along x, after the prefilter, of the texture and of a field with which it has
-        the cross spectrum (n, n)."""
+        """Mean product of the gradients along x, after the prefilter, of the texture and of another field.
+
+        `cross` (n, n) is their cross spectrum.
+        """
         return float(((2 * np.pi * self.frequency) ** 2 * self.prefilter * cross).mean())
+
+    def score_kernel(self, reach: int) -> FloatImage:
+        """Kernel (2 reach + 1, 2 reach + 1) that filters errors, before the prefilter, into the right-hand side.
+
+        The mean square of the filtered image is `score` of the spectrum of the errors.
+        """
+        whole = np.fft.fftshift(np.fft.ifft2(np.sqrt(self.slope * self.texture) * self.prefilter).real)
+        near = slice(len(whole) // 2 - reach, len(whole) // 2 + reach + 1)
+        return whole[near, near].astype(np.float32)
 
     @property
     def slope(self) -> FloatArray:
@@ -258,11 +293,6 @@ class SpeckleSpectrum:
         return np.asarray((2 * np.pi * self.frequency) ** 2 * self.texture)
 
 
-def _contrast(surface: Surface) -> float:
-    white, black, cover = surface.white.albedo, surface.black.albedo, surface.coverage
-    return (white - black) / max(white + cover * (black - white), 1e-9)
-
-
 def _optics(frequency: FloatArray, blur: float) -> FloatArray:
     return _outer(np.sinc(frequency) ** 2 * np.exp(-4 * (np.pi * blur * frequency) ** 2))
 
@@ -270,7 +300,7 @@ def _optics(frequency: FloatArray, blur: float) -> FloatArray:
 def _prefilter_transfer(name: str, frequency: FloatArray) -> FloatArray:
     taps = PREFILTERS[name]
     place = np.arange(len(taps)) - len(taps) // 2
-    return np.asarray((taps @ np.cos(2 * np.pi * place[:, None] * frequency)) ** 2)
+    return _outer((taps @ np.cos(2 * np.pi * place[:, None] * frequency)) ** 2)
 
 
 def _outer(line: FloatArray) -> FloatArray:

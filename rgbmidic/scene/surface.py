@@ -23,7 +23,8 @@ WRINKLE_FREQUENCY = 0.525
 """Wrinkles per lattice cell: where the height spectrum of the gradient noise peaks (measured; see the tests)."""
 WRINKLE_SLOPE = 0.704
 """Rms tangential slope of the gradient noise in lattice units (measured; see the tests)."""
-_SQRT6 = math.sqrt(6.0)
+BOUND = math.sqrt(6.0)
+"""Largest deviation of the logarithm of a droplet's diameter, in its standard deviations: a triangular law's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +34,7 @@ class Finish:
     Attributes
     ----------
     albedo
-        Share of light scattered diffusely (Lambert).
+        Fraction of light scattered diffusely (Lambert).
     gloss
         Peak of the specular reflection of one facet, in units of the radiance of an ideal white.
     lobe_deg
@@ -51,6 +52,7 @@ class Finish:
     spacing: float = 0.025
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (0 <= self.albedo <= 1 and self.gloss >= 0 and 0 <= self.slope_deg <= 30):
             raise InputError(f"albedo lies in 0 to 1, gloss is not negative, slope_deg is 0 to 30: {self}")
         if not (0 < self.lobe_deg <= 30 and self.spacing > 0):
@@ -63,7 +65,7 @@ class Finish:
 
     @property
     def reflectance(self) -> float:
-        """Share of the light reflected, diffuse + specular: albedo + 8 gloss lobe**2 (lobe in rad)."""
+        """Fraction of the light reflected, diffuse + specular: albedo + 8 gloss lobe**2 (lobe in rad)."""
         return self.albedo + 8 * self.gloss * math.radians(self.lobe_deg) ** 2
 
     def _parameters(self) -> list[float]:
@@ -85,7 +87,7 @@ class Surface:
     spread
         Standard deviation of the logarithm of the diameter (bounded at 2.45 of it).
     coverage
-        Share of the surface that is black, 0 to 0.95; 0 leaves white paint alone.
+        Fraction of the surface that is black, 0 to 0.95; 0 leaves white paint alone.
     softness
         Width over which black fades to white at a droplet's edge (mm).
     dome
@@ -104,6 +106,7 @@ class Surface:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (self.droplet > 0 and 0 <= self.spread <= 0.6 and 0 <= self.coverage <= 0.95):
             raise InputError(
                 f"a droplet is larger than 0, its spread 0 to 0.6, the coverage 0 to 0.95; given are droplet "
@@ -118,15 +121,15 @@ class Surface:
     @property
     def droplets_per_area(self) -> float:
         """Droplets per mm2, from the coverage 1 - exp(-number x mean area) of the Boolean model."""
-        a = 2 * self.spread * _SQRT6
+        a = 2 * self.spread * BOUND
         mean_square = (2 * math.sinh(a / 2) / a) ** 2 if a else 1.0
         return -math.log(1 - self.coverage) / (math.pi / 4 * self.droplet**2 * mean_square)
 
     def parameters(self) -> tuple[FloatArray, FloatArray, np.uint32]:
-        """What the kernels of `rgbmidic._kernels.render` take: paint, counts and seed."""
+        """Paint, counts and seed, as the kernels of `rgbmidic._kernels.render` take them."""
         radius = self.droplet / 2
         shell = 0.3 * radius
-        far = radius * math.exp(_SQRT6 * self.spread) + self.softness / 2
+        far = radius * math.exp(BOUND * self.spread) + self.softness / 2
         reach = math.hypot(far, shell)
         cell = 1.5 * (reach + 0.5 * radius)
         counts = _poisson_table(self.droplets_per_area * cell**3 / (2 * shell))
@@ -219,6 +222,7 @@ class AffineField:
     offset: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Check the values."""
         (xx, xy), (yx, yy) = self.gradient
         if not (1 + xx) * (1 + yy) - xy * yx > 0:
             raise InputError(f"a displacement gradient must not turn the plate inside out: {self.gradient}")
@@ -260,6 +264,7 @@ class MeshField:
     displacement: FloatArray
 
     def __post_init__(self) -> None:
+        """Check the values."""
         nodes, values = np.array(self.nodes, dtype=float), np.array(self.displacement, dtype=float)
         elements = np.array(self.elements, dtype=np.int64)
         if nodes.ndim != 2 or nodes.shape[1] != 2 or values.shape != nodes.shape or elements.shape[1:] != (3,):

@@ -1,6 +1,7 @@
-"""Which point of the body a pixel sees, where it goes, how far it moves in the image: exact, nothing is rendered.
+"""Geometry of a scene, exact and without rendering: material points, displacement, and the zones where lights reflect.
 
-Reflection zones of a scene, predicted without rendering: where each light reflects on each state of the body.
+The material point that a pixel sees, its place in another state and its displacement in the image follow from the
+pin-hole camera and the body's pose; the zones from the reflectance of the paint (`rgbmidic.scene.reflection`).
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rgbmidic.errors import InputError
 from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light
 from rgbmidic.scene.reflection import Reflectance, Reflection, reflection
-from rgbmidic.scene.scene import Plate, Scene, State
+from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface, material_from_spatial
 from rgbmidic.typing import FloatArray
 
@@ -24,9 +26,17 @@ __all__ = [
     "material_points",
     "placed",
     "predict_zones",
+    "region_in_view",
     "truth",
     "zones_on_surface",
 ]
+
+REFLECTS = 0.2
+"""Specular fraction from which a light counts as reflecting at a point (chosen; the forecast does not use it)."""
+_DOME_SLOPE = 4 / 3
+"""Mean square slope of a droplet's dome h (1 - r^2/R^2)^2 over its disc, in units of (h/R)^2 (its integral)."""
+_MARGIN = 20.0
+"""Pixels between the frame's edge and the nearest point of a region that the scene does not state."""
 
 
 def material_points(
@@ -67,9 +77,16 @@ def placed(scene: Scene, material: FloatArray, state: State | None = None) -> tu
         ux, uy = state.displacement(material[0], material[1])
         position[0] += ux
         position[1] += uy
+    if isinstance(scene.body, Plate):
+        normals = np.zeros_like(material)
+        normals[2] = -1.0
+    else:
+        normals = material / scene.body.radius
+        if isinstance(scene.body, Cylinder):
+            normals[1] = 0.0
     turn, origin = state.pose(scene.body)
     points = np.einsum("ij,j...->i...", turn, position) + origin.reshape(3, *[1] * (material.ndim - 1))
-    return points, np.einsum("ij,j...->i...", turn, _normals(scene, material))
+    return points, np.einsum("ij,j...->i...", turn, normals)
 
 
 def truth(
@@ -116,35 +133,53 @@ def intersect(scene: Scene, state: State, x: FloatArray, y: FloatArray) -> Float
         if isinstance(scene.body, Plate):
             distance = -start[2] / direction[2]
         else:
-            axes = [0, 1, 2] if scene.body.parameters()[0] == 2 else [0, 2]
+            axes = [0, 1, 2] if isinstance(scene.body, Sphere) else [0, 2]
             a = (direction[axes] ** 2).sum(axis=0)
             b = np.einsum("i,i...->...", start[axes], direction[axes])
             c = (start[axes] ** 2).sum() - scene.body.radius**2
             distance = (-b - np.sqrt(b * b - a * c)) / a
         distance = np.where(distance > 0, distance, np.nan)
     point = start.reshape(3, *[1] * x.ndim) + distance * direction
-    limits = scene.body.parameters()[2:]
-    if not isinstance(scene.body, Plate):
-        point[:, abs(point[1]) > limits[1]] = np.nan
+    if isinstance(scene.body, Cylinder):
+        point[:, abs(point[1]) > scene.body.length / 2] = np.nan
     return np.asarray(point)
 
 
-def _normals(scene: Scene, material: FloatArray) -> FloatArray:
-    """Outward unit normals (3, ...) in body axes."""
-    normal = np.zeros_like(material)
-    if isinstance(scene.body, Plate):
-        normal[2] = -1.0
-        return normal
-    normal = material / scene.body.radius
-    if scene.body.parameters()[0] == 1:
-        normal[1] = 0.0
-    return normal
+def region_in_view(
+    x: FloatArray, y: FloatArray, displacement: FloatArray, shape: tuple[int, int]
+) -> tuple[float, float, float, float]:
+    """Return the largest rectangle about the middle on the body and, with a margin, in the frame in all states.
 
+    Parameters
+    ----------
+    x, y : ndarray, shape (h, w)
+        Points of the reference image, px.
+    displacement : ndarray, shape (T, 2, h, w)
+        Of these points in every state, px; NaN off the body.
+    shape
+        Rows and columns of the frame.
 
-REFLECTS = 0.2
-"""Specular share from which a light counts as reflecting at a point."""
-_DOME_SLOPE = 4 / 3
-"""Mean square slope of a droplet's dome h (1 - r^2/R^2)^2 over its disc, in units of (h/R)^2."""
+    Returns
+    -------
+    tuple
+        (x0, y0, x1, y1), px.
+
+    Raises
+    ------
+    InputError
+        There is none; the user must state one.
+    """
+    height, width = shape
+    seen = np.asarray(np.isfinite(displacement[:, 0]).all(axis=0))
+    largest = np.abs(displacement[:, :, seen]).max(axis=(0, 2)) if seen.any() else np.zeros(2)
+    left, top = (float(np.ceil(value)) + _MARGIN for value in largest)
+    middle = (width - 1) / 2, (height - 1) / 2
+    while 2 * left < width - 8 and 2 * top < height - 8:
+        inside = (abs(x - middle[0]) <= middle[0] - left) & (abs(y - middle[1]) <= middle[1] - top)
+        if inside.any() and seen[inside].all():
+            return left, top, width - 1 - left, height - 1 - top
+        left, top = left + 4, top + 4
+    raise InputError("the body leaves the middle of the frame: state output.region = [x0, y0, x1, y1]")
 
 
 def macroscopic(surface: Surface) -> Reflectance:
@@ -175,7 +210,7 @@ def slope_variance(paint: Finish) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Zones:
-    """What each light is expected to do at points of the surface, in one state; NaN where it does not see them.
+    """Reflection and grey level expected of each light at points of the surface, in one state; NaN where it is hidden.
 
     Attributes
     ----------
@@ -193,7 +228,7 @@ class Zones:
 
     @property
     def share(self) -> FloatArray:
-        """Specular share (k, ...) of the light that reaches the camera."""
+        """Specular fraction (k, ...) of the light that reaches the camera."""
         return self.geometry.share(self.reflectance)
 
     @property
@@ -223,7 +258,7 @@ def predict_zones(
     lights
         Instead of the scene's, in the same colours.
     reflectance
-        Of the paint, for instance from a goniometry; None: what follows from the scene's facets and wrinkles.
+        Of the paint, for instance from a goniometry; None: that of the scene's facets and wrinkles.
     """
     where = material_points(scene, state) if material is None else material
     zones = zones_on_surface(scene, *placed(scene, where, state), lights=lights, reflectance=reflectance)
@@ -245,19 +280,14 @@ def zones_on_surface(
     `points` (mm) and unit `normals` of shape (3, ...) in camera axes, which the slopes then have, too; `lights` and
     `reflectance` as in `predict_zones`.
     """
-    chosen = scene.lights if lights is None else lights
+    chosen, camera = scene.lights if lights is None else lights, scene.camera
     positions = np.array([light.position for light in chosen])
-    return Zones(
-        geometry=reflection(points, normals, positions),
-        irradiance=_irradiance(scene, chosen, positions, points),
-        reflectance=reflectance or macroscopic(scene.surface),
-    )
-
-
-def _irradiance(scene: Scene, lights: tuple[Light, ...], positions: FloatArray, points: FloatArray) -> FloatArray:
-    camera = scene.camera
     levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
-    powers = np.array([light.power for light in lights]) * NOMINAL_DISTANCE**2 * levels
+    powers = np.array([light.power for light in chosen]) * NOMINAL_DISTANCE**2 * levels
     rest = (1,) * (points.ndim - 1)
     square = ((positions.reshape(-1, 3, *rest) - points) ** 2).sum(axis=1)
-    return np.asarray(powers.reshape(-1, *rest) / square)
+    return Zones(
+        geometry=reflection(points, normals, positions),
+        irradiance=np.asarray(powers.reshape(-1, *rest) / square),
+        reflectance=reflectance or macroscopic(scene.surface),
+    )

@@ -1,4 +1,4 @@
-"""What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect."""
+"""Inspection of one frame before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect."""
 
 from rgbmidic.lab.inspection.inspect import inspect_files, inspect_frame, state_frames
 from rgbmidic.lab.inspection.results import ChannelSummary, Finding, Inspection, LightSummary, Spread

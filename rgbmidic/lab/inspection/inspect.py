@@ -1,7 +1,4 @@
-"""The inspection of one frame: what a user must know before a test.
-
-Figures of the samples and of the lights in a region, from which an inspection is made up.
-"""
+"""Inspection of one frame before a test: figures of its samples and lights in a region, uncertainty to expect."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ import numpy as np
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_source
-from rgbmidic.frames.data import ChannelFrame, Mosaic, sampled_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaic import SMALLEST_FRAME, ReflectionAwareDemosaicer
 from rgbmidic.illumination.frame_check import check_state
@@ -23,17 +20,9 @@ from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseM
 from rgbmidic.illumination.separate import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmix import align, unmix
-from rgbmidic.lab.inspection.prediction import predict
+from rgbmidic.lab.inspection.prediction import SeparationErrors, predict
 from rgbmidic.lab.inspection.results import BLIND, ChannelSummary, Inspection, LightSummary, Spread
-from rgbmidic.lab.inspection.samples import (
-    Channel,
-    Disturbances,
-    Frame,
-    View,
-    channels_of,
-    noise_estimate,
-    speckle_texture,
-)
+from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture, surroundings
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
@@ -51,8 +40,11 @@ __all__ = [
     "state_frames",
 ]
 
+Frame = Mosaic | ChannelFrame
 Linear = Sequence[LinearMosaic | LinearChannels]
 Progress = Callable[[int, int, str], None]
+CONTRAST_WIDTH = (10.0, 40.0)
+"""Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
 
 
 def inspect_files(
@@ -73,11 +65,11 @@ def inspect_files(
     files
         One file, or one per light.
     test
-        Settings of a test; its sections say how the frame is read, separated and measured.
+        Settings of a test; its sections state how the frame is read, separated and measured.
     calibration
         Calibration file; instead of the test's.
     frame
-        What the file does not tell (its `path` is not used); instead of the test's.
+        What the file does not state (its `path` is not used); instead of the test's.
     region, element_size
         (x0, y0, x1, y1) and side of the elements in px; instead of the test's, else the whole frame and 25.
     accept
@@ -129,10 +121,10 @@ def inspect_frame(
     accept: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Inspection:
-    """What one frame tells before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect.
+    """Inspect one frame before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect.
 
     The uncertainty is predicted in closed form (`rgbmidic.lab.inspection.prediction`) from the speckle, the contrast
-    of the lights and what separating a frame like this one gets wrong.
+    of the lights and the errors of separating a frame like this one.
 
     Parameters
     ----------
@@ -142,7 +134,7 @@ def inspect_frame(
         Crosstalk, noise and registration as far as they are known. Without crosstalk the channels stand for the lights,
         without noise it is estimated from the frame.
     region
-        What will be measured; None: the whole frame. Of the frame only this and its surroundings are looked at.
+        The region to be measured; None: the whole frame. Of the frame only this and its surroundings are looked at.
     element_size
         Side of the elements in px.
     demosaic, prefilter
@@ -150,11 +142,11 @@ def inspect_frame(
     name
         Of the frame, for reports.
     seed
-        Of what is drawn for the prediction.
+        Of the random numbers of the prediction.
     accept
         Contradictions to the calibration that are accepted, by the names of the checks (`FrameCheck`).
     progress
-        Called with the steps done, their number and what comes next.
+        Called with the steps done, their number and the next one.
 
     Raises
     ------
@@ -172,49 +164,51 @@ def inspect_frame(
     known = (calibration or Calibration()).cropped(None, shape)
     if not isinstance(region, Region):
         region = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1) if region is None else region, shape)
-    tell = progress or (lambda done, total, line: None)
+    report = progress or (lambda done, total, line: None)
     contradictions = check_state(frames, known, region.mask, name, accept=accept)
-    mesh, view = Tri3Mesh.from_region(region, element_size), View.around(region)
-    region = view.region(region)
-    linear = [linearise(view.frame(shot), known.noise) for shot in frames]
+    mesh, window = Tri3Mesh.from_region(region, element_size), surroundings(region)
+    part = window.part_of(Window.whole(shape))
+    region = region.part(*part)
+    cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
+    linear = [linearise(shot, known.noise) for shot in cut]
     channels = channels_of(linear)
-    _check_light(channels, region.mask)
-    tell(0, 3, "exposure, speckle and noise")
+    report(0, 3, "exposure, speckle and noise")
     samples = SampleSummary.of(channels, region.mask, known.noise, linear[0].full_scale)
-    crosstalk = view.crosstalk(known.crosstalk or Crosstalk.identity(("red", "green", "blue")))
-    tell(1, 3, "lights, and what separating them gets wrong")
+    crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
+    crosstalk = crosstalk.cropped(window.origin, window.shape)
+    report(1, 3, "lights, and the errors of their separation")
     names = known.registration.lights if known.registration else ()
-    separated = _separated(linear, crosstalk, demosaic, samples.noise, names, np.random.default_rng(seed))
-    images = separated.images
+    separated, errors = _separated(linear, crosstalk, demosaic, samples.noise, names, np.random.default_rng(seed))
+    images = separated
     if known.registration is not None:
-        images = align(images, known.registration.cropped(view.origin))
-    tell(2, 3, "uncertainty to expect")
-    level, contrast = level_and_contrast(images, contrast_window(samples.facts))
-    index = _reflection_index(separated.images, contrast)
+        images = align(images, known.registration.cropped(window.origin))
+    report(2, 3, "uncertainty to expect")
+    level, contrast = level_and_contrast(images, contrast_window(samples.channels))
+    index = _reflection_index(separated, contrast)
     prediction = predict(
-        replace(mesh, nodes=mesh.nodes - view.origin),
+        replace(mesh, nodes=mesh.nodes - window.origin),
         region,
         contrast=contrast,
         level=level,
-        disturbances=separated.disturbances,
-        texture=separated.images.texture or samples.texture,
+        errors=errors,
+        texture=separated.texture or samples.texture,
         prefilter=prefilter,
     )
-    tell(3, 3, "done")
+    report(3, 3, "done")
     single = not isinstance(linear[0], LinearMosaic) and len(linear[0].values) == 1
     return Inspection(
         name=name,
         kind="bayer" if isinstance(linear[0], LinearMosaic) else "monochrome" if single else "rgb",
-        channels=samples.facts,
+        channels=samples.channels,
         lights=light_summaries(images, contrast, index, prediction.alone, region.mask),
         frame_shape=shape,
-        origin=view.origin,
+        origin=window.origin,
         images=images,
         reflection_index=index,
         saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
         region=region.mask,
         hidden=hidden(contrast, region.mask),
-        texture=separated.images.texture,
+        texture=separated.texture,
         noise=samples.noise,
         noise_known=known.noise is not None,
         contradictions=contradictions,
@@ -230,7 +224,7 @@ def inspect_frame(
 
 
 def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) -> FrameSettings:
-    """The test's frame settings, or none, with what else is stated (`FrameSettings`; None: not stated).
+    """Return the test's frame settings, or none, with what else is stated (`FrameSettings`; None: not stated).
 
     Raises
     ------
@@ -247,14 +241,6 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
     return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Separated:
-    """The lights of a frame, and what their separation gets wrong."""
-
-    images: IlluminationImages
-    disturbances: Disturbances
-
-
 def _separated(
     linear: Linear,
     crosstalk: Crosstalk,
@@ -262,8 +248,10 @@ def _separated(
     noise: NoiseModel,
     names: Sequence[str],
     random: np.random.Generator,
-) -> _Separated:
-    """Separate a state as the test would; reflection index and speckle of a mosaic are those of the default method.
+) -> tuple[IlluminationImages, SeparationErrors]:
+    """Separate a state as the test would, and draw the errors of that.
+
+    Reflection index and speckle of a mosaic are those of the default method.
 
     `names` are those of lights in succession, where they are known.
     """
@@ -274,19 +262,18 @@ def _separated(
         if method not in ("auto", DEFAULT_METHOD):
             other = separate(first, crosstalk, method)
             images = replace(other, reflection=images.reflection, texture=images.texture)
-        disturbances = Disturbances.of_mosaic(first, model, crosstalk, method, noise, random)
-        return _Separated(images=images, disturbances=disturbances)
+        return images, SeparationErrors.of_mosaic(first, model, crosstalk, method, noise, random)
     full = [frame for frame in linear if isinstance(frame, LinearChannels)]
 
     def lights(frames: Sequence[LinearChannels]) -> IlluminationImages:
         single = len(frames[0].values) == 1
         return IlluminationImages.in_succession(frames, names) if single else unmix(frames[0], crosstalk)
 
-    return _Separated(images=lights(full), disturbances=Disturbances.of_channels(full, lights, noise, random))
+    return lights(full), SeparationErrors.of_channels(full, lights, noise, random)
 
 
 def _reflection_index(images: IlluminationImages, contrast: FloatImage) -> FloatImage | None:
-    """What the separation tells of reflections, else the contrast that a light lacks to the best one's."""
+    """Reflection index of the separation, else the relative contrast that a light lacks to the best one."""
     index = images.reflection_index()
     if index is not None or len(contrast) == 1:
         return index
@@ -308,25 +295,11 @@ def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     return rows, columns
 
 
-def _check_light(channels: list[Channel], inside: BoolArray) -> None:
-    samples = [channel.values[inside & np.isfinite(channel.values)] for channel in channels]
-    if not all(values.size for values in samples):
-        raise InputError("the region holds no sample of some channel: it must be larger than a cell of the pattern")
-    if all(channel.saturated[inside].sum() == values.size for channel, values in zip(channels, samples, strict=True)):
-        raise InputError("every sample of the region is saturated: there is nothing to inspect")
-    if all(float(np.ptp(values)) == 0 for values in samples):
-        raise InputError("every channel of the region is constant: there is nothing to inspect")
-
-
-CONTRAST_WIDTH = (10.0, 40.0)
-"""Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleSummary:
-    """What the samples of the channels tell: figures, the camera noise, and the autocorrelation of the speckle."""
+    """Figures of the samples of the channels, the camera noise, and the autocorrelation of the speckle."""
 
-    facts: tuple[ChannelSummary, ...]
+    channels: tuple[ChannelSummary, ...]
     noise: NoiseModel
     texture: TextureModel | None
 
@@ -334,36 +307,64 @@ class SampleSummary:
     def of(
         cls, channels: list[Channel], inside: BoolArray, calibrated: NoiseModel | None, full_scale: float
     ) -> SampleSummary:
-        """Of the samples inside the region; `calibrated` is the noise where it is known."""
+        """Summarise the samples inside the region.
+
+        Parameters
+        ----------
+        channels
+            As they were sampled.
+        inside : ndarray, shape (H, W), bool
+            The region.
+        calibrated
+            The noise where it is known; None: it is estimated.
+        full_scale
+            DN.
+
+        Returns
+        -------
+        SampleSummary
+
+        Raises
+        ------
+        InputError
+            A channel without a sample in the region; all samples saturated, or every channel constant.
+        """
+        samples = [channel.values[inside & np.isfinite(channel.values)] for channel in channels]
+        saturated = [int(channel.saturated[inside].sum()) for channel in channels]
+        if not all(values.size for values in samples):
+            raise InputError("the region holds no sample of some channel: it must be larger than a cell of the pattern")
+        if saturated == [values.size for values in samples]:
+            raise InputError("every sample of the region is saturated: there is nothing to inspect")
+        if all(float(np.ptp(values)) == 0 for values in samples):
+            raise InputError("every channel of the region is constant: there is nothing to inspect")
         textures = [speckle_texture(channel, inside, calibrated) for channel in channels]
         estimates = noise_estimate(channels, inside) if calibrated is None else []
         known = [estimate for estimate in estimates if np.isfinite(estimate)]
         typical = float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
         noise = calibrated or NoiseModel(gain=float("inf"), read_noise=typical)
-        facts = []
-        for number, channel in enumerate(channels):
-            samples = channel.values[inside & np.isfinite(channel.values)] / full_scale
-            low, high = np.quantile(samples, [0.05, 0.95])
-            level, texture = float(samples.mean()), textures[number]
-            facts.append(
+        summaries = []
+        for number, (channel, texture) in enumerate(zip(channels, textures, strict=True)):
+            values = samples[number] / full_scale
+            level = float(values.mean())
+            low, high = np.quantile(values, [0.05, 0.95]).tolist()
+            std = estimates[number] if estimates else float(noise.variance(np.array(level * full_scale))) ** 0.5
+            summaries.append(
                 ChannelSummary(
                     name=channel.name,
                     mean=level,
-                    low=float(low),
-                    high=float(high),
-                    saturated=float(channel.saturated[inside].sum() / samples.size),
+                    low=low,
+                    high=high,
+                    saturated=saturated[number] / values.size,
                     speckle_px=float("nan") if texture is None else texture.diameter,
-                    noise_dn=estimates[number]
-                    if estimates
-                    else float(noise.variance(np.array(level * full_scale))) ** 0.5,
+                    noise_dn=std,
                 )
             )
         sharpest = sorted((texture for texture in textures if texture), key=lambda texture: texture.diameter)
-        return cls(facts=tuple(facts), noise=noise, texture=sharpest[len(sharpest) // 2] if sharpest else None)
+        return cls(channels=tuple(summaries), noise=noise, texture=sharpest[len(sharpest) // 2] if sharpest else None)
 
 
 def contrast_window(channels: tuple[ChannelSummary, ...]) -> float:
-    """Standard deviation (px) of a window that holds many speckles."""
+    """Return the standard deviation (px) of a window that holds many speckles."""
     sizes = [channel.speckle_px for channel in channels if np.isfinite(channel.speckle_px)]
     return float(np.clip(2.5 * np.median(sizes) if sizes else 0.0, *CONTRAST_WIDTH))
 
@@ -393,11 +394,11 @@ def light_summaries(
     inside: BoolArray,
 ) -> tuple[LightSummary, ...]:
     """Figures of each light in the region, from its contrast, its reflection index and its uncertainty alone."""
-    facts = []
+    summaries = []
     for j, light in enumerate(images.names):
         values, valid = images.values[j][inside], images.valid[j][inside]
         mean = local_mean(images.values[j], CONTRAST_WIDTH[0])[inside]
-        facts.append(
+        summaries.append(
             LightSummary(
                 name=light,
                 mean=float(values[valid].mean() / images.full_scale) if valid.any() else float("nan"),
@@ -408,7 +409,7 @@ def light_summaries(
                 alone=Spread.of(alone[j]),
             )
         )
-    return tuple(facts)
+    return tuple(summaries)
 
 
 def green_difference(mosaic: LinearMosaic) -> float:

@@ -1,37 +1,123 @@
-"""Displacement uncertainty expected from one frame, in closed form: nothing is solved.
+"""Displacement uncertainty expected from one frame: `rgbmidic.scene.forecast` with images of the frame's errors.
 
-As in `rgbmidic.scene.forecast` the covariance of the nodes is ``M^-1 S M^-1``, with M the Hessian of the weighted sum
-over the lights and S the covariance of its right-hand side. M follows from the speckle's autocorrelation and the
-contrast of each light; S from the `Disturbances` of two states, each convolved with a kernel whose transfer function is
-the root of the spectrum of the speckle's gradient. Every light counts with the inverse variance of its residual.
+Contrast and energy of the speckle's gradient follow from the frame; the errors are drawn (`SeparationErrors`). The
+reflection-aware model of the frame (local means, slope of each channel on the common texture, channel-specific
+component, autocorrelation of the speckle) describes a random frame with the statistics of the one given. Such a frame
+is drawn with all its channels at every pixel and separated as the test does, behind the four phases of the colour
+filter array: what is the same in all of them moves with the specimen, the rest stays with the sensor.
+Camera noise goes the same way. Filtered with the root of the speckle's gradient spectrum, the mean square of the errors
+is the variance of the right-hand side.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import scipy.sparse as sp
+import numpy.typing as npt
+from scipy.ndimage import median_filter
 
-from rgbmidic.correlation.assembly import Assembly
-from rgbmidic.correlation.equations import SEEN
-from rgbmidic.correlation.images import PREFILTERS, apply_prefilter
-from rgbmidic.correlation.nodes import LOST
-from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset
-from rgbmidic.illumination.images import local_mean
+from rgbmidic.correlation.images import apply_prefilter
+from rgbmidic.illumination.colour_factors import BLOCK, LEAST, MEAN_BLOCK, enlarged
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.demosaic import SPARKLE_VARIANCE, Reconstruction
+from rgbmidic.illumination.images import IlluminationImages, local_mean
+from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.lab.inspection.samples import Disturbances
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.scene.camera import mosaic_samples
+from rgbmidic.scene.forecast import expected_std, light_pull
+from rgbmidic.scene.speckle import SpeckleSpectrum, separated_phases
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Prediction", "expected_std", "predict"]
+__all__ = ["Prediction", "SeparationErrors", "gaussian_field", "predict"]
 
 
 _GRID, _REACH = 64, 16
 """Frequencies on which the kernel is computed, and the distance (px) to which it is kept: speckle's gradients are
 correlated over a speckle or two."""
+SETTLED = 32.0
+"""Standard deviation (px) of the window over which the model of the frame is averaged once more."""
+TYPICAL = 9
+"""Side (blocks) of the square over which the channel-specific variance is taken by its median."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeparationErrors:
+    """Images of the errors of the lights of one state.
+
+    Attributes
+    ----------
+    noise : ndarray, shape (k, H, W), float32
+        Change of the lights by the camera noise, DN.
+    mosaic : ndarray, shape (4, k, H, W), float32
+        Difference of the lights behind each phase of the colour filter array from the mean of the four, DN; shape
+        (0, k, H, W) for a camera that has all channels at every pixel.
+    """
+
+    noise: FloatImage
+    mosaic: FloatImage
+
+    @classmethod
+    def of_mosaic(
+        cls,
+        mosaic: LinearMosaic,
+        model: Reconstruction,
+        crosstalk: Crosstalk,
+        method: str,
+        noise: NoiseModel,
+        random: np.random.Generator,
+    ) -> SeparationErrors:
+        """Errors drawn for a raw mosaic.
+
+        Parameters
+        ----------
+        mosaic
+            The frame, with the noise that the separation reckons with.
+        model
+            Model of the frame that the reflection-aware method fitted.
+        crosstalk, method
+            How the test separates its frames (`rgbmidic.illumination.separate`).
+        noise
+            Camera noise to draw.
+        random
+            Source of random numbers.
+        """
+        channels = _drawn_channels(model, mosaic.values.shape, random)
+
+        def lights(values: FloatImage, cfa: str) -> FloatImage:
+            drawn = replace(mosaic, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
+            return np.nan_to_num(separate(drawn, crosstalk, method, texture=model.texture).values)
+
+        images = separated_phases(channels, mosaic.cfa, lights)
+        noisy = lights(_noisy(mosaic_samples(channels, mosaic.cfa), noise, random), mosaic.cfa)
+        return cls(noise=noisy - images[0], mosaic=images - images.mean(axis=0))
+
+    @classmethod
+    def of_channels(
+        cls,
+        frames: Sequence[LinearChannels],
+        lights: Callable[[Sequence[LinearChannels]], IlluminationImages],
+        noise: NoiseModel,
+        random: np.random.Generator,
+    ) -> SeparationErrors:
+        """Errors drawn for a camera with all channels at every pixel: those of noise alone.
+
+        Parameters
+        ----------
+        frames
+            Of one state: one, or one per light in succession.
+        lights
+            Separates them.
+        noise, random
+            Camera noise to draw; source of random numbers.
+        """
+        quiet = lights(frames).values
+        noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in frames]).values
+        return cls(noise=np.nan_to_num(noisy - quiet), mosaic=np.empty((0, *quiet.shape), dtype=np.float32))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +129,7 @@ class Prediction:
     std
         Of all lights together.
     noise, mosaic
-        The parts of it from camera noise, and from what the mosaic did not sample.
+        The parts of it from camera noise, and from samples that the mosaic lacks.
     alone : tuple of ndarray
         Of every light alone.
     """
@@ -60,31 +146,36 @@ def predict(
     *,
     contrast: FloatImage,
     level: FloatImage,
-    disturbances: Disturbances,
+    errors: SeparationErrors,
     texture: TextureModel | None,
     prefilter: str,
 ) -> Prediction:
-    """What a second state of a frame is expected to be measured with.
+    """Return the standard uncertainty expected of the displacement from a frame to a second state.
 
     Parameters
     ----------
     mesh, region
-        What is measured.
+        Mesh of the measurement and its region, in px of the images.
     contrast, level : ndarray, shape (k, H, W)
         Local standard deviation of each light in units of its local mean, 0 where the light is not known; and that
         mean, DN.
-    disturbances
-        Of one state, DN; those of the other are as large and independent.
+    errors
+        Of one state, DN; those of the other state are as large and independent.
     texture
         The speckle's autocorrelation; None: there is none, and nothing can be measured.
     prefilter
         Of the solve (`rgbmidic.correlation.images.PREFILTERS`).
+
+    Returns
+    -------
+    Prediction
     """
     if texture is None:
-        nothing = np.full(len(mesh.nodes), np.nan)
-        return Prediction(std=nothing, noise=nothing, mosaic=nothing, alone=(nothing,) * len(contrast))
+        unknown = np.full(len(mesh.nodes), np.nan)
+        return Prediction(std=unknown, noise=unknown, mosaic=unknown, alone=(unknown,) * len(contrast))
     light = contrast > 0
-    energy, kernel = _gradient(texture, prefilter)
+    spectrum = SpeckleSpectrum.of_texture(texture, size=_GRID, prefilter=prefilter)
+    kernel = spectrum.score_kernel(_REACH)
 
     def filtered(draws: FloatImage, change: Callable[[FloatImage], FloatImage]) -> Iterator[FloatImage]:
         """Draws (n, k, H, W) relative to the level of the light, one (k, H, W) after the other, every image changed."""
@@ -93,17 +184,17 @@ def predict(
             yield np.stack([change(image) for image in relative])
 
     def variance(change: Callable[[FloatImage], FloatImage]) -> FloatImage:
-        """Local mean square (k, H, W) of all disturbances of one state."""
+        """Local mean square (k, H, W) of all errors of one state."""
         total = np.zeros_like(contrast)
         for draws in parts:
             for images in filtered(draws, change):
                 total += images**2 / np.float32(len(draws))
         return _smooth(total, region.mask, mesh.size)
 
-    parts = disturbances.noise[None], disturbances.mosaic
-    own = np.sqrt(np.maximum(contrast**2 - variance(lambda image: image), 0) * light)
+    parts = errors.noise[None], errors.mosaic
+    texture_contrast = np.sqrt(np.maximum(contrast**2 - variance(lambda image: image), 0) * light)
     residual = variance(lambda image: apply_prefilter(image, prefilter))
-    pull = np.divide(own, residual, out=np.zeros_like(own), where=residual > 0)
+    pull = light_pull(texture_contrast, residual)
     pixels = PixelMap.from_mesh(mesh, region)
 
     def scores(draws: FloatImage) -> FloatArray:
@@ -116,59 +207,57 @@ def predict(
         return 2 * _element_means(_smooth(total, region.mask, mesh.size), pixels)
 
     noise, mosaic = (scores(draws) for draws in parts)
-    information = energy * _element_means(pull * own, pixels)
+    information = spectrum.energy * _element_means(pull * texture_contrast, pixels)
     together = expected_std(mesh, information.sum(axis=0), noise[0] + mosaic[0], noise[0], mosaic[0])
     alone = [expected_std(mesh, info, score)[0] for info, score in zip(information, (noise + mosaic)[1:], strict=True)]
     return Prediction(std=together[0], noise=together[1], mosaic=together[2], alone=tuple(alone))
 
 
-def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -> FloatArray:
-    """Standard uncertainty (n, N) of a displacement component at the nodes, px; NaN where they see too little.
+def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
+    """Return a Gaussian random image (H, W) with the autocorrelation of `texture`, its offset aside."""
+    from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2, rfftfreq
 
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    information, *scores : ndarray, shape (E,)
-        Per pixel of each element: of the Hessian, and n variances of the right-hand side.
+    rows, columns = (next_fast_len(side, real=True) for side in shape)
+    frequency = np.hypot(fftfreq(rows).astype(np.float32)[:, None], rfftfreq(columns).astype(np.float32))
+    table = np.linspace(0, 0.71, 4096)
+    spectrum = rfft2(random.standard_normal((rows, columns), dtype=np.float32))
+    spectrum *= np.interp(frequency, table, np.sqrt(texture.spectrum(table))).astype(np.float32)
+    return np.asarray(irfft2(spectrum, s=(rows, columns))[: shape[0], : shape[1]], dtype=np.float32)
+
+
+def _drawn_channels(model: Reconstruction, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
+    """Channels (3, H, W) of a random state with the frame's statistics, DN."""
+    factors, texture = model.factors, model.texture
+    sparkle = TextureModel(weights=(1.0,), widths=(float(np.sqrt(2 * SPARKLE_VARIANCE)),))
+    channels = np.repeat(gaussian_field(texture, shape, random)[None], 3, axis=0)
+    # by the median around: variances are cut off at zero, so that a mean would be too large
+    typical = median_filter(factors.private - LEAST, size=(1, TYPICAL, TYPICAL), mode="reflect")
+    deviation = np.sqrt(enlarged(np.maximum(typical, 0), BLOCK, shape))
+    for channel in range(3):
+        if deviation[channel].any():
+            coarse, fine = (gaussian_field(kind, shape, random) for kind in (texture, sparkle))
+            specific = np.sqrt(texture.private) * coarse + np.sqrt(1 - texture.private) * fine
+            channels[channel] += deviation[channel] * specific
+    mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
+    return np.asarray(mean + enlarged(_settled(factors.slope, BLOCK), BLOCK, shape) * channels, dtype=np.float32)
+
+
+def _settled(grid: npt.NDArray[np.floating], block: int) -> FloatArray:
+    """Return a grid (n, h, w) of blocks smoothed over `SETTLED` px, without the scatter of few speckles per window.
+
+    The scatter differs from channel to channel, and a frame with a ratio of the channels that scatters would be harder
+    to separate than a real one.
     """
-    area = mesh.to_nodes(mesh.areas)
-    density = mesh.to_nodes(information * mesh.areas) / area
-    seen = density > SEEN * np.median(density[density > 0]) if (density > 0).any() else np.zeros(len(density), bool)
-    if not seen.any():
-        return np.full((len(scores), len(density)), np.nan)
-    assembly = Assembly.from_mesh(mesh)
-    mass = ((1 + np.eye(3)) / 12)[..., None] * np.array([1.0, 0.0, 1.0])
-
-    def assembled(values: FloatArray) -> sp.csc_matrix:
-        return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
-
-    # elements that no light sees must not make the system singular
-    solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
-    used = np.asarray(seen[mesh.elements].all(axis=1))
-    recovery = Recovery.over(mesh, used, density, linear_fit_offset(mesh))
-    along_x, colouring = [(recovery.displacement_functionals[0], seen)], NodeColouring.from_mesh(mesh)
-    std = np.stack([functional_std(solve, assembled(score), colouring, along_x)[:, 0] for score in scores])
-    return np.where(seen & (std < LOST), std, np.nan)
+    return np.stack([cv2.GaussianBlur(layer.astype(np.float64), (0, 0), SETTLED / block) for layer in grid])
 
 
-def _gradient(texture: TextureModel, prefilter: str) -> tuple[float, FloatImage]:
-    """Mean square (px^-2) of the texture's gradient along a direction after the prefilter; and the kernel that turns a
-    disturbance into one whose square, per pixel, is the variance of the right-hand side."""
-    frequency = np.fft.fftfreq(_GRID)
-    taps = PREFILTERS[prefilter]
-    place = np.arange(len(taps)) - len(taps) // 2
-    line = (taps @ np.cos(2 * np.pi * place[:, None] * frequency)) ** 2
-    filtered = np.outer(line, line)
-    radius = np.hypot(frequency[:, None], frequency)
-    gradient = (2 * np.pi * radius) ** 2 / 2 * texture.spectrum(radius)
-    kernel = np.fft.fftshift(np.fft.ifft2(np.sqrt(gradient) * filtered).real)
-    near = slice(_GRID // 2 - _REACH, _GRID // 2 + _REACH + 1)
-    return float((gradient * filtered).mean()), kernel[near, near].astype(np.float32)
+def _noisy(values: FloatImage, noise: NoiseModel, random: np.random.Generator) -> FloatImage:
+    white = random.standard_normal(values.shape, dtype=np.float32)
+    return np.asarray(values + white * np.sqrt(noise.variance(values)), dtype=np.float32)
 
 
 def _smooth(images: FloatImage, inside: BoolArray, width: float) -> FloatImage:
-    """Local means of images (n, H, W) over what lies inside the region, over about an element and its neighbours."""
+    """Local means of images (n, H, W) inside the region, over about an element and its neighbours."""
     return np.stack([np.nan_to_num(local_mean(np.where(inside, image, np.float32(np.nan)), width)) for image in images])
 
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab.demo import check_folder, write_document
+from rgbmidic.lab import check_folder, number_or_none, write_document
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, save_figure
-from rgbmidic.typing import AnyArray, BoolArray
+from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,8 +55,8 @@ def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
     rows = []
     for channel in inspection.channels:
         noise = f"{channel.noise_dn:.1f}" if inspection.noise_known else f"~ {channel.noise_dn:.0f}"
-        shares = [f"{share:.1%}" for share in (channel.mean, channel.low, channel.high, channel.saturated)]
-        rows.append([channel.name, *shares, _text(channel.speckle_px, 1), noise])
+        fractions = [f"{value:.1%}" for value in (channel.mean, channel.low, channel.high, channel.saturated)]
+        rows.append([channel.name, *fractions, _text(channel.speckle_px, 1), noise])
     return ["channel", "mean", "5 %", "95 %", "saturated", "speckle, px", "noise, DN"], rows
 
 
@@ -70,7 +70,7 @@ def light_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
 
 
 def uncertainty_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows: all lights together, what that is made of, each light alone."""
+    """Headings and rows: all lights together, its parts, each light alone."""
     parts = {"all lights": Spread.of(inspection.std)}
     if inspection.kind == "bayer":
         parts |= {
@@ -88,7 +88,7 @@ def _text(value: float, digits: int) -> str:
 
 
 def inspection_document(inspection: Inspection) -> dict[str, Any]:
-    """The figures as plain values, for inspection.json; a number that is not known is null."""
+    """Return the figures as plain values, for inspection.json; a number that is not known is null."""
     texture = inspection.texture
     return {
         "schema": "rgbmidic-inspection",
@@ -99,11 +99,11 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "element_size_px": inspection.element_size,
         "crosstalk_known": inspection.crosstalk_known,
         "noise_known": inspection.noise_known,
-        "speckle_px": _number(inspection.speckle_px),
+        "speckle_px": number_or_none(inspection.speckle_px),
         "texture": None
         if texture is None
         else {
-            "diameter_px": _number(texture.diameter),
+            "diameter_px": number_or_none(texture.diameter),
             "agreement_of_colours": texture.correlation,
             "channel_specific_fraction": texture.private,
         },
@@ -118,17 +118,13 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
     }
 
 
-def _plain(facts: Any) -> dict[str, Any]:
-    values = {name: getattr(facts, name) for name in facts.__dataclass_fields__ if name != "alone"}
-    return {name: _number(value) if isinstance(value, float) else value for name, value in values.items()}
+def _plain(summary: Any) -> dict[str, Any]:
+    values = {name: getattr(summary, name) for name in summary.__dataclass_fields__ if name != "alone"}
+    return {name: number_or_none(value) if isinstance(value, float) else value for name, value in values.items()}
 
 
 def _spread(spread: Spread) -> dict[str, float | None]:
-    return {"median": _number(spread.median), "q95": _number(spread.q95)}
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+    return {"median": number_or_none(spread.median), "q95": number_or_none(spread.q95)}
 
 
 def inspection_figure(inspection: Inspection) -> Figure:
@@ -159,46 +155,50 @@ def inspection_figure(inspection: Inspection) -> Figure:
 
 
 def _draw_light(axis: Axes, inspection: Inspection, light: int) -> None:
-    image, facts = _reduced(inspection.images.values[light]), inspection.lights[light]
+    image, name = _reduced(inspection.images.values[light]), inspection.lights[light].name
     known = image[np.isfinite(image)]
     low, high = np.percentile(known, [1, 99]) if known.size else (0, 1)
     axis.set_facecolor("#e8590c")  # what is unknown
     axis.imshow(
         image, extent=_extent(inspection), cmap="gray", vmin=low, vmax=max(high, low + 1e-6), interpolation="auto"
     )
-    axis.set_title(f"light {literal(facts.name)}" if len(inspection.lights) > 1 else "image")
+    axis.set_title(f"light {literal(name)}" if len(inspection.lights) > 1 else "image")
     _frame_axis(axis, inspection, first=light == 0)
 
 
 def _draw_index(axis: Axes, inspection: Inspection, light: int) -> Any:
     assert inspection.reflection_index is not None
-    facts = inspection.lights[light]
+    summary = inspection.lights[light]
     index = _reduced(inspection.reflection_index[light])
     picture = axis.imshow(index, extent=_extent(inspection), cmap="inferno", vmin=0, vmax=1, interpolation="auto")
-    axis.set_title(f"{literal(facts.name)} reflects on {facts.reflecting:.0%}")
+    axis.set_title(f"{literal(summary.name)} reflects on {summary.reflecting:.0%}")
     _frame_axis(axis, inspection, first=light == 0)
     return picture
 
 
 def _draw_trouble(axis: Axes, inspection: Inspection) -> None:
     """Saturated samples, and where no light shows the texture, over the mean of the lights."""
+    from matplotlib.colors import to_rgb
     from matplotlib.lines import Line2D
+    from scipy.ndimage import maximum_filter
 
     mean = np.nan_to_num(inspection.images.values).mean(axis=0)
     low, high = np.percentile(mean, [1, 99])
     grey = np.clip((_reduced(mean) - low) / max(high - low, 1e-6), 0, 1)
     picture = np.repeat(0.35 + 0.6 * grey[..., None], 3, axis=2)
+    # grown by a pixel and more, so that single samples stay visible in a reduced picture
+    grown = maximum_filter(inspection.saturated, size=2 * _step(inspection.saturated.shape) + 1)
     marks = {
-        "saturated": (_spread_out(inspection.saturated), "#c8102e"),
+        "saturated": (grown, "#c8102e"),
         "no light shows it": (inspection.hidden, "#1f5fbf"),
     }
     handles = []
     for label, (mask, colour) in marks.items():
         where = _reduced(mask & inspection.region)
-        picture[where] = 0.25 * picture[where] + 0.75 * np.array(_rgb(colour))
-        share = (inspection.saturated if label == "saturated" else mask)[inspection.region].mean()
+        picture[where] = 0.25 * picture[where] + 0.75 * np.array(to_rgb(colour))
+        fraction = (inspection.saturated if label == "saturated" else mask)[inspection.region].mean()
         style: dict[str, Any] = {"marker": "s", "linestyle": "", "markersize": 5}
-        handles.append(Line2D([], [], color=colour, label=f"{label}: {share:.1%}", **style))
+        handles.append(Line2D([], [], color=colour, label=f"{label}: {fraction:.1%}", **style))
     axis.imshow(picture, extent=_extent(inspection), interpolation="nearest")
     axis.set_title("samples in the region")
     axis.legend(handles=handles, loc="upper left", fontsize=8, handletextpad=0.2, **_BOX)
@@ -246,19 +246,6 @@ def _write_summary(axis: Axes, inspection: Inspection) -> None:
     lines += ["", "warnings: " + (", ".join(codes) if codes else "none")]
     text = "\n".join(fill(line, 36, subsequent_indent="  ") if line.strip() == line else line for line in lines)
     axis.text(0.02, 0.98, text, transform=axis.transAxes, va="top", fontsize=8, linespacing=1.5, parse_math=False)
-
-
-def _spread_out(mask: BoolArray) -> BoolArray:
-    """A mask grown by a pixel and more, so that single samples stay visible in a reduced picture."""
-    from scipy.ndimage import maximum_filter
-
-    return np.asarray(maximum_filter(mask, size=2 * _step(mask.shape) + 1))
-
-
-def _rgb(colour: str) -> tuple[float, float, float]:
-    from matplotlib.colors import to_rgb
-
-    return to_rgb(colour)
 
 
 def _step(shape: tuple[int, ...]) -> int:

@@ -1,4 +1,4 @@
-"""What an inspection finds, as plain values, and the warnings that follow from them."""
+"""The results of an inspection, as plain values, and the warnings that follow from them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["TOO_FINE", "ChannelSummary", "Finding", "Inspection", "LightSummary"
 
 
 BLIND = 0.5
-"""Share of the usual contrast that no light reaches where the specimen cannot be seen."""
+"""Fraction of the usual contrast that no light reaches where the specimen cannot be seen; chosen."""
 TOO_FINE = 0.75
 """Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs/inspect.md)."""
 COARSE = 3.0
-"""Speckles along the side of an element that it needs at least."""
+"""Least number of speckles along the side of an element (iDICs Good Practices Guide, for subsets)."""
 SATURATED, DARK, HIDDEN, NEGATIVE, GREENS = 0.01, 0.1, 0.01, 0.01, 0.05
-"""Shares from which a warning is worth its line: of saturated samples; of the full scale that the bright twentieth of a
-channel reaches; of the region that no light shows; of pixels where a light is negative; between the two greens."""
+"""Fractions (chosen) from which a warning is given: of saturated samples; of the full scale at the 95 % quantile of a
+channel; of the region that no light shows; of pixels where a light is negative; between the two greens."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,11 +53,11 @@ class ChannelSummary:
     name : str
         R, G, B; M for a monochrome camera, M1, M2, ... for lights in succession.
     mean, low, high : float
-        Mean, 5 % and 95 % quantile of the samples above black, in shares of the full scale.
+        Mean, 5 % and 95 % quantile of the samples above black, in fractions of the full scale.
     saturated : float
-        Share of the samples that are saturated.
+        Fraction of the samples that are saturated.
     speckle_px : float
-        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.samples.speckle_size`).
+        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.samples.speckle_texture`).
     noise_dn : float
         Standard deviation of the camera noise of a sample at the mean level, DN; estimated from the frame where the
         calibration does not know the noise.
@@ -80,15 +80,15 @@ class LightSummary:
     ----------
     name : str
     mean : float
-        Mean grey level in shares of the full scale.
+        Mean grey level in fractions of the full scale.
     contrast : float
         Median of the local standard deviation over the local mean.
     reflecting : float or None
-        Share of the region where the reflection index exceeds `REFLECTING` of the images; None for a single light.
+        Fraction of the region where the reflection index exceeds `REFLECTING` of the images; None for a single light.
     valid : float
-        Share of the region where the light is known.
+        Fraction of the region where the light is known.
     negative : float
-        Share of the region where the light's local mean is negative, which no light can be.
+        Fraction of the region where the light's local mean is negative, which no light can be.
     alone : Spread
         Predicted standard uncertainty with this light alone, px.
     """
@@ -111,7 +111,7 @@ class Finding:
     code : str
         For programs, such as ``"fine speckle"``.
     text : str
-        What it means and what helps.
+        Its meaning and remedy.
     """
 
     code: str
@@ -120,7 +120,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """What one frame tells before a test.
+    """Results of the inspection of one frame before a test.
 
     Attributes
     ----------
@@ -128,8 +128,8 @@ class Inspection:
         The frame.
     kind : str
         ``"bayer"``, ``"rgb"`` or ``"monochrome"``.
-    channels : tuple of ChannelFacts
-    lights : tuple of LightFacts
+    channels : tuple of ChannelSummary
+    lights : tuple of LightSummary
     frame_shape : tuple of int
         Rows and columns of the frame. Of it the region and its surroundings were looked at, H rows and W columns.
     origin : tuple of int
@@ -137,7 +137,7 @@ class Inspection:
     images : IlluminationImages
         The separated lights (k, H, W), DN.
     reflection_index : ndarray, shape (k, H, W), float32, or None
-        Share of a light's light that is not diffuse, 0 to 1; relative to the light with the most contrast at each
+        Fraction of a light's image that is not diffuse, 0 to 1; relative to the light with the most contrast at each
         place. None for a single light.
     saturated, region : ndarray, shape (H, W), bool
     hidden : ndarray, shape (H, W), bool
@@ -147,9 +147,9 @@ class Inspection:
     noise : NoiseModel
         Camera noise, calibrated or estimated from the frame.
     noise_known, crosstalk_known : bool
-        Whether the calibration tells them; a monochrome camera has no crosstalk to know.
+        Whether the calibration states them; for a monochrome camera crosstalk counts as known.
     contradictions : tuple of Mismatch
-        What of the frame contradicts the calibration: doubtful, or accepted.
+        Contradictions of the frame to the calibration: doubtful, or accepted.
     element_size : float
         px.
     nodes : ndarray, shape (N, 2), float64
@@ -159,7 +159,7 @@ class Inspection:
         Predicted standard uncertainty of u, and of v, px, all lights together, camera noise and separation; NaN where
         no light sees enough.
     noise_std, sampling_std : ndarray, shape (N,), float64
-        The parts of it from camera noise, and from what the mosaic did not sample.
+        The parts of it from camera noise, and from samples that the mosaic lacks.
     greens : float
         Difference of the means of the two greens of a mosaic over their mean; 0 for other cameras.
     """
@@ -190,7 +190,7 @@ class Inspection:
 
     @property
     def unmeasured(self) -> float:
-        """Share of the nodes that cannot be measured."""
+        """Fraction of the nodes that cannot be measured."""
         return float(np.isnan(self.std).mean())
 
     @property

@@ -1,59 +1,33 @@
-"""What the samples of one camera channel say by themselves: exposure, speckle size, noise.
+"""Samples of one frame before anything is demosaiced: the part looked at, its channels, speckle size and noise.
 
-Nothing here demosaics: a channel of a mosaic is an image (H, W) with NaN where another channel was sampled.
-
-What separating a frame gets wrong, drawn from the frame's own statistics.
-
-The reflection-aware model of a frame (local means, each channel's slope on the common texture, what is private to each
-channel, the speckle's autocorrelation) describes a random frame with the statistics of the one given. Such a frame is
-drawn with all its channels at every pixel and separated as the test does, behind the four phases of the colour filter
-array: what is the same in all of them moves with the specimen and does no harm, the rest stays with the sensor. Camera
-noise goes the same way.
-
-The part of a frame that an inspection looks at: the region and its surroundings.
+A channel of a mosaic is an image (H, W) with NaN where another channel was sampled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import numpy.typing as npt
-from scipy.ndimage import median_filter
 from scipy.optimize import nnls
 
-from rgbmidic.frames.data import ChannelFrame, Mosaic, sampled_channels, shift_cfa
-from rgbmidic.illumination.colour_factors import BLOCK, LEAST, MEAN_BLOCK, enlarged
-from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.demosaic import SPARKLE_VARIANCE, Reconstruction
-from rgbmidic.illumination.images import IlluminationImages, local_mean
+from rgbmidic.frames.data import Window, sampled_channels
+from rgbmidic.illumination.images import local_mean
 from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
-from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.mesh import Region
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "Channel",
-    "Disturbances",
-    "Frame",
-    "View",
-    "channels_of",
-    "gaussian_field",
-    "noise_estimate",
-    "speckle_texture",
-]
+__all__ = ["Channel", "channels_of", "noise_estimate", "speckle_texture", "surroundings"]
 
 MEAN_WIDTH = 20.0
 """Standard deviation (px) of the local mean that the contrast is taken against; wide, so as to keep coarse speckle."""
 FARTHEST = 24
-"""Largest distance (px) at which the autocorrelation is looked at."""
+"""Largest distance (px) of the autocorrelation: speckle of up to half of it is found."""
 _WIDTHS = 0.5 * 1.25 ** np.arange(17)
 """Standard deviations (px) of the Gaussians that are fitted to it."""
 _REGRESSED, _FLATTEST = 20_000, 0.05
-"""Samples that are looked at, and the share of them, with the flattest surroundings, that the regression is made on."""
+"""Samples that are looked at, and the fraction of them, with the flattest surroundings, for the
+regression; chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +51,7 @@ class Channel:
 
 
 def channels_of(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
-    """The channels of a frame, or of the frames of lights fired in succession."""
+    """Return the channels of a frame, or of the frames of lights fired in succession."""
     channels: list[Channel] = []
     for frame in frames:
         if isinstance(frame, LinearMosaic):
@@ -98,7 +72,7 @@ def channels_of(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
 
 
 def speckle_texture(channel: Channel, inside: BoolArray, noise: NoiseModel | None) -> TextureModel | None:
-    """The autocorrelation of a channel's contrast; None where there is no texture, or no end of it within `FARTHEST`.
+    """Return the autocorrelation of a channel's contrast; None without a texture, or one that ends within `FARTHEST`.
 
     The contrast is the sample over the local mean, less 1. Products of samples of this channel alone enter, so that
     demosaicing has no part in it. The noise is a peak at distance 0, where its variance is subtracted; with unknown
@@ -121,7 +95,7 @@ def speckle_texture(channel: Channel, inside: BoolArray, noise: NoiseModel | Non
     if noise is not None:
         product[at_zero] -= float((noise.variance(mean[usable]) / mean[usable] ** 2).mean())
     kept = (count > 0.05 * count.max()) & (~at_zero if noise is None else True)
-    narrowest = 0.0 if noise is not None else channel.step / 2  # nothing tells narrower ones from noise
+    narrowest = 0.0 if noise is not None else channel.step / 2  # narrower ones cannot be distinguished from noise
     return _fitted(distance[kept], product[kept], np.asarray(_WIDTHS[narrowest < _WIDTHS], dtype=np.float64))
 
 
@@ -159,11 +133,11 @@ def _fitted(distance: FloatArray, product: FloatArray, widths: FloatArray) -> Te
 
 
 def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
-    """Standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
+    """Return the standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
 
     Where its surroundings are bright and flattest, a sample's contrast is predicted from the 24 samples around it, of
-    whatever channel, by linear regression, one for each position in the cell of the mosaic. What is left is the
-    sample's own noise, that of its neighbours through the regression, and texture that they do not tell: fair where
+    any channel, by linear regression, one for each position in the cell of the mosaic. The residual holds the
+    sample's own noise, that of its neighbours through the regression, and texture that they do not predict: fair where
     paint is flat over five samples, too high for finer speckle and in reflections (docs/inspect.md). Its scale is
     1.4826 times the median absolute value.
     """
@@ -192,7 +166,7 @@ def _mean(channel: Channel) -> FloatImage:
 
 
 def _unpredicted(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], step: int) -> FloatImage:
-    """What a regression on the 5 x 5 samples around leaves of the samples of one phase, flat."""
+    """Residual (flat) of the samples of one phase after a regression on the 5 x 5 samples around each."""
     rows, columns = np.nonzero(lattice[2:-2, 2:-2])
     kept = ((rows + 2) % step == phase[0]) & ((columns + 2) % step == phase[1])
     rows, columns = rows[kept], columns[kept]
@@ -211,178 +185,22 @@ def _unpredicted(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], 
     around = np.delete(patches, 12, axis=1)
     system = np.column_stack([around, np.ones(len(around))])
     coefficients = np.linalg.lstsq(system, patches[:, 12], rcond=None)[0]
-    share = np.sqrt(len(patches) / max(len(patches) - system.shape[1], 1))
-    return np.asarray((patches[:, 12] - system @ coefficients) * share, dtype=np.float32)
+    freedom = np.sqrt(len(patches) / max(len(patches) - system.shape[1], 1))
+    return np.asarray((patches[:, 12] - system @ coefficients) * freedom, dtype=np.float32)
 
-
-SETTLED = 32.0
-"""Standard deviation (px) of the window over which the model of the frame is averaged once more."""
-TYPICAL = 9
-"""Side (blocks) of the square over which what is private to a channel is taken by its median."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Disturbances:
-    """Images of what disturbs the lights of one state.
-
-    Attributes
-    ----------
-    noise : ndarray, shape (k, H, W), float32
-        What the camera noise does to the lights, DN.
-    mosaic : ndarray, shape (4, k, H, W), float32
-        What behind each phase of the colour filter array differs from the mean of the four, DN; shape (0, k, H, W) for
-        a camera that has all channels at every pixel.
-    """
-
-    noise: FloatImage
-    mosaic: FloatImage
-
-    @classmethod
-    def of_mosaic(
-        cls,
-        mosaic: LinearMosaic,
-        model: Reconstruction,
-        crosstalk: Crosstalk,
-        method: str,
-        noise: NoiseModel,
-        random: np.random.Generator,
-    ) -> Disturbances:
-        """Draw those of a raw mosaic.
-
-        Parameters
-        ----------
-        mosaic
-            The frame; it holds the noise that the separation knows of.
-        model
-            What the reflection-aware method found out about it.
-        crosstalk, method
-            How the test separates its frames (`rgbmidic.illumination.separate`).
-        noise
-            Camera noise to draw.
-        random
-            Source of chance.
-        """
-        channels = _drawn_channels(model, mosaic.values.shape, random)
-
-        def lights(values: FloatImage, cfa: str) -> FloatImage:
-            drawn = replace(mosaic, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
-            return np.nan_to_num(separate(drawn, crosstalk, method, texture=model.texture).values)
-
-        phases = [shift_cfa(mosaic.cfa, row, column) for row, column in np.ndindex(2, 2)]
-        images = np.stack([lights(_sampled(channels, cfa), cfa) for cfa in phases])
-        noisy = lights(_noisy(_sampled(channels, mosaic.cfa), noise, random), mosaic.cfa)
-        return cls(noise=noisy - images[0], mosaic=images - images.mean(axis=0))
-
-    @classmethod
-    def of_channels(
-        cls,
-        frames: Sequence[LinearChannels],
-        lights: Callable[[Sequence[LinearChannels]], IlluminationImages],
-        noise: NoiseModel,
-        random: np.random.Generator,
-    ) -> Disturbances:
-        """Draw those of a camera with all channels at every pixel, where noise is all there is.
-
-        `lights` separates the frames of one state.
-        """
-        quiet = lights(frames).values
-        noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in frames]).values
-        return cls(noise=np.nan_to_num(noisy - quiet), mosaic=np.empty((0, *quiet.shape), dtype=np.float32))
-
-
-def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
-    """A Gaussian random image (H, W) with the autocorrelation of `texture`, its offset aside."""
-    from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2, rfftfreq
-
-    rows, columns = (next_fast_len(side, real=True) for side in shape)
-    frequency = np.hypot(fftfreq(rows).astype(np.float32)[:, None], rfftfreq(columns).astype(np.float32))
-    table = np.linspace(0, 0.71, 4096)
-    spectrum = rfft2(random.standard_normal((rows, columns), dtype=np.float32))
-    spectrum *= np.interp(frequency, table, np.sqrt(texture.spectrum(table))).astype(np.float32)
-    return np.asarray(irfft2(spectrum, s=(rows, columns))[: shape[0], : shape[1]], dtype=np.float32)
-
-
-def _drawn_channels(model: Reconstruction, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
-    """Channels (3, H, W) of a random state with the frame's statistics, DN."""
-    factors, texture = model.factors, model.texture
-    sparkle = TextureModel(weights=(1.0,), widths=(float(np.sqrt(2 * SPARKLE_VARIANCE)),))
-    channels = np.repeat(gaussian_field(texture, shape, random)[None], 3, axis=0)
-    deviation = np.sqrt(enlarged(_typical(factors.private - LEAST), BLOCK, shape))
-    for channel in range(3):
-        if deviation[channel].any():
-            coarse, fine = (gaussian_field(kind, shape, random) for kind in (texture, sparkle))
-            private = np.sqrt(texture.private) * coarse + np.sqrt(1 - texture.private) * fine
-            channels[channel] += deviation[channel] * private
-    mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
-    return np.asarray(mean + enlarged(_settled(factors.slope, BLOCK), BLOCK, shape) * channels, dtype=np.float32)
-
-
-def _sampled(channels: FloatImage, cfa: str) -> FloatImage:
-    """The mosaic (H, W) that a colour filter array makes of channels (3, H, W)."""
-    return np.asarray(np.take_along_axis(channels, sampled_channels(cfa, channels.shape[1:])[None], axis=0)[0])
-
-
-def _settled(grid: npt.NDArray[np.floating], block: int) -> FloatArray:
-    """A grid (n, h, w) of blocks without what chance, a handful of speckles in a window, makes of it.
-
-    The channels' chance differs, and a frame in which their ratio wobbled would be harder to separate than a real one.
-    """
-    return np.stack([cv2.GaussianBlur(layer.astype(np.float64), (0, 0), SETTLED / block) for layer in grid])
-
-
-def _typical(private: FloatArray) -> FloatArray:
-    """Private variance (n, h, w) by its median around: chance is cut off at zero, so that a mean would be too large."""
-    return np.maximum(median_filter(private, size=(1, TYPICAL, TYPICAL), mode="reflect"), 0)
-
-
-def _noisy(values: FloatImage, noise: NoiseModel, random: np.random.Generator) -> FloatImage:
-    white = random.standard_normal(values.shape, dtype=np.float32)
-    return np.asarray(values + white * np.sqrt(noise.variance(values)), dtype=np.float32)
-
-
-Frame = Mosaic | ChannelFrame
 
 MARGIN = 96
 """Surroundings (px) of the region that are looked at with it: three standard deviations of the window over which the
-model of the frame is averaged (`rgbmidic.lab.inspection.samples.SETTLED`)."""
+model of the frame is averaged (`rgbmidic.lab.inspection.prediction.SETTLED`)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class View:
-    """The part of a frame that is looked at.
+def surroundings(region: Region) -> Window:
+    """Return the part of the frame that is looked at: the region and `MARGIN` px around.
 
-    Attributes
-    ----------
-    origin
-        Its first column and row, both even, so that the pattern of a mosaic stays what it is.
-    shape
-        Its rows and columns.
+    It begins at an even column and row, so that the pattern of a mosaic stays the same.
     """
-
-    origin: tuple[int, int]
-    shape: tuple[int, int]
-
-    @classmethod
-    def around(cls, region: Region) -> View:
-        """A region with its surroundings."""
-        spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0)]
-        first = [max(int(span[0]) - MARGIN, 0) // 2 * 2 for span in spans]
-        last = [min(int(span[-1]) + 1 + MARGIN, side) for span, side in zip(spans, region.mask.shape, strict=True)]
-        return cls(origin=(first[1], first[0]), shape=(last[0] - first[0], last[1] - first[1]))
-
-    def frame(self, frame: Frame) -> Frame:
-        """The part of a frame."""
-        return replace(frame, values=np.ascontiguousarray(frame.values[..., *self._slices]))
-
-    def region(self, region: Region) -> Region:
-        """The region in it."""
-        return region.part(*self._slices)
-
-    def crosstalk(self, crosstalk: Crosstalk) -> Crosstalk:
-        """The crosstalk in it."""
-        return crosstalk.cropped(self.origin, self.shape)
-
-    @property
-    def _slices(self) -> tuple[slice, slice]:
-        (x, y), (rows, columns) = self.origin, self.shape
-        return slice(y, y + rows), slice(x, x + columns)
+    spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0)]
+    first = [max(int(span[0]) - MARGIN, 0) // 2 * 2 for span in spans]
+    last = [min(int(span[-1]) + 1 + MARGIN, side) for span, side in zip(spans, region.mask.shape, strict=True)]
+    shape = last[0] - first[0], last[1] - first[1]
+    return Window(origin=(first[1], first[0]), shape=shape, frame=region.mask.shape)

@@ -66,7 +66,7 @@ class Goniometry:
     lobe
         Fitted to the mean of the pixels; its uncertainty is that of choosing these pixels among others.
     spread : ndarray, shape (n,)
-        Standard deviation between the pixels of a bundle of what is not diffuse light.
+        Standard deviation, between the pixels of a bundle, of the light that is not diffuse.
     band
         Light angles (first, last) between which the reflection is erratic; NaN where it is nowhere.
     """
@@ -156,7 +156,7 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, std: npt.ArrayLik
 def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: float = VISIBLE) -> Goniometry:
     """Diffuse light, specular lobe and erratic band of a series of grey levels.
 
-    Every pixel has its own diffuse level, found where the light is far from the reflection; what is more than that is
+    Every pixel has its own diffuse level, found where the light is far from the reflection; the excess over it is
     reflection. A smooth reflection would be the same at every pixel of one paint: the spread between the pixels is the
     erratic part.
 
@@ -194,14 +194,19 @@ def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: flo
     white = diffuse > (np.quantile(diffuse, 0.1) + np.quantile(diffuse, 0.9)) / 2
     excess = values - cosine[:, None] * diffuse
     spread = np.sqrt(np.mean([excess[:, group].var(axis=1) for group in (white, ~white) if group.any()], axis=0))
-    band = _interval(angles, spread > visible * float(diffuse[white].mean()), int(spread.argmax()))
+    # the run of angles around the largest spread on which it is visible
+    hidden, peak = np.flatnonzero(~(spread > visible * float(diffuse[white].mean()))), int(spread.argmax())
+    band = (float("nan"), float("nan"))
+    if peak not in hidden:
+        first, last = hidden[hidden < peak].max(initial=-1) + 1, hidden[hidden > peak].min(initial=len(angles)) - 1
+        band = (float(angles[first]), float(angles[last]))
     return Goniometry(angles_deg=angles, levels=values, white=white, lobe=lobe, spread=spread, band=band)
 
 
 def _lobe_of_pixels(angles: FloatArray, levels: FloatArray) -> Lobe:
     """Lobe of the mean of m pixels; its uncertainty from leaving out groups of them (jackknife).
 
-    The residual of the fit would not tell: a pixel's deviation is the same at neighbouring angles.
+    The residual of the fit does not show it: a pixel's deviation is the same at neighbouring angles.
     """
     whole = fit_lobe(angles, levels.mean(axis=1))
     groups = min(_GROUPS, levels.shape[1])
@@ -217,15 +222,3 @@ def _lobe_of_pixels(angles: FloatArray, levels: FloatArray) -> Lobe:
 def _lobe(angles: FloatArray, diffuse: float, specular: float, centre: float, width: float) -> FloatArray:
     lambert = np.maximum(np.cos(np.radians(angles)), 0)
     return np.asarray(diffuse * lambert + specular * np.exp(-((angles - centre) ** 2) / (2 * width**2)))
-
-
-def _interval(angles: FloatArray, inside: BoolArray, peak: int) -> tuple[float, float]:
-    """First and last angle of the run of `inside` around the peak."""
-    if not inside[peak]:
-        return float("nan"), float("nan")
-    first = last = peak
-    while first > 0 and inside[first - 1]:
-        first -= 1
-    while last < len(angles) - 1 and inside[last + 1]:
-        last += 1
-    return float(angles[first]), float(angles[last])

@@ -29,7 +29,7 @@ __all__ = [
 AREA_SIZE = (50.0, 100.0)
 """Width and height (px) of the paper's areas."""
 _MEASURED = 0.5
-"""Fraction of an area that must be measured for a figure on it; a choice."""
+"""Fraction of an area that must be measured for a figure on it; chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +57,7 @@ class Area:
         return x - width / 2, y - height / 2, x + width / 2, y + height / 2
 
     def cut(self, image: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        """The pixels of an image whose centres lie in the area.
+        """Return the pixels of an image whose centres lie in the area.
 
         Parameters
         ----------
@@ -174,7 +174,7 @@ def _over_measured(values: npt.NDArray[np.floating], statistic: object) -> float
 
 
 def area_stds(high_passed: FloatArray, areas: Sequence[Area]) -> FloatArray:
-    """Standard deviation of an image in each area.
+    """Return the standard deviation of an image in each area.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ _BLOCKS = 3
 
 
 def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
-    """A height map minus the best bipolynomial: all x^i y^j with i and j up to `order` (paper, Fig. 10: 4).
+    """Return a height map minus the best bipolynomial: all x^i y^j with i and j up to `order` (paper, Fig. 10: 4).
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
 
 
 def slope_uncertainty(height_std: float, pitch: float) -> float:
-    """Standard uncertainty of a small local slope: that of a central difference, ``std / (sqrt(2) pitch)``.
+    """Return the standard uncertainty of a small local slope: that of a central difference, ``std / (sqrt(2) pitch)``.
 
     It holds where the slope is well above it; where it is not, the slope, being positive, is biased upwards.
 

@@ -1,9 +1,9 @@
 """Better places for the lamps: their directions are chosen anew, each at its own distance from the specimen.
 
-The zones should not overlap in any state, should lie outside the field as far as the light can afford to fall
-obliquely, and the colour that measures best (of a Bayer camera green, with two samples in four) deserves the light that
-reflects least. All three follow from one cost: the uncertainty over field and states if every light counted by the
-fourth power of its diffuse share, as one who trusts no reflection would weight it.
+The reflection zones should not overlap in any state and should lie outside the field as far as the light can afford to
+fall obliquely; the colour that measures best (of a Bayer camera green, with two samples in four) deserves the light
+that reflects least. All three follow from one cost: the uncertainty over field and states if every light counted by
+the fourth power of its diffuse fraction, the weighting of a user who trusts no reflection.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ INCLINATIONS = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
 APART = 20.0
 """Least angle (degrees) between two lamps, seen from the specimen."""
 _POINTS = 300
-"""Points of the field at which lamps are compared."""
+"""Points of the field at which lamps are compared; chosen for the time that it takes."""
 _STATES = 6
-"""States at which they are compared."""
+"""States at which they are compared; chosen for the time that it takes."""
 _DIFFUSE_POWER = 4
+"""Power of the diffuse fraction in the cost (see above); chosen."""
 _WORTHWHILE = 1.02
-"""Gain from which lamps are moved."""
+"""Gain from which lamps are moved; chosen: less is not worth mounting."""
 _AFFORDABLE = 1.2
 """Largest growth of the expected uncertainty for lamps that are moved, which then stand more obliquely: a reflection
-that hardly disturbs need not be fled at any price."""
+that hardly adds to the uncertainty need not be avoided at any price; chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +50,7 @@ class Proposal:
     Attributes
     ----------
     plan
-        What to expect of them.
+        Zones and uncertainty with them.
     gain
         Cost of the present lamps over theirs; 1 where nothing better was found.
     """
@@ -64,14 +65,14 @@ class Proposal:
 
 
 def propose_colours(plan: Plan) -> Proposal:
-    """The present lamp directions with the colours exchanged for the best."""
+    """Return the present lamp directions with the colours exchanged for the best."""
     compared = _Compared.of(plan, _directions(plan.scene))
     own = tuple(range(len(plan.scene.lights)))
     return compared.proposal(plan, min(permutations(own), key=compared.cost), affordable=1.0)
 
 
 def propose_lamps(plan: Plan) -> Proposal:
-    """The best directions of a grid over azimuth and inclination, with the best colour for each."""
+    """Return the best directions of a grid over azimuth and inclination, with the best colour for each."""
     present = _directions(plan.scene)
     compared = _Compared.of(plan, np.concatenate([present, _grid()]))
     own = tuple(range(len(present)))
@@ -99,11 +100,13 @@ class _Compared:
         material = material_points(scene, None, pixels)
         index = np.unique(np.linspace(0, len(plan.outlooks) - 1, _STATES).round().astype(int))
         states = [plan.outlooks[i].state for i in index]
-        brightness = np.nanmean(plan.reference.level[:, plan.inside], axis=1)
-        information = [
-            _information(scene, instrument, j, directions, material, states, np.nan_to_num(brightness))
-            for j in range(len(scene.lights))
-        ]
+        brightness = np.nan_to_num(np.nanmean(plan.reference.level[:, plan.inside], axis=1))
+        information = []
+        for light, lamp in enumerate(scene.lights):
+            candidates = tuple(_placed(lamp, scene, direction) for direction in directions)
+            before, *after = (_zones(scene, candidates, light, material, state) for state in (State(), *states))
+            clear = [_clear(instrument, light, before, one, brightness) for one in after]
+            information.append(np.stack(clear, axis=1))
         return cls(directions=directions, information=np.stack(information))
 
     def cost(self, choice: Iterable[int]) -> float:
@@ -140,8 +143,10 @@ class _Compared:
                 return choice
 
     def proposal(self, plan: Plan, choice: tuple[int, ...], affordable: float) -> Proposal:
-        """The plan with the lights in the chosen directions, if that gains and the uncertainty does not grow by more
-        than the factor `affordable`."""
+        """Return the plan with the lights in the chosen directions, if that gains.
+
+        The uncertainty must not grow by more than the factor `affordable`.
+        """
         gain = self.cost(range(len(choice))) / self.cost(choice)
         if gain < _WORTHWHILE:
             return Proposal(plan=plan, gain=1.0)
@@ -153,24 +158,8 @@ class _Compared:
         return Proposal(plan=better, gain=gain)
 
 
-def _information(
-    scene: Scene,
-    instrument: Instrument,
-    light: int,
-    directions: FloatArray,
-    material: FloatArray,
-    states: list[State],
-    brightness: FloatArray,
-) -> FloatArray:
-    """Information (directions, states, points) that a light gives from each direction."""
-    lamp = scene.lights[light]
-    candidates = tuple(_placed(lamp, scene, direction) for direction in directions)
-    before, *after = (_zones(scene, candidates, light, material, state) for state in (State(), *states))
-    return np.stack([_clear(instrument, light, before, one, brightness) for one in after], axis=1)
-
-
 def _zones(scene: Scene, candidates: tuple[Light, ...], light: int, material: FloatArray, state: State) -> Zones:
-    """Zones of one light from many places; `light` tells its colour."""
+    """Zones of one light from many places; `light` is its index, for its colour."""
     camera = replace(scene.camera, crosstalk=None, sensitivities=None)
     alone = replace(scene, lights=(scene.lights[light],), camera=camera)
     zones = predict_zones(alone, state, material=material, lights=candidates)
@@ -179,21 +168,19 @@ def _zones(scene: Scene, candidates: tuple[Light, ...], light: int, material: Fl
 
 
 def _clear(instrument: Instrument, light: int, before: Zones, after: Zones, brightness: FloatArray) -> FloatArray:
-    """Inverse variance (directions, points) of what a light says, by the fourth power of its diffuse share."""
+    """Inverse variance (directions, points) of the pull of a light, times the fourth power of its diffuse fraction."""
     variance = instrument.light_variance(light, before, after, brightness)
     with np.errstate(invalid="ignore"):
         clear = (1 - np.fmax(before.share, after.share)) ** _DIFFUSE_POWER / variance
     full = instrument.scene.camera.full_scale
-    surface = instrument.scene.surface
     for zones in (before, after):
-        white = surface.white.albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance)
         with np.errstate(invalid="ignore"):
-            clear = np.where(zones.irradiance * white < full, clear, 0.0)
+            clear = np.where(instrument.white_level(zones) < full, clear, 0.0)
     return np.nan_to_num(clear)
 
 
 def _directions(scene: Scene) -> FloatArray:
-    """Unit vectors (k, 3) from the body's front point to the lamps."""
+    """Return unit vectors (k, 3) from the body's front point to the lamps."""
     towards = np.array([light.position for light in scene.lights]) - scene.body.front
     return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
 
@@ -207,7 +194,7 @@ def _grid() -> FloatArray:
 
 
 def _placed(light: Light, scene: Scene, direction: FloatArray) -> Light:
-    """The light at its distance from the body's front point, in another direction."""
+    """Return the light at its distance from the body's front point, in another direction."""
     front = np.array(scene.body.front)
     distance = np.linalg.norm(np.array(light.position) - front)
     x, y, z = (front + distance * direction).tolist()

@@ -2,43 +2,32 @@
 
 Everything follows from a SCENE.toml: its reflection zones (`rgbmidic.scene.zones`) and the uncertainty in closed form
 (`rgbmidic.scene.forecast`). Nothing is rendered.
-
-A measurement in small by processes of its own: what they compile lies in the cache when it is needed.
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels import are_compiled
 from rgbmidic.errors import InputError
 from rgbmidic.scene.forecast import Forecast, Instrument, trace_change
 from rgbmidic.scene.scene import Experiment, Scene, State
-from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones, truth
+from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones, region_in_view, truth
 from rgbmidic.settings import IlluminationSettings
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Outlook", "Plan", "make_plan", "outlook", "rehearsed"]
+__all__ = ["Outlook", "Plan", "make_plan"]
 
 _POINTS = 80
-"""Points of the prediction along the longer side of the frame."""
-_MARGIN = 20.0
-"""Pixels between the frame's edge and what moves nearest to it, where the scene states no region."""
+"""Points of the prediction along the longer side of the frame; chosen: zones are far wider than a step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outlook:
-    """What is expected of one state, at points of the reference image; NaN where the body is not seen.
+    """Zones and uncertainty expected in one state, at points of the reference image; NaN where the body is not seen.
 
     Attributes
     ----------
@@ -49,7 +38,7 @@ class Outlook:
     displacement : ndarray, shape (2, h, w)
         px.
     reflects : ndarray, shape (k, h, w), bool
-        Whether the light's specular share exceeds `rgbmidic.scene.zones.REFLECTS` in the reference or in this state.
+        Whether the light's specular fraction exceeds `rgbmidic.scene.zones.REFLECTS` in the reference or in this state.
     lit : ndarray, shape (k, h, w), bool
         Whether the light reaches the point in both.
     saturated : ndarray, shape (k, h, w), bool
@@ -79,16 +68,16 @@ class Outlook:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """A scene with what is expected of it.
+    """A scene with the outlook of each of its states.
 
     Attributes
     ----------
     scene
         Lamps, camera, paint and body.
     instrument
-        What camera, paint and processing make of them.
+        Camera, paint and processing, reduced for the forecast.
     field
-        (x0, y0, x1, y1) in px of the reference image: what is to be measured.
+        (x0, y0, x1, y1) in px of the reference image: the region to be measured.
     x, y : ndarray, shape (h, w)
         Points (px) of the reference image at which everything is predicted.
     inside : ndarray, shape (h, w), bool
@@ -109,12 +98,12 @@ class Plan:
     outlooks: tuple[Outlook, ...]
 
     def with_lamps(self, scene: Scene) -> Plan:
-        """The same plan with a scene whose lamps stand elsewhere."""
+        """Return the same plan with a scene whose lamps stand elsewhere."""
         reference, outlooks = _predict(scene, self.instrument, self.x, self.y, [o.state for o in self.outlooks])
         return replace(self, scene=scene, reference=reference, outlooks=outlooks)
 
     def share(self, mask: BoolArray) -> float:
-        """Share of the field on which a mask (h, w) holds."""
+        """Fraction of the field on which a mask (h, w) holds."""
         return float(mask[self.inside].mean())
 
     @property
@@ -130,12 +119,16 @@ def make_plan(experiment: Experiment) -> Plan:
     Parameters
     ----------
     experiment
-        What `rgbmidic.scene.scene.read_scene` reads; without states, the body at rest is compared with itself.
+        From `rgbmidic.scene.scene.read_scene`; without states, the body at rest is compared with itself.
 
     Raises
     ------
     InputError
         The field does not lie on the body in every state.
+
+    Returns
+    -------
+    Plan
     """
     scene = experiment.scene
     states = list(experiment.states) or [State()]
@@ -147,7 +140,7 @@ def make_plan(experiment: Experiment) -> Plan:
     x, y = np.meshgrid(np.arange(0, width - 0.5, step), np.arange(0, height - 0.5, step))
     reference, outlooks = _predict(scene, instrument, x, y, states)
     motion = np.stack([outlook.displacement for outlook in outlooks])
-    field = experiment.output.region or _field_in_view(x, y, motion, scene.camera.shape)
+    field = experiment.output.region or region_in_view(x, y, motion, scene.camera.shape)
     inside = (x >= field[0]) & (y >= field[1]) & (x <= field[2]) & (y <= field[3])
     if not inside.any() or not np.isfinite(motion[:, :, inside]).all():
         raise InputError(f"the field {list(field)} px does not lie on the body in every state")
@@ -166,162 +159,35 @@ def make_plan(experiment: Experiment) -> Plan:
 def _predict(
     scene: Scene, instrument: Instrument, x: FloatArray, y: FloatArray, states: list[State]
 ) -> tuple[Zones, tuple[Outlook, ...]]:
+    """Zones at rest, and the outlook of every state, at points x, y (h, w) of a square grid (px)."""
     material = material_points(scene, None, (x, y))
     reference = predict_zones(scene, material=material)
-    return reference, tuple(outlook(scene, instrument, reference, material, state, (x, y)) for state in states)
-
-
-def outlook(
-    scene: Scene,
-    instrument: Instrument,
-    reference: Zones,
-    material: FloatArray,
-    state: State,
-    pixels: tuple[FloatArray, FloatArray],
-) -> Outlook:
-    """Predict one state.
-
-    Parameters
-    ----------
-    scene, instrument
-        Lamps, camera, paint and body; what camera, paint and processing make of them.
-    reference
-        Zones of the reference state at the material points.
-    material : ndarray, shape (3, h, w)
-        mm, body axes.
-    state
-        The deformed state.
-    pixels
-        Where the reference image shows the material points: x and y (h, w) on a square grid, px.
-    """
-    zones = predict_zones(scene, state, material=material)
-    step = float(pixels[0][0, 1] - pixels[0][0, 0])
-    displacement = truth(scene, state, None, pixels)
-    change = _around(trace_change(displacement), instrument.element_size / step)
-    with np.errstate(invalid="ignore"):
-        share = np.fmax(reference.share, zones.share)
-        reflects = share > REFLECTS
-    return Outlook(
-        state=state,
-        zones=zones,
-        displacement=displacement,
-        reflects=reflects,
-        lit=np.isfinite(reference.share) & np.isfinite(zones.share),
-        saturated=instrument.saturated(reference) | instrument.saturated(zones),
-        forecast=instrument.forecast(reference, zones, change),
-    )
+    reach = instrument.element_size / float(x[0, 1] - x[0, 0])
+    outlooks = []
+    for state in states:
+        zones = predict_zones(scene, state, material=material)
+        displacement = truth(scene, state, None, (x, y))
+        with np.errstate(invalid="ignore"):
+            reflects = np.fmax(reference.share, zones.share) > REFLECTS
+        outlooks.append(
+            Outlook(
+                state=state,
+                zones=zones,
+                displacement=displacement,
+                reflects=reflects,
+                lit=np.isfinite(reference.share) & np.isfinite(zones.share),
+                saturated=instrument.saturated(reference) | instrument.saturated(zones),
+                forecast=instrument.forecast(reference, zones, _around(trace_change(displacement), reach)),
+            )
+        )
+    return reference, tuple(outlooks)
 
 
 def _around(values: FloatArray, reach: float) -> FloatArray:
-    """Mean (n, h, w) of what is known within about `reach` points: over the elements of a node."""
+    """Mean (n, h, w) of the known values within about `reach` points: over the elements of a node."""
     known = np.isfinite(values)
     total, weight = (
         np.stack([cv2.GaussianBlur(part, (0, 0), 0.5 * reach) for part in stack])
         for stack in (np.where(known, values, 0.0), known.astype(np.float64))
     )
     return np.where(known, total / np.where(known, weight, 1.0), np.nan)
-
-
-def _field_in_view(
-    x: FloatArray, y: FloatArray, motion: FloatArray, shape: tuple[int, int]
-) -> tuple[float, float, float, float]:
-    """The largest rectangle about the middle that lies on the body and within the frame, with a margin, in all states.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    height, width = shape
-    seen = np.asarray(np.isfinite(motion[:, 0]).all(axis=0))
-    largest = np.abs(motion[:, :, seen]).max(axis=(0, 2)) if seen.any() else np.zeros(2)
-    left, top = (float(np.ceil(value)) + _MARGIN for value in largest)
-    middle = (width - 1) / 2, (height - 1) / 2
-    while 2 * left < width - 8 and 2 * top < height - 8:
-        inside = (abs(x - middle[0]) <= middle[0] - left) & (abs(y - middle[1]) <= middle[1] - top)
-        if inside.any() and seen[inside].all():
-            return left, top, width - 1 - left, height - 1 - top
-        left, top = left + 4, top + 4
-    raise InputError("the body leaves the middle of the frame: state output.region = [x0, y0, x1, y1]")
-
-
-_SIZE = 96
-"""Rows and columns of the frames, px: nine elements of the usual size."""
-_REGION = (10, 10, 86, 86)
-_SETTINGS = f"""\
-[frames]
-path = "*.dng"
-[calibration]
-file = "calibration.json"
-[region]
-rectangle = {list(_REGION)}
-"""
-
-
-@contextmanager
-def rehearsed() -> Iterator[None]:
-    """While the block runs two other processes compile the kernels of a measurement, those of the separation and those
-    of the solve; at the end of all they are cached.
-
-    Where kernels were compiled on this machine before there is nothing to do.
-    """
-    if are_compiled():
-        yield
-        return
-    with ExitStack() as stack:
-        others = [stack.enter_context(_started(part)) for part in _PARTS]
-        try:
-            yield
-        except BaseException:
-            for one in others:
-                one.kill()
-            raise
-
-
-def _started(part: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, "-m", __name__, part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-
-
-def _separate() -> None:
-    """Prepare a measurement of raw frames and separate their lights."""
-    from rgbmidic.frames.data import Mosaic
-    from rgbmidic.frames.images import write_dng
-    from rgbmidic.lab.virtual.dataset import record, true_calibration
-    from rgbmidic.lab.virtual.rendering import sphere_scene
-    from rgbmidic.pipeline import Plan
-    from rgbmidic.settings import read_test
-
-    scene = sphere_scene(size=_SIZE)
-    with tempfile.TemporaryDirectory() as folder:
-        for index in range(2):
-            frame = record(_images(index), scene.camera, scene.lights, seed=index)
-            assert isinstance(frame, Mosaic)
-            write_dng(Path(folder) / f"{index}.dng", frame)
-        true_calibration(scene).write(Path(folder) / "calibration.json")
-        (Path(folder) / "test.toml").write_text(_SETTINGS, encoding="utf-8")
-        plan = Plan.from_settings(read_test(Path(folder) / "test.toml"))
-        plan.separation(plan.series.read(1))
-
-
-def _solve() -> None:
-    """Solve for the displacement between images of three lights."""
-    from rgbmidic import correlate
-
-    correlate(_images(0), _images(1), region=_REGION)
-
-
-def _images(index: int) -> FloatImage:
-    """Blobs under three lights, a fraction of a pixel further from frame to frame."""
-    from scipy.ndimage import gaussian_filter, shift
-
-    blobs = gaussian_filter(np.random.default_rng(0).normal(size=(3, _SIZE, _SIZE)), (0, 1.5, 1.5))
-    moved = shift(blobs, (0, 0, 0.3 * index), mode="nearest")
-    return np.clip(1000 + 2000 * moved, 0, None).astype(np.float32)
-
-
-_PARTS = {"separation": _separate, "solve": _solve}
-
-if __name__ == "__main__":
-    _PARTS[sys.argv[1]]()

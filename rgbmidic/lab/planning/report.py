@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic._version import __version__
-from rgbmidic.lab.demo import check_folder, write_document
+from rgbmidic.lab import check_folder, number_or_none, write_document
 from rgbmidic.lab.planning.lamps import Proposal
 from rgbmidic.lab.planning.plan import Outlook, Plan
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal, save_figure
 from rgbmidic.scene.camera import Light
 from rgbmidic.scene.scene import Scene
-from rgbmidic.scene.zones import REFLECTS, Zones
+from rgbmidic.scene.zones import REFLECTS
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -50,6 +50,8 @@ def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwri
         Name to better lamps.
     out
         Folder; made where it does not exist.
+    overwrite
+        Whether a plan in the folder is replaced.
 
     Raises
     ------
@@ -62,18 +64,18 @@ def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwri
 
 
 def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per state: shares of the field where each light reflects, all do, one or none is clean."""
+    """Headings and one row per state: field fractions where each light reflects, all do, one or none is clean."""
     names = [light.name for light in plan.scene.lights]
     rows = []
     for label, one in _labelled(plan):
-        shares = [one["reflecting"][name] for name in names]
-        shares += [one[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
-        rows.append([label, f"{one['largest_motion_px']:.1f}", *(f"{share:.1%}" for share in shares)])
+        fractions = [one["reflecting"][name] for name in names]
+        fractions += [one[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
+        rows.append([label, f"{one['largest_motion_px']:.1f}", *(f"{fraction:.1%}" for fraction in fractions)])
     return ["state", "motion, px", *names, "all", "one", "none", "clipped"], rows
 
 
 def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per state: standard uncertainty over the field in px, and what it is made of."""
+    """Headings and one row per state: standard uncertainty over the field in px, and its parts."""
     rows = []
     for label, one in _labelled(plan):
         std = one["std_px"]
@@ -113,14 +115,14 @@ def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
 
 
 def summary(plan: Plan) -> str:
-    """One line: how much two lights share at worst, and the uncertainty over field and states."""
+    """One line: the largest overlap of reflections, and the uncertainty over field and states."""
     overlap = max(plan.share(np.asarray(outlook.reflects.sum(axis=0) > 1)) for outlook in plan.outlooks)
     std = f"{plan.std:.4f} px" if math.isfinite(plan.std) else "unbounded: somewhere no light sees"
     return f"reflections overlap on up to {overlap:.1%} of the field; u_std {std}"
 
 
 def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
-    """The plan as plain values, for plan.json; shares are of the field, a number that is not known is null."""
+    """Return the plan as plain values, for plan.json; fractions are of the field, an unknown number is null."""
     return {
         "schema": "rgbmidic-plan",
         "rgbmidic": __version__,
@@ -135,21 +137,22 @@ def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
 
 
 def _arrangement(plan: Plan) -> dict[str, Any]:
+    lamps = []
+    for light in plan.scene.lights:
+        azimuth, inclination = _angles(plan.scene, light)
+        lamps.append(
+            {
+                "name": light.name,
+                "position_mm": list(light.position),
+                "azimuth_deg": azimuth,
+                "inclination_deg": inclination,
+                "power": light.power,
+            }
+        )
     return {
-        "lights": [_lamp(plan.scene, light) for light in plan.scene.lights],
-        "std_px": _number(plan.std),
+        "lights": lamps,
+        "std_px": number_or_none(plan.std),
         "states": [_state(plan, outlook) for outlook in plan.outlooks],
-    }
-
-
-def _lamp(scene: Scene, light: Light) -> dict[str, Any]:
-    azimuth, inclination = _angles(scene, light)
-    return {
-        "name": light.name,
-        "position_mm": list(light.position),
-        "azimuth_deg": azimuth,
-        "inclination_deg": inclination,
-        "power": light.power,
     }
 
 
@@ -185,14 +188,11 @@ def _rms(values: FloatArray) -> float | None:
     return float(np.sqrt(np.mean(known**2))) if known.size else None
 
 
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
     """Zones of the lights (above) and uncertainty (below) in the first and last state, and in the last as proposed."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     panels = {"first state": (plan, plan.outlooks[0]), "last state": (plan, plan.outlooks[-1])}
     panels |= {f"last state, {name}": (p.plan, p.plan.outlooks[-1]) for name, p in proposals.items() if p.gain > 1}
@@ -209,7 +209,10 @@ def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
             axes[0, column].set_title(literal(f"{title}{turned}"))
             shown = _draw_std(axes[1, column], one, outlook, top)
         figure.colorbar(shown, ax=list(axes[1]), label="u_std (px)", extend="max", aspect=20, pad=0.02)
-        figure.legend(*_legend(plan.scene), loc="outside upper center", ncols=len(plan.scene.lights) + 2)
+        lines = [Line2D([], [], color=colour) for colour in _colours(plan.scene)]
+        lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
+        labels = [*(literal(light.name) for light in plan.scene.lights), "at rest", "field"]
+        figure.legend(lines, labels, loc="outside upper center", ncols=len(labels))
         for axis in axes[:, 0]:
             axis.set_ylabel("y (px)")
         for axis in axes[1]:
@@ -227,25 +230,22 @@ def _extent(plan: Plan) -> tuple[float, float, float, float]:
 
 
 def _draw_zones(axis: Axes, plan: Plan, outlook: Outlook) -> None:
-    """Specular shares as colours, zones as lines: broken in the reference state, whole in this one."""
+    """Specular fractions as colours, zones as lines: broken in the reference state, whole in this one."""
     from matplotlib.colors import to_rgb
 
     body = np.isfinite(outlook.displacement[0])
     picture = np.where(body[..., None], 0.93, 1.0) * np.ones(3)
-    for colour, share in zip(_colours(plan.scene), _largest(plan.reference, outlook.zones), strict=True):
-        cover = 0.85 * np.clip(np.nan_to_num(share), 0, 1)[..., None]
+    largest = np.fmax(plan.reference.share, outlook.zones.share)
+    for colour, fraction in zip(_colours(plan.scene), largest, strict=True):
+        cover = 0.85 * np.clip(np.nan_to_num(fraction), 0, 1)[..., None]
         picture = picture * (1 - cover) + np.array(to_rgb(colour)) * cover
     axis.imshow(picture, extent=_extent(plan), interpolation="bilinear")
     for index, colour in enumerate(_colours(plan.scene)):
         for zones, style in ((plan.reference, "--"), (outlook.zones, "-")):
-            share = zones.share[index]
-            if np.nanmin(share, initial=1.0) < REFLECTS < np.nanmax(share, initial=0.0):
-                axis.contour(plan.x, plan.y, share, [REFLECTS], colors=[colour], linestyles=style, linewidths=1)
+            fraction = zones.share[index]
+            if np.nanmin(fraction, initial=1.0) < REFLECTS < np.nanmax(fraction, initial=0.0):
+                axis.contour(plan.x, plan.y, fraction, [REFLECTS], colors=[colour], linestyles=style, linewidths=1)
     _draw_field(axis, plan)
-
-
-def _largest(first: Zones, second: Zones) -> FloatArray:
-    return np.asarray(np.fmax(first.share, second.share))
 
 
 def _draw_std(axis: Axes, plan: Plan, outlook: Outlook, top: float) -> Any:
@@ -266,11 +266,3 @@ def _draw_field(axis: Axes, plan: Plan) -> None:
     axis.set_ylim(height - 0.5, -0.5)
     axis.set_aspect("equal")
     axis.locator_params(nbins=4)
-
-
-def _legend(scene: Scene) -> tuple[list[Any], list[str]]:
-    from matplotlib.lines import Line2D
-
-    lines = [Line2D([], [], color=colour) for colour in _colours(scene)]
-    lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
-    return lines, [*(literal(light.name) for light in scene.lights), "at rest", "field"]

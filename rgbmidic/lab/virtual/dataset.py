@@ -1,16 +1,15 @@
 """A virtual test on disk: raw frames, calibration captures, the exact truth, and settings that `rgbmidic run` takes.
 
-What a laboratory records beside the test: one light at a time on a target, dark frames, a white card, checks.
-
-What the camera of a scene records: colour filter array, shot and read noise, quantisation, saturation.
+The captures are those that a laboratory records beside the test: one light at a time on a target, dark frames, a white
+card, the checks. The camera (`record`) samples through its colour filter array, adds shot and read noise, quantises
+and saturates.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,15 +18,15 @@ import numpy.typing as npt
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual.rendering import render
-from rgbmidic.scene.camera import Camera, Light
+from rgbmidic.scene.camera import Camera, Light, mosaic_samples
 from rgbmidic.scene.scene import DatasetSettings, Experiment, Plate, Scene, State, Target, read_scene
 from rgbmidic.scene.surface import Finish, Surface
-from rgbmidic.scene.zones import truth
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.scene.zones import region_in_view, truth
+from rgbmidic.typing import FloatImage
 
 __all__ = [
     "check_frames",
@@ -43,12 +42,13 @@ __all__ = [
 
 Frame = Mosaic | ChannelFrame
 Progress = Callable[[int, int, str], None]
-MARGIN = 20
-"""Pixels between the frame's edge and what moves nearest to it, in the region of test.toml."""
+EXPOSURES = tuple(0.13 * time for time in (0.5, 1, 2, 4, 6, 10))
+"""Fraction of the full scale that the brightest sample of a white card reaches, .13 per ms of the exposure times that
+calibration/README.md states; in the last it saturates."""
 
 
 def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | None = None) -> Path:
-    """Render what a SCENE.toml describes.
+    """Render the virtual test that a SCENE.toml describes.
 
     Written to `out`: ``frames/`` (frame 0 shows the body at rest; a monochrome camera gets one folder per light),
     ``dark/``, ``light_NAME/``, ``flat_1/`` and so on and ``check/`` for `rgbmidic-calibrate`, ``calibration.json`` (the
@@ -85,8 +85,7 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
 
 def write_experiment(experiment: Experiment, out: Path, progress: Progress | None = None) -> Path:
     """Like `write_dataset`, from an experiment in memory."""
-    _check_names_of_lights(experiment.scene)
-    _make_folder(out)
+    _check_output(experiment.scene, out)
     scene, settings = experiment.scene, experiment.output
     states = (State(), *experiment.states)
     seeds = np.random.SeedSequence(settings.seed).spawn(5)
@@ -94,7 +93,9 @@ def write_experiment(experiment: Experiment, out: Path, progress: Progress | Non
     at_rest = render(scene)
     for index, state in enumerate(states):
         images = render(scene, state) if index else at_rest
-        _write_state(out, scene, settings, index, images, frame_seeds[index])
+        for (folder, on), seed in zip(_folders(scene).items(), frame_seeds[index], strict=False):
+            frame = record(images, scene.camera, scene.lights, seed=int(seed), on=on)
+            _write_frame(out / folder, index, frame, settings)
         if settings.noise_free:
             _save(out / "noise_free" / f"frame_{index:04d}.npz", images=images)
         if progress is not None:
@@ -104,19 +105,19 @@ def write_experiment(experiment: Experiment, out: Path, progress: Progress | Non
     _write_captures(out, scene, settings, at_rest, [int(seed.generate_state(1)[0]) for seed in seeds[1:]])
     true_calibration(scene).write(out / "calibration.json")
     test = out / "test.toml"
-    test.write_text(_test_settings(scene, settings, _region(settings, displacement)), encoding="utf-8")
+    y, x = np.indices(scene.camera.shape, dtype=float, sparse=True)
+    region = settings.region or region_in_view(x, y, displacement, scene.camera.shape)
+    test.write_text(_test_settings(scene, settings, region), encoding="utf-8")
     return test
 
 
-def _check_names_of_lights(scene: Scene) -> None:
+def _check_output(scene: Scene, out: Path) -> None:
+    """Names of lights that can be names of folders, and an empty folder, which is made."""
     for light in scene.lights:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", light.name):
             raise InputError(f"a light's name becomes a folder's: letters, digits, - and _ only, not {light.name!r}")
         if light.name in ("all", "dark"):
             raise InputError(f"a light cannot be called {light.name!r}: that is the name of a folder of captures")
-
-
-def _make_folder(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         taken = any(out.iterdir())
@@ -126,33 +127,12 @@ def _make_folder(out: Path) -> None:
         raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder")
 
 
-def _write_state(
-    out: Path,
-    scene: Scene,
-    settings: DatasetSettings,
-    index: int,
-    images: FloatImage,
-    seeds: npt.NDArray[np.uint32],
-) -> None:
-    """One frame; of a monochrome camera, for which the lights fire in succession, one per light."""
-    for folder, seed, on in zip(_folders(scene), seeds, _lights_on(scene), strict=False):
-        frame = record(images, scene.camera, scene.lights, seed=int(seed), on=on)
-        _write_frame(out / folder, index, frame, settings)
-
-
-def _folders(scene: Scene) -> list[str]:
-    if scene.camera.kind == "monochrome" and len(scene.lights) > 1:
-        return [f"frames_{light.name}" for light in scene.lights]
-    return ["frames"]
-
-
-def _lights_on(scene: Scene) -> Iterator[tuple[str, ...]]:
+def _folders(scene: Scene) -> dict[str, tuple[str, ...]]:
+    """Folders of frames with the lights that shine: of a monochrome camera one each, since they fire in succession."""
     names = tuple(light.name for light in scene.lights)
-    return ((name,) for name in names) if scene.camera.kind == "monochrome" else iter([names])
-
-
-def _suffix(camera: Camera, settings: DatasetSettings) -> str:
-    return "dng" if camera.kind == "bayer" and settings.format == "dng" else "tif"
+    if scene.camera.kind == "monochrome" and len(names) > 1:
+        return {f"frames_{name}": (name,) for name in names}
+    return {"frames": names}
 
 
 def _write_frame(folder: Path, index: int, frame: Frame, settings: DatasetSettings) -> None:
@@ -176,6 +156,7 @@ def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest:
 
 
 def true_calibration(scene: Scene) -> Calibration:
+    """Return the calibration that a perfect laboratory would find of a scene."""
     camera = scene.camera
     return Calibration(
         crosstalk=None if camera.kind == "monochrome" else camera.true_crosstalk(scene.lights),
@@ -187,30 +168,10 @@ def true_calibration(scene: Scene) -> Calibration:
     )
 
 
-def _region(settings: DatasetSettings, displacement: FloatArray) -> tuple[float, float, float, float]:
-    """The stated rectangle, or the frame less the largest motion and a margin, on the body in every state.
-
-    Raises
-    ------
-    InputError
-        No rectangle about the middle of the frame stays in view; the user must state one.
-    """
-    if settings.region is not None:
-        return settings.region
-    height, width = displacement.shape[2:]
-    seen = np.asarray(np.isfinite(displacement[:, 0]).all(axis=0))
-    moved = np.abs(displacement[:, :, seen]).max(axis=(0, 2)) if seen.any() else np.zeros(2)
-    x, y = (math.ceil(motion) + MARGIN for motion in moved)
-    while 2 * x < width and 2 * y < height:
-        if seen[y : height - y, x : width - x].all():
-            return float(x), float(y), float(width - 1 - x), float(height - 1 - y)
-        x, y = x + 4, y + 4
-    raise InputError("the body leaves the middle of the frame: state output.region = [x0, y0, x1, y1]")
-
-
 def _test_settings(scene: Scene, settings: DatasetSettings, region: tuple[float, ...]) -> str:
-    """The text of test.toml."""
-    camera, suffix = scene.camera, _suffix(scene.camera, settings)
+    """Return the text of test.toml."""
+    camera = scene.camera
+    suffix = "dng" if camera.kind == "bayer" and settings.format == "dng" else "tif"
     path = ", ".join(f'"{folder}/*.{suffix}"' for folder in _folders(scene))
     lines = ["[frames]", f"path = [{path}]", f'kind = "{camera.kind}"']
     if suffix == "tif":
@@ -229,14 +190,8 @@ def _save(path: Path, **arrays: npt.ArrayLike) -> None:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
 
 
-EXPOSURES = tuple(0.13 * time for time in (0.5, 1, 2, 4, 6, 10))
-"""Share of the full scale that the brightest sample of a white card reaches, .13 per ms of the exposure times that
-calibration/README.md states; in the last it saturates."""
-_NO_LIGHT = Light(name="off", position=(0.0, 0.0, 0.0), power=0.0)
-
-
 def target_scene(scene: Scene, target: Target = "white") -> Scene:
-    """The same lights and camera before a flat mat target that fills the field at the body's front point."""
+    """Return the same lights and camera before a flat mat target that fills the field at the body's front point."""
     if target not in ("white", "speckled"):
         raise InputError(f"unknown target {target!r}; allowed are white, speckled")
     mat = Finish(albedo=0.8, gloss=0.0, slope_deg=0.0)
@@ -279,8 +234,9 @@ def dark_frames(camera: Camera, *, count: int = 3, seed: int) -> list[Frame]:
     """Frames with all lights off."""
     darkness = np.zeros((1, *camera.shape), dtype=np.float32)
     lightless = replace(camera, crosstalk=np.ones((camera.channels, 1)))
+    off = (Light(name="off", position=(0.0, 0.0, 0.0), power=0.0),)
     seeds = np.random.SeedSequence(seed).generate_state(count)
-    return [record(darkness, lightless, (_NO_LIGHT,), seed=int(s)) for s in seeds]
+    return [record(darkness, lightless, off, seed=int(s)) for s in seeds]
 
 
 def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]:
@@ -289,8 +245,8 @@ def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]
     brightest = float(np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images).max())
     steps = np.random.SeedSequence(seed).spawn(len(EXPOSURES))
     taken = []
-    for share, step in zip(EXPOSURES, steps, strict=True):
-        exposed = images * np.float32(share * scene.camera.full_scale / brightest)
+    for fraction, step in zip(EXPOSURES, steps, strict=True):
+        exposed = images * np.float32(fraction * scene.camera.full_scale / brightest)
         taken.append([record(exposed, scene.camera, scene.lights, seed=int(s)) for s in step.generate_state(count)])
     return taken
 
@@ -303,7 +259,7 @@ def check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int)
     scene
         Its lights and camera.
     images : ndarray, shape (k, H, W)
-        What each light alone gives.
+        Images of each light alone.
     count
         Frames of each kind.
     seed
@@ -327,14 +283,14 @@ def record(
     seed: int,
     on: Collection[str] | None = None,
 ) -> Mosaic | ChannelFrame:
-    """The raw frame that the camera takes.
+    """Return the raw frame that the camera takes.
 
     Electrons = Poisson(gain x signal) + normal(read noise); DN = round(electrons/gain + black), clipped at saturation.
 
     Parameters
     ----------
     images : (k, H, W)
-        What each light alone gives (`rgbmidic.lab.virtual.render`).
+        Images of each light alone (`rgbmidic.lab.virtual.render`).
     camera
         The camera.
     lights
@@ -347,44 +303,31 @@ def record(
     Returns
     -------
     Mosaic (Bayer camera) or ChannelFrame (3 channels, or 1 for a monochrome camera)
+
+    Raises
+    ------
+    InputError
+        Images that are not those of the lights, or a light that is not there.
     """
-    signal = _channel_signal(_lit(np.asarray(images), lights, on), camera, lights)
-    values = _expose(signal, camera, np.random.default_rng(seed))
-    black = np.array(float(camera.black_level))
-    if camera.kind == "bayer":
-        return Mosaic(values=values, cfa=camera.cfa, black_level=black, white_level=camera.white_level)
-    return ChannelFrame(values=values, black_level=black, white_level=camera.white_level)
-
-
-def _lit(
-    images: npt.NDArray[np.floating], lights: tuple[Light, ...], on: Collection[str] | None
-) -> npt.NDArray[np.floating]:
-    """The images with those of the lights that are off set to nothing."""
-    if images.ndim != 3 or len(images) != len(lights):
-        raise InputError(f"{len(lights)} lights give as many images (k, H, W), not an array of shape {images.shape}")
-    if on is None:
-        return images
+    signal = np.asarray(images)
+    if signal.ndim != 3 or len(signal) != len(lights):
+        raise InputError(f"{len(lights)} lights give as many images (k, H, W), not an array of shape {signal.shape}")
     names = [light.name for light in lights]
-    if unknown := set(on) - set(names):
-        raise InputError(f"no light {', '.join(sorted(unknown))}; there are {', '.join(names)}")
-    return np.asarray(images * np.array([name in on for name in names], dtype=images.dtype)[:, None, None])
-
-
-def _channel_signal(images: npt.NDArray[np.floating], camera: Camera, lights: tuple[Light, ...]) -> FloatImage:
-    """Noise-free DN above black: (H, W) behind a colour filter array, else (C, H, W)."""
-    matrix = camera.mixing(lights)
-    channels: FloatImage = np.einsum("cl,lyx->cyx", matrix.astype(np.float32), images.astype(np.float32, copy=False))
-    if camera.kind != "bayer":
-        return channels
-    mosaic = np.empty(channels.shape[1:], dtype=np.float32)
-    for (row, column), channel in np.ndenumerate(cfa_channels(camera.cfa)):
-        mosaic[row::2, column::2] = channels[channel, row::2, column::2]
-    return mosaic
-
-
-def _expose(signal: FloatImage, camera: Camera, generator: np.random.Generator) -> npt.NDArray[np.uint16]:
+    if on is not None:
+        if unknown := set(on) - set(names):
+            raise InputError(f"no light {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+        signal = signal * np.array([name in on for name in names], dtype=signal.dtype)[:, None, None]
+    mixing = camera.mixing(lights).astype(np.float32)
+    signal = np.einsum("cl,lyx->cyx", mixing, signal.astype(np.float32, copy=False))
+    if camera.kind == "bayer":
+        signal = mosaic_samples(signal, camera.cfa)
+    generator = np.random.default_rng(seed)
     electrons = generator.poisson(np.maximum(signal, 0) * camera.gain).astype(np.float64)
     if camera.read_noise > 0:
         electrons += generator.normal(scale=camera.read_noise, size=signal.shape)
     levels = np.rint(electrons / camera.gain + camera.black_level)
-    return np.clip(levels, 0, camera.white_level).astype(np.uint16)
+    values = np.clip(levels, 0, camera.white_level).astype(np.uint16)
+    black = np.array(float(camera.black_level))
+    if camera.kind == "bayer":
+        return Mosaic(values=values, cfa=camera.cfa, black_level=black, white_level=camera.white_level)
+    return ChannelFrame(values=values, black_level=black, white_level=camera.white_level)

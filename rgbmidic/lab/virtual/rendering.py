@@ -1,12 +1,14 @@
-"""Images of a scene: every pixel traced back to the paint, so that a deformed image is exact and never a warped one.
+"""Images of a scene, and ready-made scenes.
 
-Ready-made scenes: the reference sphere and plate on which rgbmidic's figures are measured, and the paper's bench.
+Every pixel is traced back to the paint, so that a deformed image is exact and never a warped one. The scenes are the
+sphere and the plate on which the figures of rgbmidic are measured, and the bench of the paper.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.special import erf
@@ -14,7 +16,7 @@ from scipy.special import erf
 from rgbmidic._kernels.render import trace_rows
 from rgbmidic.scene.camera import DISTANCE, NOMINAL_DISTANCE, PIXEL, Light, Vector, reference_camera, three_lights
 from rgbmidic.scene.scene import Plate, Scene, Sphere, State
-from rgbmidic.scene.surface import AffineField, Finish, InPlaneField, Surface, material_from_spatial
+from rgbmidic.scene.surface import AffineField, Finish, Surface, material_from_spatial
 from rgbmidic.scene.zones import intersect, truth
 from rgbmidic.typing import FloatArray, FloatImage
 
@@ -31,9 +33,9 @@ __all__ = [
 ]
 
 BAND = 64
-"""Pixel rows traced at a time: bounds the memory."""
+"""Pixel rows traced at a time: bounds the memory; the images do not depend on it."""
 LONGEST_STEP = 0.25
-"""Motion (px) between two of the poses over which a moving body is averaged."""
+"""Motion (px) between two of the poses over which a moving body is averaged: a quarter of the pixel's own aperture."""
 
 
 def samples_needed(scene: Scene) -> int:
@@ -54,7 +56,7 @@ def samples_needed(scene: Scene) -> int:
 
 
 def render(scene: Scene, state: State | None = None) -> FloatImage:
-    """What each light alone gives, without noise.
+    """Images of each light alone, without noise.
 
     Parameters
     ----------
@@ -68,24 +70,18 @@ def render(scene: Scene, state: State | None = None) -> FloatImage:
     ndarray, shape (k, H, W)
         DN above black in the channel that sees the light best, neither quantised nor clipped; 0 off the body.
     """
-    state = state or State()
-    poses = _poses_during_exposure(scene, state)
+    state, duration = state or State(), scene.camera.exposure_time
+    poses = [state]
+    if duration > 0 and state.moves:
+        # the middles of equal parts of the exposure, each shorter than `LONGEST_STEP` px of motion
+        swept = np.hypot(*truth(scene, state.after(duration / 2), state.after(-duration / 2)))
+        length = float(np.nanmax(swept, initial=0.0))
+        parts = max(1, math.ceil(length / LONGEST_STEP))
+        poses = [state.after(duration * ((i + 0.5) / parts - 0.5)) for i in range(parts)]
     out = _trace(scene, poses[0])
     for pose in poses[1:]:
         out += _trace(scene, pose)
     return out * np.float32(1 / len(poses))
-
-
-def _poses_during_exposure(scene: Scene, state: State) -> list[State]:
-    """States at the middles of equal parts of the exposure, each shorter than `LONGEST_STEP` px of motion."""
-    duration = scene.camera.exposure_time
-    if duration == 0 or not state.moves:
-        return [state]
-    swept = truth(scene, state.after(duration / 2), state.after(-duration / 2))
-    finite = np.isfinite(swept[0])
-    length = float(np.hypot(swept[0], swept[1])[finite].max()) if finite.any() else 0.0
-    parts = max(1, math.ceil(length / LONGEST_STEP))
-    return [state.after(duration * ((i + 0.5) / parts - 0.5)) for i in range(parts)]
 
 
 def _trace(scene: Scene, state: State) -> FloatImage:
@@ -110,7 +106,8 @@ def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> Fl
         [[*(turn.T @ (np.array(li.position) - origin)), li.power * NOMINAL_DISTANCE**2] for li in lights]
     )
     lens = np.array([camera.focal_px, *camera.centre, lights[0].magnification, *lights[0].shift])
-    affine = _affine(state.displacement)
+    field = AffineField() if state.displacement is None else state.displacement
+    affine = field.inverse() if isinstance(field, AffineField) else None
     pad, taps = _aperture(camera.lens_blur, n)
     height, width = camera.shape
     out = np.empty((len(lights), height, width), dtype=np.float32)
@@ -129,12 +126,6 @@ def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> Fl
         lines = rows.reshape(len(lights), -1, width)
         out[:, top:bottom] = sum(tap * lines[:, q : q + (bottom - top) * n : n] for q, tap in enumerate(taps))
     return out
-
-
-def _affine(field: InPlaneField | None) -> FloatArray | None:
-    """The inverse of an affine in-plane displacement; None for any other field."""
-    field = AffineField() if field is None else field
-    return field.inverse() if isinstance(field, AffineField) else None
 
 
 def _aperture(blur: float, samples: int) -> tuple[int, FloatArray]:
@@ -186,7 +177,7 @@ def sphere_scene(
     aberration: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **camera: object,
 ) -> Scene:
-    """The speckled 82.5 mm sphere under three coloured lamps; `turned` gives its states.
+    """Return the speckled 82.5 mm sphere under three coloured lamps; `turned` gives its states.
 
     Parameters
     ----------
@@ -202,6 +193,15 @@ def sphere_scene(
         Relative magnification of the lens in red, green and blue.
     **camera
         Changed settings of the camera (`Camera`), for instance ``cfa="GBRG"`` or ``kind="rgb"``.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        A setting that is not possible.
     """
     return Scene(
         body=Sphere(),
@@ -214,33 +214,37 @@ def sphere_scene(
 def plate_scene(
     *,
     size: int = 512,
-    seed: int = 0,
-    droplet: float = 0.23,
     gloss: float = 0.0,
     glare: str | None = None,
     tilt_deg: tuple[float, float] = (float(np.degrees(0.15)), 0.0),
-    aberration: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    **camera: object,
+    **settings: Any,
 ) -> Scene:
-    """A flat speckled plate under three coloured lamps; `strained_plate` gives its states.
+    """Return a flat speckled plate under three coloured lamps; `strained_plate` gives its states.
 
     Parameters
     ----------
+    size
+        Rows and columns (px).
     gloss
         0 (default): no reflection anywhere. With 1.5 the reference tilt brings green's reflection near the field.
     glare
         Name of a lamp to be moved, at its distance, to where its reflection covers the whole field.
     tilt_deg
         Tilt of the plate about y, then about x.
+    **settings
+        The other parameters of `sphere_scene`.
 
-    Other parameters as in `sphere_scene`.
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        A setting that is not possible, or no lamp of that name.
     """
-    scene = Scene(
-        body=Plate(width=200.0, height=200.0, centre=(0.0, 0.0, DISTANCE), tilt_deg=tilt_deg),
-        lights=three_lights(aberration=aberration),
-        camera=reference_camera((size, size), **camera),
-        surface=paint(droplet=droplet, gloss=gloss, seed=seed),
-    )
+    plate = Plate(width=200.0, height=200.0, centre=(0.0, 0.0, DISTANCE), tilt_deg=tilt_deg)
+    scene = replace(sphere_scene(size=size, gloss=gloss, **settings), body=plate)
     if glare is None:
         return scene
     lamp = scene.light(glare)
@@ -249,7 +253,7 @@ def plate_scene(
 
 
 def paper_scene(*, size: int = 1024, seed: int = 0, colour: bool = False, **camera: object) -> Scene:
-    """The bench of paper section 3.3: two white lamps in succession and a monochrome camera, or three colours at once.
+    """Return the bench of paper section 3.3: a monochrome camera and two white lamps in succession, or three colours.
 
     The lamps stand so far apart that, while the sphere turns from 0 to +14 degrees, the reflection of one never comes
     where the other's was (reflections at -305 and +207 px of the middle, moving by +181 px). The paint is that of
@@ -272,7 +276,7 @@ def paper_scene(*, size: int = 1024, seed: int = 0, colour: bool = False, **came
 
 
 def expose(scene: Scene, state: State | None = None, level: float = 0.97) -> Scene:
-    """The scene with an exposure that brings its brightest pixel, over all channels, to a fraction of full scale."""
+    """Return the scene with the exposure at which the brightest sample of all channels is a fraction of full scale."""
     images = render(scene, state)
     together = np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images)
     brightest = float((images if scene.camera.kind == "monochrome" else together).max())
@@ -281,20 +285,20 @@ def expose(scene: Scene, state: State | None = None, level: float = 0.97) -> Sce
 
 
 def _lamp_at(angle_deg: float, height_deg: float, distance: float = 550.0) -> Vector:
-    """A lamp seen from the front point under an angle from the optical axis, a little above (negative) or below it."""
+    """Return the place of a lamp at an angle from the optical axis, seen from the front point, and a height (down)."""
     angle, height = np.radians(angle_deg), np.radians(height_deg)
     x, z = distance * np.cos(height) * np.sin(angle), DISTANCE - distance * np.cos(height) * np.cos(angle)
     return float(x), float(distance * np.sin(height)), float(z)
 
 
 def turned(angle_deg: float) -> State:
-    """The body turned by an angle about the vertical through its front point (paper, section 2.1)."""
+    """Return the body turned by an angle about the vertical through its front point (paper, section 2.1)."""
     return State(angle_deg=angle_deg)
 
 
 def strained_plate(
     *, shift_px: tuple[float, float] = (0.25, 0.075), strain: float = 0.002, pixel: float = PIXEL
 ) -> State:
-    """A plate stretched by the same strain along x and y and shifted by about `shift_px` in the image."""
+    """Return a plate stretched by the same strain along x and y and shifted by about `shift_px` in the image."""
     offset = (shift_px[0] * pixel, shift_px[1] * pixel)
     return State(displacement=AffineField(gradient=((strain, 0.0), (0.0, strain)), offset=offset))

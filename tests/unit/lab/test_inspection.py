@@ -27,11 +27,11 @@ from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic.illumination.separate import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
-from rgbmidic.lab.inspection.prediction import expected_std
+from rgbmidic.lab.inspection.prediction import gaussian_field
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
-from rgbmidic.lab.inspection.samples import Channel, channels_of, gaussian_field, noise_estimate, speckle_texture
+from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.scene.forecast import node_constant
+from rgbmidic.scene.forecast import expected_std, node_constant
 
 Run = Callable[..., tuple[int, str, str]]
 SHAPE = (192, 192)

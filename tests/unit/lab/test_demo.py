@@ -1,4 +1,4 @@
-"""The measurement in small that compiles the kernels while the demonstration's frames are rendered."""
+"""The small measurements that compile the kernels while the demonstration's frames are rendered."""
 
 import subprocess
 import sys
@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from rgbmidic.lab.planning import plan as rehearsal
+from rgbmidic.lab import demo
 
 _REST = """
 import importlib, pkgutil, sys
 from pathlib import Path
 import rgbmidic._kernels
-from rgbmidic.lab.planning import plan as rehearsal
+from rgbmidic.lab import demo
 
 def kernels():
     names = [one.name for one in pkgutil.iter_modules(rgbmidic._kernels.__path__)]
@@ -21,7 +21,7 @@ def kernels():
     found = [getattr(value, "__wrapped__", value) for module in modules for value in vars(module).values()]
     return {(one.py_func.__name__, form) for one in found if hasattr(one, "py_func") for form in one.signatures}
 
-for part in rehearsal._PARTS.values():
+for part in demo._SMALL_MEASUREMENTS.values():
     part()
 before = kernels()
 from small_tests import colour_test
@@ -32,7 +32,7 @@ print(len(before), *sorted({name for name, _ in kernels() - before}))
 """
 
 
-def test_a_measurement_compiles_nothing_that_the_rehearsal_has_not(tmp_path):
+def test_a_measurement_compiles_nothing_that_the_small_measurements_have_not(tmp_path):
     """But for the renderer, which makes this test's frames."""
     tests = str(Path(__file__).parents[2])
     script = f"import sys; sys.path.insert(0, {tests!r})\n{_REST}"
@@ -42,12 +42,12 @@ def test_a_measurement_compiles_nothing_that_the_rehearsal_has_not(tmp_path):
     assert more == ["trace_rows"]
 
 
-def test_what_goes_wrong_meanwhile_ends_the_rehearsal(monkeypatch):
-    monkeypatch.setattr(rehearsal, "are_compiled", lambda: False)
+def test_what_goes_wrong_meanwhile_ends_the_compilation(monkeypatch):
+    monkeypatch.setattr(demo, "are_compiled", lambda: False)
     started = []
-    monkeypatch.setattr(rehearsal.subprocess, "Popen", _noting(started))
+    monkeypatch.setattr(demo.subprocess, "Popen", _noting(started))
     begun = time.monotonic()
-    with pytest.raises(KeyboardInterrupt), rehearsal.rehearsed():
+    with pytest.raises(KeyboardInterrupt), demo.kernels_compiled_meanwhile():
         raise KeyboardInterrupt
     assert len(started) == 2
     assert all(one.returncode != 0 for one in started)
@@ -55,9 +55,9 @@ def test_what_goes_wrong_meanwhile_ends_the_rehearsal(monkeypatch):
 
 
 def test_nothing_is_started_where_the_kernels_are_compiled(monkeypatch):
-    monkeypatch.setattr(rehearsal, "are_compiled", lambda: True)
-    monkeypatch.setattr(rehearsal.subprocess, "Popen", lambda *_, **__: pytest.fail("started"))
-    with rehearsal.rehearsed():
+    monkeypatch.setattr(demo, "are_compiled", lambda: True)
+    monkeypatch.setattr(demo.subprocess, "Popen", lambda *_, **__: pytest.fail("started"))
+    with demo.kernels_compiled_meanwhile():
         pass
 
 
