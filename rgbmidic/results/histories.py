@@ -282,7 +282,7 @@ def _read(
 
 
 def _in_units(
-    history: History, units: Units, clock: FloatArray, window: int, share: float, references: npt.NDArray[np.bool_]
+    history: History, units: Units, clock: FloatArray, window: int, fraction: float, references: npt.NDArray[np.bool_]
 ) -> Iterator[HistoryColumn]:
     """Convert a history to the reader's units; add its rates over a window of frames, at kinks those of both sides."""
     length = history.unit == "px"
@@ -291,7 +291,7 @@ def _in_units(
     if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
-    found = rates(clock, history.values, history.std, window=span, share=share, references=references)
+    found = rates(clock, history.values, history.std, window=span, common_fraction=fraction, references=references)
     for power, name in enumerate(("velocity", "acceleration") if length else ("velocity",), start=1):
         for side in ("", "_before", "_after"):
             values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")
