@@ -288,8 +288,8 @@ def frame_covariance(std: FloatArray, common_fraction: float, references: Sequen
     -------
     ndarray, shape (T, T, ...)
     """
-    variance, own = np.asarray(std, dtype=np.float64) ** 2, np.asarray(references, dtype=bool)
-    either, both = own[:, None] | own[None], own[:, None] & own[None]
+    variance, reference = np.asarray(std, dtype=np.float64) ** 2, np.asarray(references, dtype=bool)
+    either, both = reference[:, None] | reference[None], reference[:, None] & reference[None]
     count = round(1 / common_fraction) - 1
     factor = np.where(both, -1 / max(count - 1, 1), np.where(either, 0.0, common_fraction))
     np.fill_diagonal(factor, 1.0)

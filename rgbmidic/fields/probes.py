@@ -224,13 +224,13 @@ class StrainGauge:
         """Lay a gauge of a length around a point, px; an `InputError` where it is outside the region or too short."""
         gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
         nodes = np.unique(gauges.nodes)
-        own = replace(
+        reduced = replace(
             gauges,
             points=gauges.points[nodes],
             nodes=np.searchsorted(nodes, gauges.nodes),
             needed=gauges.needed[:, nodes],
         )
-        return cls(name=name, nodes=nodes, gauges=own, measure=measure)
+        return cls(name=name, nodes=nodes, gauges=reduced, measure=measure)
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute exx, eyy, exy, e1, e2, the direction of e1 and the von Mises equivalent."""
