@@ -129,7 +129,9 @@ def judge(signal: Signal, noise: float, draws: int, seed: int) -> list[str]:
     values = signal.value[:, None] + noise * random.normal(size=(len(signal.times), draws))
     own = np.where(known[:, None], values, np.nan)
     still: BoolArray = np.zeros(len(signal.times), dtype=bool)
-    found = rates(signal.times, own, np.full(own.shape, noise), window=WINDOW - 1.0, share=0.0, references=still)
+    found = rates(
+        signal.times, own, np.full(own.shape, noise), window=WINDOW - 1.0, common_fraction=0.0, references=still
+    )
     plain = fixed(signal.times, values, known)
     at_rest = signal.times <= (np.inf if signal.onset is None else signal.onset)
     if not (signal.velocity[at_rest] == 0).all():
@@ -177,11 +179,13 @@ def measure_time(nodes: int = 10_000, frames: int = 500) -> None:
     t = np.arange(frames, dtype=np.float64)
     still: BoolArray = t < 0
     noise = 0.01 * np.random.default_rng(0).normal(size=(frames, nodes))
-    rates(t, noise[:, :2], np.full((frames, 2), 0.01), window=WINDOW - 1.0, share=0.0, references=still)  # compiles
+    rates(
+        t, noise[:, :2], np.full((frames, 2), 0.01), window=WINDOW - 1.0, common_fraction=0.0, references=still
+    )  # compiles
     for name, motion in {"rest": 0 * t, "swing": 5 * np.sin(t / 6), "blows": 0.5 * np.abs(t % 80 - 40)}.items():
         values = noise + motion[:, None]
         start, wall = time.process_time(), time.perf_counter()
-        rates(t, values, np.full(values.shape, 0.01), window=WINDOW - 1.0, share=0.0, references=still)
+        rates(t, values, np.full(values.shape, 0.01), window=WINDOW - 1.0, common_fraction=0.0, references=still)
         seconds = time.process_time() - start
         print(f"{name}: {nodes} nodes, {frames} frames: {seconds:.3g} s CPU, {time.perf_counter() - wall:.3g} s")
 

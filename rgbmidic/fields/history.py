@@ -1,17 +1,14 @@
-"""Physical units of what a result states: millimetres through the image scale, seconds through the frames' times.
+"""Histories of probes: displacements of nodes over the frames, physical units, rates; and the paper's high-pass filter.
 
-What a probe takes, the displacements of some nodes over the frames, and what it gives: named histories.
+Velocity and acceleration where motion may set in at any frame come from local polynomials within the pieces of a
+series. A series is cut into pieces, each a polynomial of the times within its noise, which is known; all ways to cut it
+count by their probability (Fearnhead, Stat Comput 16, 2006). Around every frame polynomials are fitted to a window
+(Savitzky and Golay, Anal Chem 36, 1964) that does not leave the piece; the mean over pieces and degrees is the rate.
+Its uncertainty is that of the mean in noise, and the spread of what it was taken over (Hoeting et al, Stat Sci 14,
+1999). Times need not be even; frames that are lost or without data are left out. The noise of the reference, which all
+frames have in common, cancels.
 
-Velocity and acceleration where motion may set in at any frame: local polynomials within the pieces of a series.
-
-A series is cut into pieces, each a polynomial of the times within its noise, which is known; all ways to cut it count
-by their probability (Fearnhead, Stat Comput 16, 2006). Around every frame polynomials are fitted to a window (Savitzky
-and Golay, Anal Chem 36, 1964) that does not leave the piece; the mean over pieces and degrees is the rate. Its
-uncertainty is that of the mean in noise, and the spread of what it was taken over (Hoeting et al, Stat Sci 14, 1999).
-Times need not be even; frames that are lost or not measured are left out. What all frames share of the reference's
-noise cancels.
-
-The fine part of a displacement field: what a wide Gaussian filter takes out is taken off (paper, section 2.2).
+`high_pass` is the fine part of a displacement field (paper, section 2.2): the field less its wide Gaussian filter.
 """
 
 from __future__ import annotations
@@ -33,16 +30,28 @@ from rgbmidic.typing import BoolArray, FloatArray
 __all__ = ["SIGMA", "History", "Nodal", "Probe", "Rates", "Units", "column", "high_pass", "rates"]
 
 
+_WIDE = 1.01
+"""Windows are as wide as stated and 1 % more: cameras round time stamps, to 1 us at 10,000 frames a second."""
+_KINK = 4.0
+"""Standard uncertainties by which the rates of both sides differ at a kink: in noise once in 16,000 frames."""
+_EXACT = 1e-3
+"""Least noise of a value over the median one: a value that is stated without noise does not outweigh all others."""
+SIGMA = 40.0
+"""Standard deviation (px) of the paper's Gaussian filter."""
+_KNOWN = 1e-3
+"""Fraction of the filter's weight that must lie on measured pixels: single precision then holds the mean to 1e-4."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Units:
-    """In what a result is told; the store keeps px and frames.
+    """Units that a result is stated in; the store keeps px and frames.
 
     Attributes
     ----------
     mm_per_pixel
-        Millimetres on the specimen for a pixel; None where not known: lengths are told in px.
+        Millimetres on the specimen for a pixel; None where not known: lengths are stated in px.
     mm_per_pixel_std
-        Its standard uncertainty. It is a part of that of every length in mm, and the same factor in all of them.
+        Its standard uncertainty. It contributes to that of every length in mm, as the same factor in all of them.
     timed
         Whether the frames' times are known; else a frame is the unit of time.
     """
@@ -53,16 +62,25 @@ class Units:
 
     @classmethod
     def of(cls, scale: ScaleSettings, *, timed: bool) -> Self:
-        """As ``[scale]`` states them."""
+        """Take the scale from ``[scale]``."""
         return cls(mm_per_pixel=scale.mm_per_pixel, mm_per_pixel_std=scale.mm_per_pixel_std, timed=timed)
 
     @classmethod
     def from_points(
         cls, points: Sequence[Sequence[float]], length: float, *, length_std: float = 0.0, point_std: float = 0.5
     ) -> Self:
-        """The scale from two points (x, y) in px on an image and their distance in mm.
+        """Find the scale from two points on an image and their distance.
 
-        Along either axis a point is as uncertain as `point_std`: half a pixel where it is read off an image by eye.
+        Parameters
+        ----------
+        points : shape (2, 2)
+            Both points (x, y) in px.
+        length
+            Their distance in mm.
+        length_std
+            Its standard uncertainty in mm.
+        point_std
+            Standard uncertainty of a point along either axis in px: half a pixel where it is read off by eye.
 
         Raises
         ------
@@ -92,18 +110,18 @@ class Units:
         return "s" if self.timed else "frame"
 
     def per_time(self, unit: str, power: int = 1) -> str:
-        """A unit by the time or its square, such as ``"mm/s"``, ``"mm/s²"`` or, of no unit, ``"1/s"``."""
+        """Write a unit over the time or its square, such as ``"mm/s"``, ``"mm/s²"`` or, of no unit, ``"1/s"``."""
         return f"{unit or '1'}/{self.time}" + ("²" if power == 2 else "")
 
     def lengths(self, values: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Lengths and their standard uncertainty in px, or by time, in mm where the scale is known."""
+        """Convert lengths in px (or px over time) and their standard uncertainty to mm where the scale is known."""
         if self.mm_per_pixel is None:
             return values, std
         return self.mm_per_pixel * values, np.hypot(self.mm_per_pixel * std, self.mm_per_pixel_std * values)
 
 
 def column(name: str, unit: str) -> str:
-    """Name of a column with its unit in plain letters: `u` in ``"mm/s²"`` is ``"u_mm_per_s2"``."""
+    """Return the name of a column with its unit in plain letters: `u` in ``"mm/s²"`` is ``"u_mm_per_s2"``."""
     plain = unit.replace("²", "2")
     over, _, below = plain.partition("/")
     words = [part for part in ("" if over == "1" else over, f"per_{below}" if below else "") if part]
@@ -141,7 +159,7 @@ class History:
 
 
 class Probe(Protocol):
-    """What all probes can do.
+    """The interface of a probe, which measures one or more quantities over the frames.
 
     Attributes
     ----------
@@ -152,21 +170,15 @@ class Probe(Protocol):
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """First part of the names of its histories."""
 
     @property
-    def nodes(self) -> npt.NDArray[np.int64]: ...
+    def nodes(self) -> npt.NDArray[np.int64]:
+        """Nodes that it needs."""
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """What it reads, from the displacements of its `nodes`."""
-
-
-_WIDE = 1.01
-"""Windows are as wide as stated, and a per cent more: cameras' stamps are rounded."""
-_KINK = 4.0
-"""Standard uncertainties by which the rates of both sides differ at a kink: in noise once in 16,000 frames."""
-_EXACT = 1e-3
-"""Least noise of a value, as part of the median one: what is stated without noise does not outweigh all others."""
+        """Compute its histories from the displacements of its `nodes`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -202,7 +214,7 @@ class Rates:
 _POWERS = {"value": 0, "velocity": 1, "acceleration": 2} | {
     f"{name}_{side}": power for side in ("before", "after") for power, name in ((1, "velocity"), (2, "acceleration"))
 }
-"""What the kernel gives, in its order, and the power of the time that each is over."""
+"""Quantities in the order of the kernel, each with the power of the time in its denominator."""
 
 
 def rates(
@@ -211,10 +223,10 @@ def rates(
     std: npt.ArrayLike,
     *,
     window: float,
-    share: float,
+    common_fraction: float,
     references: Sequence[bool] | BoolArray,
 ) -> Rates:
-    """Value, velocity and acceleration of a quantity that is measured in every frame.
+    """Estimate value, velocity and acceleration of a quantity that is measured in every frame.
 
     Next to a change of the motion, and at both ends of the test, a window keeps its length and the polynomial is taken
     off its middle, with an uncertainty that is accordingly larger. No statement that holds for every motion is narrower
@@ -230,8 +242,8 @@ def rates(
     window
         Length of time that the fit of a parabola takes in, from the first to the last frame; those of degrees 3 and 4
         take in 4/3 and 5/3 of it.
-    share
-        Of the variance that the reference puts into all frames alike, `reference_fraction`.
+    common_fraction
+        Fraction of the variance that all frames have in common, that of the reference: `reference_fraction`.
     references : (T,), bool
         Which of the frames belong to the reference.
 
@@ -247,8 +259,8 @@ def rates(
         The times do not rise, shapes differ, or no window has enough frames.
     """
     when, what, error = (np.asarray(part, dtype=np.float64) for part in (times, values, std))
-    own = np.asarray(references, dtype=bool)
-    if not len(when) or what.shape != error.shape or len(when) != len(what) or len(own) != len(when):
+    references = np.asarray(references, dtype=bool)
+    if not len(when) or what.shape != error.shape or len(when) != len(what) or len(references) != len(when):
         raise InputError(f"rates need a time for each frame, not {when.shape} for values {what.shape}, {error.shape}")
     if not (np.diff(when) > 0).all():
         raise InputError("rates need the times of the frames to rise from each to the next")
@@ -261,9 +273,9 @@ def rates(
         )
     flat, spread = (np.ascontiguousarray(part.reshape(len(when), -1).T) for part in (what, error))
     scaled = (when - when[0]) / reach
-    noise, common = _noise(scaled, flat, spread, share, own)
+    noise, common = _noise(scaled, flat, spread, common_fraction, references)
     out = np.full((len(flat), 2, len(_POWERS), len(when)), np.nan)
-    weight = own / max(own.sum(), 1)
+    weight = references / max(references.sum(), 1)
     mean_rates(scaled, np.nan_to_num(flat), noise, common, weight, most, out)
     out[:, 1] = np.sqrt(np.maximum(out[:, 1], 0))
     out /= reach ** np.array(list(_POWERS.values()), dtype=np.float64)[:, None]
@@ -278,12 +290,12 @@ def rates(
 
 
 def _noise(
-    times: FloatArray, values: FloatArray, std: FloatArray, share: float, references: BoolArray
+    times: FloatArray, values: FloatArray, std: FloatArray, fraction: float, references: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Noise of each value that is its own (0: not known), and the variance that the reference adds to all (N, T).
+    """Split the uncertainty (N, T) into each value's own noise (0: not known) and the variance common to all frames.
 
-    As `frame_covariance` has it: frames share the reference's part of the smaller variance, here that of the least in
-    half a window to both sides. A frame of the reference has the noise of the others, and no other part.
+    As in `frame_covariance`, two frames have the reference's part of the smaller variance in common, here that of the
+    least in half a window to both sides. A frame of the reference has the noise of the others alone.
     """
     known = np.isfinite(values) & np.isfinite(std)
     variance = np.where(known, std, 0.0) ** 2
@@ -291,27 +303,21 @@ def _noise(
     first, last = np.searchsorted(times, times - 0.5), np.searchsorted(times, times + 0.5, side="right")
     least = np.stack([others[:, a:b].min(axis=1) for a, b in zip(first, last, strict=True)], axis=1)
     least = np.where(np.isfinite(least), least, others.min(axis=1, keepdims=True))
-    least = np.where(np.isfinite(least), least, variance / (1 - share))
-    noise = np.sqrt(np.where(references, (1 - share) * least, np.maximum(variance - share * least, 0)))
+    least = np.where(np.isfinite(least), least, variance / (1 - fraction))
+    noise = np.sqrt(np.where(references, (1 - fraction) * least, np.maximum(variance - fraction * least, 0)))
     middle, size = np.median(noise, axis=1), np.abs(np.nan_to_num(values)).max(axis=1)
     floor = np.where(middle > 0, _EXACT * middle, 1e-9 * size + np.finfo(float).tiny)
-    return np.where(known, np.maximum(noise, floor[:, None]), 0.0), share * least
-
-
-SIGMA = 40.0
-"""Standard deviation (px) of the paper's Gaussian filter."""
-_KNOWN = 1e-3
-"""Share of the filter's weight that must lie on measured pixels."""
+    return np.where(known, np.maximum(noise, floor[:, None]), 0.0), fraction * least
 
 
 def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
-    """A field (H, W) minus its copy filtered by a Gaussian: the paper's U tilde.
+    """Subtract from a field (H, W) its copy filtered by a Gaussian: the paper's U tilde.
 
     NaN pixels take no part: the filter is the normalised convolution, the sum of the measured pixels' values over the
     sum of their weights. At the edge of the measured region such a filter is lopsided and would leak the field's slope
-    into the result. The best quadratic polynomial is therefore taken off first and its own, exactly known, share
-    (a constant) put back: within the region the result is the plain filter's, and near the edge only what is
-    neither rotation, stretch nor bending of the whole field can leak.
+    into the result. The best quadratic polynomial is therefore subtracted first and its own high-pass
+    part, which is a constant and exactly known, added again: within the region the result is the plain filter's, and
+    near the edge only what is neither rotation, stretch nor bending of the whole field can leak.
 
     Parameters
     ----------
@@ -319,6 +325,11 @@ def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
         One component of the displacement (px).
     sigma
         Standard deviation of the Gaussian, px.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+        In px; NaN where the field is not measured.
 
     Raises
     ------
@@ -340,14 +351,14 @@ def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
 
 
 def _blur(image: FloatArray, sigma: float) -> FloatArray:
-    """Gaussian filter with zeros beyond the image, which the normalisation takes out."""
+    """Filter by a Gaussian with zeros beyond the image, which the normalisation corrects."""
     # what is filtered is small beside the displacement itself: single precision holds it to 1e-7 px
     filtered = cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(filtered, dtype=np.float64)
 
 
 def _quadratic_trend(values: FloatArray, known: BoolArray) -> tuple[FloatArray, float]:
-    """Least-squares polynomial of degree 2 in x and y (H, W), and its Laplacian."""
+    """Fit a polynomial of degree 2 in x and y (H, W) by least squares; return it and its Laplacian."""
     scale = float(max(values.shape))
     y, x = (axis / scale for axis in np.mgrid[: values.shape[0], : values.shape[1]])
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)

@@ -1,10 +1,8 @@
-"""Finite strain of a displacement gradient, its principal values and its uncertainty.
+"""Finite strain of a displacement gradient, its principal values and its uncertainty; and rigid motion.
 
 With the deformation gradient ``F = I + H`` and the stretch ``U = sqrt(F^T F)``: Green-Lagrange ``(U^2 - I) / 2``,
 Hencky ``ln U``, Biot ``U - I``, engineering (small strain) ``(H + H^T) / 2``. All are in the axes of the reference. The
-first three are functions of ``C = F^T F`` alone, hence blind to rotation, and have its eigenvectors.
-
-The motion of a body as a whole: what is left when it is taken off is deformation.
+first three are functions of ``C = F^T F`` alone, hence independent of rotation, and have its eigenvectors.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ _EQUIVALENT = np.array([[4 / 3, 2 / 3, 0], [2 / 3, 4 / 3, 0], [0, 0, 4 / 3]])
 """``e^T A e`` for the Hencky strain e = (exx, eyy, exy) is the square of the von Mises equivalent at constant volume:
 only there is constant volume ``e1 + e2 + e3 = 0``, so that the third principal strain is known."""
 EQUIVALENT = "von Mises equivalent of the Hencky strain, for a material of constant volume"
-"""What is said of the equivalent strain wherever it is stated."""
+"""Description of the equivalent strain wherever it is stated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,7 +73,7 @@ class Strain:
 
 
 def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: str = MEASURES[0]) -> Strain:
-    """Strain of displacement gradients and, to first order, its standard uncertainty.
+    """Compute the strain of displacement gradients and, to first order, its standard uncertainty.
 
     Parameters
     ----------
@@ -85,6 +83,11 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
         Of ``H`` row by row: du/dx, du/dy, dv/dx, dv/dy.
     measure
         One of `MEASURES`.
+
+    Returns
+    -------
+    Strain
+        Of the shape (...).
 
     Raises
     ------
@@ -100,11 +103,11 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
     covariances = [slope @ spread @ slope.transpose(0, 2, 1) for slope in (slopes, hencky[1])]
     with np.errstate(divide="ignore", invalid="ignore"):
         equivalent = _equivalent(_components(hencky[0]), covariances[1])
-    return _told(measure, tensor, covariances[0], equivalent, shape)
+    return _with_principal(measure, tensor, covariances[0], equivalent, shape)
 
 
 def _small(gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Small strain (n, 2, 2) and the derivative (n, 3, 4) of its exx, eyy, exy by the gradient."""
+    """Compute the small strain (n, 2, 2) and the derivative (n, 3, 4) of its exx, eyy, exy by the gradient."""
     slope = np.zeros((len(gradient), 3, 4))
     slope[:, 0, 0] = slope[:, 1, 3] = 1
     slope[:, 2, 1:3] = 0.5
@@ -112,7 +115,7 @@ def _small(gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function) -> tuple[FloatArray, FloatArray]:
-    """A function of C (n, 2, 2) and the derivative (n, 3, 4) of its xx, yy, xy by the gradient (Daleckii and Krein)."""
+    """Compute a function of C (n, 2, 2) and the derivative (n, 3, 4) of xx, yy, xy by H (Daleckii and Krein)."""
     f = np.eye(2) + gradient
     values, vectors = _eigen(f.transpose(0, 2, 1) @ f)
     values = np.maximum(values, np.finfo(float).tiny)
@@ -135,7 +138,7 @@ def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function
 
 
 def _eigen(tensor: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues (n, 2), the larger first, and eigenvectors (n, 2, 2) in columns; NaN for NaN."""
+    """Compute eigenvalues (n, 2), the larger first, and eigenvectors (n, 2, 2) in columns; NaN for NaN."""
     half, shear = (tensor[:, 0, 0] - tensor[:, 1, 1]) / 2, tensor[:, 0, 1]
     middle, radius, angle = half + tensor[:, 1, 1], np.hypot(half, shear), np.arctan2(shear, half) / 2
     c, s = np.cos(angle), np.sin(angle)
@@ -147,14 +150,14 @@ def _components(tensor: FloatArray) -> FloatArray:
     return np.stack([tensor[:, 0, 0], tensor[:, 1, 1], tensor[:, 0, 1]], axis=1)
 
 
-def _told(
+def _with_principal(
     measure: str,
     tensor: FloatArray,
     covariance: FloatArray,
     equivalent: tuple[FloatArray, FloatArray],
     shape: tuple[int, ...],
 ) -> Strain:
-    """All of a `Strain` from the tensor (n, 2, 2), the covariance (n, 3, 3) of exx, eyy, exy, and the equivalent."""
+    """Complete a `Strain` from the tensor (n, 2, 2), the covariance (n, 3, 3) of exx, eyy, exy, and the equivalent."""
     principal, vectors = _eigen(tensor)
     angle = np.degrees(np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
     c, s = vectors[:, 0, 0], vectors[:, 1, 0]
@@ -181,7 +184,7 @@ def _deviation(direction: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _equivalent(e: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The equivalent strain (n,) its uncertainty: of the first order where it is large, else what noise makes of 0."""
+    """Compute the equivalent strain (n,) and its uncertainty: first order where large, else that of noise alone."""
     square = np.einsum("na,ab,nb->n", e, _EQUIVALENT, e)
     noise = np.einsum("ab,nab->n", _EQUIVALENT, covariance)
     slope = e @ _EQUIVALENT
@@ -192,7 +195,7 @@ def _equivalent(e: FloatArray, covariance: FloatArray) -> tuple[FloatArray, Floa
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RigidMotion:
-    """Shift and rotation that come nearest to a displacement field, over its measured nodes.
+    """Shift and rotation that fit a displacement field best, by least squares over its measured nodes.
 
     Attributes
     ----------
@@ -214,7 +217,7 @@ class RigidMotion:
     def of(
         cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
     ) -> Self:
-        """Least squares over the measured nodes, for a rotation of any size (Kabsch, Acta Cryst A32, 1976).
+        """Fit shift and rotation of any size (Kabsch, Acta Cryst A32, 1976).
 
         Parameters
         ----------
@@ -255,9 +258,9 @@ class RigidMotion:
         )
 
     def removed(self, nodes: FloatArray, field: FloatArray) -> FloatArray:
-        """A displacement field as one sees it who moves with the body.
+        """Subtract the rigid motion from a displacement field: the field in axes that move with the body.
 
-        What is left of the displacements is turned back by the rotation, so that lengths and strains stay as they are.
+        The remaining displacements are rotated back, so that lengths and strains stay as they are.
 
         Parameters
         ----------
@@ -266,6 +269,11 @@ class RigidMotion:
         field : ndarray, shape (4, N)
             u, v and their standard uncertainty, px. That of the rigid motion itself is not added: it is the less, the
             more nodes there are.
+
+        Returns
+        -------
+        ndarray, shape (4, N)
+            As `field`.
         """
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         back = np.array([[c, s], [-s, c]])
@@ -274,6 +282,6 @@ class RigidMotion:
         return np.concatenate([left.T, np.sqrt(back**2 @ field[2:] ** 2)])
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Displacement (P, 2) in px of points (P, 2) by the rigid motion alone."""
+        """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone."""
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         return np.asarray((points - self.centre) @ (np.array([[c, -s], [s, c]]) - np.eye(2)).T + self.shift)

@@ -1,19 +1,14 @@
-"""Where points lie in a mesh: their element and their place in it.
-
-Nodal fields at pixels, and pixel fields at nodes.
-
-How the errors of neighbouring nodes go together, which means, gauges and strains need.
+"""Nodal fields: points in a mesh, fields between nodes and pixels, and the covariance of nodes and of frames.
 
 The solve is a least-squares fit of linear elements, whose covariance is the inverse of a Hessian: for a texture that is
 alike everywhere the inverse of the mesh's mass matrix. The displacement at a node is then that of a quadratic through
 the nodes around it, a linear function of theirs. Where the texture, the weights or the noise vary, the stated
-uncertainty of each node says by how much; its correlation with the others is taken as the mesh's alone.
+uncertainty of each node reports by how much; its correlation with the others is taken as the mesh's alone.
 
-What the frames of a test have in common: the noise of the reference, which cancels in differences and rates.
-
-The displacement of frame t has the error ``b_t - r``: what the frame's own noise makes of it, less the mean of the same
-for the n frames of the reference. With equal noise in all frames the variance stated for t is ``(1 + 1/n) Var(b)``, of
-which the share ``1 / (1 + n)`` is the reference's.
+The frames of a test have the noise of the reference in common, which cancels in differences and rates. The displacement
+of frame t has the error ``b_t - r``: that of the frame's own noise, less the mean of the same for the n frames of the
+reference. With equal noise in all frames the variance stated for t is ``(1 + 1/n) Var(b)``, of which the fraction
+``1 / (1 + n)`` is the reference's.
 """
 
 from __future__ import annotations
@@ -46,12 +41,16 @@ __all__ = [
 _CANDIDATES = 24
 """Elements nearest to a point among which its own is looked for: their sizes in one mesh differ by a factor of 2."""
 _EDGE = 1e-6
-"""How far outside an element, in barycentric coordinates, a point may be and still belong to it."""
+"""How far outside an element, in barycentric coordinates, a point may be and still belong to it: rounding, 1e-5 px."""
+_LOW, _HIGH = 0.5, 2.0
+"""Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
+_RINGS = 4
+"""Edges from a node up to which the inverse mass matrix is kept: what lies beyond is .8 % or less."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Places:
-    """Points in a mesh.
+    """Points in a mesh: their elements and barycentric coordinates.
 
     Attributes
     ----------
@@ -61,7 +60,7 @@ class Places:
         In px on the reference.
     inside : ndarray, shape (P,), bool
     element : ndarray, shape (P,), int
-        That holds the point, the nearest one for a point outside.
+        The element that holds the point, the nearest one for a point outside.
     barycentric : ndarray, shape (P, 3)
         Value of the shape functions of that element's nodes at the point.
     """
@@ -74,7 +73,7 @@ class Places:
 
     @classmethod
     def of(cls, mesh: Tri3Mesh, points: npt.ArrayLike) -> Self:
-        """Look for points (P, 2) in a mesh."""
+        """Find the elements of points (P, 2) in a mesh."""
         from scipy.spatial import cKDTree
 
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
@@ -103,22 +102,31 @@ class Places:
 
     @property
     def where(self) -> str:
-        """The region and its bounds, in words."""
+        """Text for messages with the bounds of the region."""
         (left, top), (right, bottom) = self.mesh.nodes.min(axis=0), self.mesh.nodes.max(axis=0)
         return f"the region that was measured, which lies within x {left:g} to {right:g}, y {top:g} to {bottom:g}"
 
     def mean(self) -> FloatArray:
-        """Weight (N,) of every node in the mean over the points that are inside."""
+        """Compute the weight (N,) of every node in the mean over the points that are inside."""
         nodes, weights = self.mesh.elements[self.element[self.inside]], self.barycentric[self.inside]
         sums = np.bincount(nodes.ravel(), weights=weights.ravel(), minlength=len(self.mesh.nodes))
         return np.asarray(sums / max(self.inside.sum(), 1))
 
 
 def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> FloatImage:
-    """A nodal field (N, 2) at the pixels of an image of `shape` (H, W), as curved as the nodes around say it is.
+    """Interpolate a nodal field at the pixels of an image, by quadratics through the nodes around each node.
 
-    Each node's quadratic counts as its shape function does. Linear between nodes that are right, a wave of 6 elements
-    would lose a tenth of its height; this one keeps .99, .95 at 4 and .83 at 3 elements.
+    Each node's quadratic is weighted by its shape function. Linear interpolation of exact nodal values would lose a
+    tenth of the height of a wave of 6 elements; this one keeps .99 of it, .95 at 4 and .83 at 3 elements.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    values : ndarray, shape (N, 2)
+        At the nodes; NaN where a node has no data.
+    shape
+        Rows and columns (H, W) of the image.
 
     Returns
     -------
@@ -133,7 +141,20 @@ def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> Flo
 
 
 def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
-    """A pixel field (C, H, W) at nodes (N, 2), bilinear; shape (N, C), NaN where a pixel used is NaN."""
+    """Interpolate a pixel field at nodes, bilinearly.
+
+    Parameters
+    ----------
+    field : ndarray, shape (C, H, W)
+        At the pixels.
+    nodes : ndarray, shape (N, 2)
+        Positions (x, y) in px; a node outside the image takes the value at its edge.
+
+    Returns
+    -------
+    ndarray, shape (N, C)
+        NaN where one of the four pixels around is NaN.
+    """
     height, width = field.shape[1:]
     x = np.clip(nodes[:, 0], 0, width - 1)
     y = np.clip(nodes[:, 1], 0, height - 1)
@@ -146,14 +167,16 @@ def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
 
 
 def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: float = 0.0) -> float:
-    """Root mean square difference, over pixels and components, of a nodal field (N, 2) and a pixel field (2, H, W).
+    """Compute the root mean square difference, over pixels and components, of a nodal field and a pixel field.
 
     Parameters
     ----------
-    mesh, values
-        The field; NaN nodes leave out their elements.
-    truth
-        NaN pixels are left out.
+    mesh
+        The mesh.
+    values : ndarray, shape (N, 2)
+        At its nodes; the elements of NaN nodes are left out.
+    truth : ndarray, shape (2, H, W)
+        At the pixels; NaN pixels are left out.
     border
         Width in px of the rim of the mesh's bounding box that is left out.
     """
@@ -166,15 +189,9 @@ def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: 
     return float(np.sqrt(np.mean(inner**2))) if inner.size else float("nan")
 
 
-_LOW, _HIGH = 0.5, 2.0
-"""Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
-_RINGS = 4
-"""Edges from a node up to which the inverse mass matrix is kept: what lies beyond is .8 % or less."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodalCovariance:
-    """Correlation of the error of one displacement component between the nodes of a mesh; u and v have none in common.
+    """Correlation of the errors of one displacement component between the nodes of a mesh; u and v are not correlated.
 
     Attributes
     ----------
@@ -189,7 +206,7 @@ class NodalCovariance:
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh) -> Self:
-        """Of the linear fit (the inverse mass matrix), carried through the recovery of the nodal values."""
+        """Propagate the covariance of the linear fit (inverse mass matrix) through the recovery of the nodal values."""
         mass = mass_matrix(mesh)
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
         inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale), _RINGS) @ scale
@@ -200,9 +217,18 @@ class NodalCovariance:
         return cls(mesh=mesh, correlation=sp.csr_matrix(unit @ whole @ unit))
 
     def variance(self, weights: FloatArray, std: FloatArray) -> FloatArray:
-        """Variance of the sum of nodal values by `weights` (..., N) where their standard uncertainty is `std` (..., N).
+        """Compute the variance of a weighted sum of nodal values.
 
-        Nodes of the weight 0 take no part, their uncertainty may be NaN.
+        Parameters
+        ----------
+        weights : ndarray, shape (..., N)
+            Of the nodes. Nodes of the weight 0 take no part, their uncertainty may be NaN.
+        std : ndarray, shape (..., N)
+            Standard uncertainty of the nodal values.
+
+        Returns
+        -------
+        ndarray, shape (...)
         """
         parts = np.where(weights != 0, np.asarray(weights) * np.asarray(std), 0.0)
         flat = np.atleast_2d(parts.reshape(-1, parts.shape[-1]))
@@ -210,7 +236,7 @@ class NodalCovariance:
         return np.asarray(np.maximum(total, 0)).reshape(parts.shape[:-1])
 
     def part(self, nodes: npt.NDArray[np.int64]) -> FloatArray:
-        """Correlation (m, m) of some nodes, given by their indices (m,)."""
+        """Extract the correlation (m, m) of some nodes, given by their indices (m,)."""
         chosen = sp.csr_matrix(
             (np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=(len(nodes), len(self.mesh.nodes))
         )
@@ -218,7 +244,7 @@ class NodalCovariance:
 
 
 def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int) -> sp.csr_matrix:
-    """Polynomial of `degree` in a matrix with eigenvalues in the bounds above that comes nearest to its inverse.
+    """Approximate the inverse of a matrix with eigenvalues in the bounds above by the best polynomial of a `degree`.
 
     Saad, Iterative methods for sparse linear systems, algorithm 12.1, on the unit matrix. Every such polynomial is
     positive within the bounds, so that no combination of nodes gets a negative variance.
@@ -236,24 +262,24 @@ def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int) -> sp.csr_matrix:
 
 
 def reference_fraction(count: int) -> float:
-    """Share of the variance of every frame that the mean of `count` reference frames puts into all of them alike."""
+    """Return the fraction of a frame's variance that comes from the mean of `count` reference frames, common to all."""
     return 1 / (1 + count)
 
 
-def frame_covariance(std: FloatArray, share: float, references: Sequence[bool] | BoolArray) -> FloatArray:
-    """Covariance between frames of a quantity that is measured in each.
+def frame_covariance(std: FloatArray, common_fraction: float, references: Sequence[bool] | BoolArray) -> FloatArray:
+    """Compute the covariance between frames of a quantity that is measured in each.
 
-    Two frames share the reference's part, ``share`` of the smaller of their variances: where one of them is less
-    certain, because it sees fewer lights or has changed more, what it has beyond the other is its own (the covariance
+    Two frames have the reference's part in common, `common_fraction` of the smaller of their variances: where one of
+    them is less certain, because it sees fewer lights or has changed more, the excess is independent (the covariance
     of an estimate with the best one is the variance of the best). A frame of the reference, whose own noise is a part
-    of the mean that is taken off, shares nothing with the others: the only one is 0 without uncertainty, n of them
-    are correlated by ``-1/(n - 1)``.
+    of the mean that is subtracted, has nothing in common with the others: the only one is 0 without uncertainty, n of
+    them are correlated by ``-1/(n - 1)``.
 
     Parameters
     ----------
     std : ndarray, shape (T, ...)
         Standard uncertainty in each frame.
-    share
+    common_fraction
         See `reference_fraction`.
     references : (T,), bool
         Which of the frames belong to the reference.
@@ -262,17 +288,25 @@ def frame_covariance(std: FloatArray, share: float, references: Sequence[bool] |
     -------
     ndarray, shape (T, T, ...)
     """
-    variance, own = np.asarray(std, dtype=np.float64) ** 2, np.asarray(references, dtype=bool)
-    either, both = own[:, None] | own[None], own[:, None] & own[None]
-    count = round(1 / share) - 1
-    factor = np.where(both, -1 / max(count - 1, 1), np.where(either, 0.0, share))
+    variance, reference = np.asarray(std, dtype=np.float64) ** 2, np.asarray(references, dtype=bool)
+    either, both = reference[:, None] | reference[None], reference[:, None] & reference[None]
+    count = round(1 / common_fraction) - 1
+    factor = np.where(both, -1 / max(count - 1, 1), np.where(either, 0.0, common_fraction))
     np.fill_diagonal(factor, 1.0)
     factor = factor.reshape(factor.shape + (1,) * (variance.ndim - 1))
     return np.asarray(factor * np.minimum(variance[:, None], variance[None]))
 
 
-def difference_std(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
-    """Standard uncertainty of a quantity's difference between two frames that are no reference, from that in each."""
+def difference_std(first: FloatArray, second: FloatArray, common_fraction: float) -> FloatArray:
+    """Compute the standard uncertainty of a quantity's difference between two frames that are no reference.
+
+    Parameters
+    ----------
+    first, second : ndarray
+        Standard uncertainty in either frame.
+    common_fraction
+        See `reference_fraction`.
+    """
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    shared = share * np.minimum(first, second) ** 2
+    shared = common_fraction * np.minimum(first, second) ** 2
     return np.asarray(np.sqrt(first**2 + second**2 - 2 * shared))

@@ -1,11 +1,8 @@
-"""Extensometers between two points, and virtual strain gauges, over the frames.
+"""Probes: displacement at points and over areas, extensometers between two points, and virtual strain gauges.
 
-Displacement at points, along lines and over areas, with the covariance between the nodes that it comes from.
-
-Probes: what is read off a displacement field at points, over areas, between two points, and over strain gauges.
-
-A probe knows the nodes that it needs; it takes the displacements of these in some frames and gives named histories with
-their standard uncertainty. All probes sit on the material: their places are those on the reference.
+A probe knows the nodes that it needs; it takes the displacements of these in some frames and returns named histories
+with their standard uncertainty, from the covariance between the nodes. All probes sit on the material: their places are
+those on the reference.
 """
 
 from __future__ import annotations
@@ -26,129 +23,10 @@ from rgbmidic.typing import FloatArray
 __all__ = ["PROBES", "Gauge", "Mean", "StrainGauge", "make_probe"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Gauge:
-    """An extensometer between two points: extension in px and strain, extension over length.
-
-    Attributes
-    ----------
-    ends : ndarray, shape (2, 2)
-        Both points, px.
-    difference
-        Of the displacements at both ends, as a mean whose weights add up to 0.
-    moving
-        Whether the length is that between the points as they move; else the extension along the line as it was.
-    """
-
-    name: str
-    ends: FloatArray
-    difference: Mean
-    moving: bool
-
-    @classmethod
-    def between(
-        cls,
-        covariance: NodalCovariance,
-        name: str,
-        x0: float,
-        y0: float,
-        x1: float,
-        y1: float,
-        *,
-        moving: bool = True,
-    ) -> Gauge:
-        """Between two points, px; an `InputError` where one is outside the region or both are the same."""
-        ends = np.array([[x0, y0], [x1, y1]], dtype=np.float64)
-        if not np.hypot(*(ends[1] - ends[0])) > 0:
-            raise InputError(f"{name} needs two different points, not ({x0:g}, {y0:g}) twice")
-        places = Places.of(covariance.mesh, ends)
-        places.check(name)
-        first, second = (Places.of(covariance.mesh, end).mean() for end in ends)
-        nodes = np.flatnonzero(second - first).astype(np.int64)
-        weights = (second - first)[nodes]
-        difference = Mean(name=name, nodes=nodes, weights=weights, correlation=covariance.part(nodes))
-        return cls(name=name, ends=ends, difference=difference, moving=moving)
-
-    @property
-    def nodes(self) -> npt.NDArray[np.int64]:
-        """The nodes around both points."""
-        return self.difference.nodes
-
-    @property
-    def length(self) -> float:
-        """On the reference, px."""
-        return float(np.hypot(*(self.ends[1] - self.ends[0])))
-
-    def histories(self, nodal: Nodal) -> list[History]:
-        """Extension in px and strain."""
-        d = self.difference
-        parts = [nodal.u, nodal.v]
-        apart = np.stack([part @ d.weights for part in parts], axis=1)
-        arm = self.ends[1] - self.ends[0]
-        now = arm + apart if self.moving else np.broadcast_to(arm, apart.shape)
-        towards = now / np.hypot(*now.T)[:, None]
-        extension = np.hypot(*now.T) - self.length if self.moving else (towards * apart).sum(axis=1)
-        spread = [
-            np.einsum("tm,tm->t", (d.weights * std) @ d.correlation, d.weights * std)
-            for std in (nodal.u_std, nodal.v_std)
-        ]
-        std = np.sqrt(np.maximum((towards**2 * np.stack(spread, axis=1)).sum(axis=1), 0))
-        return [
-            History(name=f"{self.name}_extension", unit="px", values=extension, std=std),
-            History(name=f"{self.name}_strain", unit="", values=extension / self.length, std=std / self.length),
-        ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StrainGauge:
-    """A virtual strain gauge: strain, principal strains with their direction, equivalent of the Hencky strain.
-
-    Attributes
-    ----------
-    gauges
-        One gauge, whose nodes count as in `nodes`.
-    measure
-        One of `rgbmidic.fields.MEASURES`.
-    """
-
-    name: str
-    nodes: npt.NDArray[np.int64]
-    gauges: StrainGauges
-    measure: str
-
-    @classmethod
-    def around(
-        cls, covariance: NodalCovariance, name: str, x: float, y: float, length: float, *, measure: str = MEASURES[0]
-    ) -> StrainGauge:
-        """Of a length, around a point, px; an `InputError` where it is outside the region or the gauge too short."""
-        gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
-        nodes = np.unique(gauges.nodes)
-        own = replace(
-            gauges,
-            points=gauges.points[nodes],
-            nodes=np.searchsorted(nodes, gauges.nodes),
-            needed=gauges.needed[:, nodes],
-        )
-        return cls(name=name, nodes=nodes, gauges=own, measure=measure)
-
-    def histories(self, nodal: Nodal) -> list[History]:
-        """exx, eyy, exy, e1, e2, the direction of e1 and the von Mises equivalent."""
-        rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
-        gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
-        s = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
-        values = [*s.components.T, *s.principal.T, s.direction_deg, s.equivalent]
-        stds = [*s.components_std.T, *s.principal_std.T, s.direction_std_deg, s.equivalent_std]
-        units = {"exx": "", "eyy": "", "exy": "", "e1": "", "e2": "", "direction": "deg", "equivalent": ""}
-        return [
-            History(name=f"{self.name}_{name}", unit=unit, values=value, std=std)
-            for (name, unit), value, std in zip(units.items(), values, stds, strict=True)
-        ]
-
-
 _LEAST = 0.5
-"""Least part of an area that must be measured for its mean to be told."""
+"""Least part of an area that must be measured for its mean to be stated: the larger part represents the whole."""
 _STEP = 1.0
-"""Distance in px of the points that stand for a line or an area."""
+"""Distance in px of the points that stand for a line or an area: an element of 10 px holds some 40."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -157,6 +35,8 @@ class Mean:
 
     Attributes
     ----------
+    name, nodes
+        See `Probe`.
     weights : ndarray, shape (m,)
         Of the nodes; their sum is 1.
     correlation : ndarray, shape (m, m)
@@ -181,14 +61,14 @@ class Mean:
 
     @classmethod
     def at_point(cls, covariance: NodalCovariance, name: str, x: float, y: float) -> Mean:
-        """At a point, px; an `InputError` where it is outside the region."""
+        """Take the displacement at a point, px; an `InputError` where it is outside the region."""
         places = Places.of(covariance.mesh, [[x, y]])
         places.check(name)
         return cls._of(name, covariance, places, 1.0)
 
     @classmethod
     def along_line(cls, covariance: NodalCovariance, name: str, x0: float, y0: float, x1: float, y1: float) -> Mean:
-        """Along the line between two points, px; an `InputError` where a part of it is outside the region."""
+        """Average along the line between two points, px; an `InputError` where a part of it is outside the region."""
         count = int(np.hypot(x1 - x0, y1 - y0) / _STEP) + 2
         places = Places.of(covariance.mesh, np.linspace((x0, y0), (x1, y1), count))
         places.check(name)
@@ -196,14 +76,14 @@ class Mean:
 
     @classmethod
     def over_circle(cls, covariance: NodalCovariance, name: str, x: float, y: float, radius: float) -> Mean:
-        """Over a circle, px, as far as it lies in the region; an `InputError` where less than half of it does."""
+        """Average over a circle, px, where it lies in the region; an `InputError` where less than half of it does."""
         grid = _grid((x - radius, y - radius, x + radius, y + radius))
         grid = grid[np.hypot(grid[:, 0] - x, grid[:, 1] - y) <= radius]
         return cls._over(covariance, name, grid)
 
     @classmethod
     def over_region(cls, covariance: NodalCovariance, name: str, x0: float, y0: float, x1: float, y1: float) -> Mean:
-        """Over a rectangle between two corners, px; errors as `over_circle`."""
+        """Average over a rectangle between two corners, px; errors as `over_circle`."""
         return cls._over(covariance, name, _grid((min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))))
 
     @classmethod
@@ -214,7 +94,7 @@ class Mean:
         return cls._of(name, covariance, places, _LEAST)
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """u and v in px."""
+        """Compute u and v in px."""
         (u, u_std), (v, v_std) = self.read(nodal)
         return [
             History(name=f"{self.name}_u", unit="px", values=u, std=u_std),
@@ -222,11 +102,11 @@ class Mean:
         ]
 
     def read(self, nodal: Nodal) -> list[tuple[FloatArray, FloatArray]]:
-        """u and v, each (T,), with their standard uncertainty."""
+        """Average u and v, each (T,), with their standard uncertainty."""
         known = np.isfinite(nodal.u + nodal.v + nodal.u_std + nodal.v_std)
-        share = known @ self.weights
-        enough = share >= self.least
-        weights = np.where(known, self.weights, 0) / np.where(enough, share, 1)[:, None]
+        measured = known @ self.weights
+        enough = measured >= self.least
+        weights = np.where(known, self.weights, 0) / np.where(enough, measured, 1)[:, None]
         found = []
         for values, std in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std)):
             mean = (weights * np.where(known, values, 0)).sum(axis=1)
@@ -237,7 +117,7 @@ class Mean:
 
 
 def _grid(box: tuple[float, float, float, float]) -> FloatArray:
-    """Points (P, 2) that stand for the cells of a rectangle."""
+    """Make the points (P, 2) that stand for the cells of a rectangle."""
     x0, y0, x1, y1 = box
     axes = []
     for low, high in ((x0, x1), (y0, y1)):
@@ -245,6 +125,125 @@ def _grid(box: tuple[float, float, float, float]) -> FloatArray:
         axes.append(low + (np.arange(count) + 0.5) * (high - low) / count)
     x, y = np.meshgrid(*axes)
     return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gauge:
+    """An extensometer between two points: extension in px and strain, extension over length.
+
+    Attributes
+    ----------
+    name
+        See `Probe`.
+    ends : ndarray, shape (2, 2)
+        Both points, px.
+    difference
+        Of the displacements at both ends, as a mean whose weights add up to 0.
+    moving
+        Whether the length is that between the points as they move; else the extension along the line as it was.
+    """
+
+    name: str
+    ends: FloatArray
+    difference: Mean
+    moving: bool
+
+    @classmethod
+    def between(cls, covariance: NodalCovariance, name: str, *place: float, moving: bool = True) -> Gauge:
+        """Lay a gauge between two points, x0, y0, x1, y1 in px.
+
+        Raises
+        ------
+        InputError
+            A point is outside the region, or both are the same.
+        """
+        ends = np.array(place, dtype=np.float64).reshape(2, 2)
+        if not np.hypot(*(ends[1] - ends[0])) > 0:
+            raise InputError(f"{name} needs two different points, not ({place[0]:g}, {place[1]:g}) twice")
+        places = Places.of(covariance.mesh, ends)
+        places.check(name)
+        first, second = (Places.of(covariance.mesh, end).mean() for end in ends)
+        nodes = np.flatnonzero(second - first).astype(np.int64)
+        weights = (second - first)[nodes]
+        difference = Mean(name=name, nodes=nodes, weights=weights, correlation=covariance.part(nodes))
+        return cls(name=name, ends=ends, difference=difference, moving=moving)
+
+    @property
+    def nodes(self) -> npt.NDArray[np.int64]:
+        """The nodes around both points."""
+        return self.difference.nodes
+
+    @property
+    def length(self) -> float:
+        """Distance of both points on the reference, px."""
+        return float(np.hypot(*(self.ends[1] - self.ends[0])))
+
+    def histories(self, nodal: Nodal) -> list[History]:
+        """Compute the extension in px and the strain."""
+        d = self.difference
+        parts = [nodal.u, nodal.v]
+        apart = np.stack([part @ d.weights for part in parts], axis=1)
+        arm = self.ends[1] - self.ends[0]
+        now = arm + apart if self.moving else np.broadcast_to(arm, apart.shape)
+        towards = now / np.hypot(*now.T)[:, None]
+        extension = np.hypot(*now.T) - self.length if self.moving else (towards * apart).sum(axis=1)
+        spread = [
+            np.einsum("tm,tm->t", (d.weights * std) @ d.correlation, d.weights * std)
+            for std in (nodal.u_std, nodal.v_std)
+        ]
+        std = np.sqrt(np.maximum((towards**2 * np.stack(spread, axis=1)).sum(axis=1), 0))
+        return [
+            History(name=f"{self.name}_extension", unit="px", values=extension, std=std),
+            History(name=f"{self.name}_strain", unit="", values=extension / self.length, std=std / self.length),
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StrainGauge:
+    """A virtual strain gauge: strain, principal strains with their direction, equivalent of the Hencky strain.
+
+    Attributes
+    ----------
+    name, nodes
+        See `Probe`.
+    gauges
+        One gauge, whose nodes count as in `nodes`.
+    measure
+        One of `rgbmidic.fields.MEASURES`.
+    """
+
+    name: str
+    nodes: npt.NDArray[np.int64]
+    gauges: StrainGauges
+    measure: str
+
+    @classmethod
+    def around(
+        cls, covariance: NodalCovariance, name: str, x: float, y: float, length: float, *, measure: str = MEASURES[0]
+    ) -> StrainGauge:
+        """Lay a gauge of a length around a point, px; an `InputError` where it is outside the region or too short."""
+        gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
+        nodes = np.unique(gauges.nodes)
+        reduced = replace(
+            gauges,
+            points=gauges.points[nodes],
+            nodes=np.searchsorted(nodes, gauges.nodes),
+            needed=gauges.needed[:, nodes],
+        )
+        return cls(name=name, nodes=nodes, gauges=reduced, measure=measure)
+
+    def histories(self, nodal: Nodal) -> list[History]:
+        """Compute exx, eyy, exy, e1, e2, the direction of e1 and the von Mises equivalent."""
+        rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
+        gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
+        s = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
+        values = [*s.components.T, *s.principal.T, s.direction_deg, s.equivalent]
+        stds = [*s.components_std.T, *s.principal_std.T, s.direction_std_deg, s.equivalent_std]
+        units = {"exx": "", "eyy": "", "exy": "", "e1": "", "e2": "", "direction": "deg", "equivalent": ""}
+        return [
+            History(name=f"{self.name}_{name}", unit=unit, values=value, std=std)
+            for (name, unit), value, std in zip(units.items(), values, stds, strict=True)
+        ]
 
 
 _Make = Callable[..., Probe]
@@ -261,7 +260,20 @@ PROBES: dict[str, tuple[int, _Make]] = {
 
 
 def make_probe(covariance: NodalCovariance, kind: str, number: int, place: Sequence[float], measure: str) -> Probe:
-    """The probe of a kind of `PROBES`, at a place in px, named by its kind and number.
+    """Make a probe, named by its kind and number.
+
+    Parameters
+    ----------
+    covariance
+        Of the mesh.
+    kind
+        One of `PROBES`.
+    number
+        Counted from 1 within the kind.
+    place
+        The numbers of `PROBES`, px.
+    measure
+        Strain measure of a strain gauge.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Strain over a virtual strain gauge: a plane is fitted to the displacements of the nodes around a place.
 
-Nothing is measured anew: gauges of any length follow from the stored displacements. The length of a virtual strain
+No new measurement is needed: gauges of any length follow from the stored displacements. The length of a virtual strain
 gauge is the diameter of a circle. A node stands for as much as an element is wide and counts by the part of that within
 the circle, so that, as in the iDICs good practice guide, the length is that of the window of points plus one of them.
 """
@@ -25,13 +25,13 @@ __all__ = ["SHORTEST", "StrainGauges", "shortest_gauge", "strain_of"]
 SHORTEST = 3.0
 """Length of the shortest gauge in elements: a node and those around it."""
 _ROUND = 0.9
-"""Share of it that will do: the sides of a mesh's elements are not quite what was asked for."""
+"""Fraction of it that will do: the sides of a mesh's elements differ by some percent from the size asked for."""
 _FLAT = 1e-2
 """Least ratio of the second moments of a gauge's nodes across and along it: below, they lie on a line."""
 
 
 def shortest_gauge(mesh: Tri3Mesh) -> float:
-    """Length in px of the shortest virtual strain gauge on a mesh."""
+    """Return the length in px of the shortest virtual strain gauge on a mesh."""
     return SHORTEST * mesh.size
 
 
@@ -46,7 +46,7 @@ def strain_of(
     gauge: float | None = None,
     measure: str = MEASURES[0],
 ) -> Strain:
-    """Strain at the nodes of a mesh from the displacements of one frame.
+    """Compute the strain at the nodes of a mesh from the displacements of one frame.
 
     For many frames or gauges make a `StrainGauges` once.
 
@@ -55,6 +55,7 @@ def strain_of(
     nodes : ndarray, shape (N, 2)
         In px on the reference.
     elements : ndarray, shape (E, 3)
+        Node indices.
     u, v, u_std, v_std : ndarray, shape (N,)
         In px; NaN where not measured.
     gauge
@@ -91,10 +92,10 @@ class StrainGauges:
     rows, nodes : ndarray, shape (M,), int
         Gauge and node of every pair of them: nodes within the gauge's circle that hang together in it, so that none
         lies across a crack or a hole.
-    shares : ndarray, shape (M,)
+    fractions : ndarray, shape (M,)
         Part of each node that is within the gauge's circle.
     needed : csr_matrix, shape (G, N)
-        Nodes that must be measured for a gauge to tell anything: the centre and those beside it.
+        Nodes that must have data, else the gauge has none: the centre and those beside it.
     whole : ndarray, shape (2, M)
         Weight of every node in the slopes along x and y where all are measured.
     inflation : ndarray, shape (G, 3)
@@ -106,20 +107,20 @@ class StrainGauges:
     points: FloatArray
     rows: npt.NDArray[np.int64]
     nodes: npt.NDArray[np.int64]
-    shares: FloatArray
+    fractions: FloatArray
     needed: sp.csr_matrix
     whole: FloatArray
     inflation: FloatArray
 
     @classmethod
     def at_nodes(cls, covariance: NodalCovariance, length: float | None = None) -> Self:
-        """A gauge around every node; errors as `strain_of`."""
+        """Lay a gauge around every node; errors as `strain_of`."""
         mesh = covariance.mesh
         return cls._around(covariance, mesh.nodes, length, _ring(mesh))
 
     @classmethod
     def at_points(cls, covariance: NodalCovariance, points: FloatArray, length: float | None = None) -> Self:
-        """Gauges around points (G, 2) within the mesh.
+        """Lay gauges around points (G, 2) within the mesh.
 
         Raises
         ------
@@ -154,7 +155,7 @@ class StrainGauges:
             points=mesh.nodes,
             rows=rows,
             nodes=pattern.indices.astype(np.int64),
-            shares=np.clip((length / 2 - away) / mesh.size, 0, 1),
+            fractions=np.clip((length / 2 - away) / mesh.size, 0, 1),
             needed=needed,
             whole=np.zeros((2, len(rows))),
             inflation=np.ones((len(centres), 3)),
@@ -162,7 +163,7 @@ class StrainGauges:
         return gauges._correlated(covariance.correlation)
 
     def _correlated(self, correlation: sp.csr_matrix) -> Self:
-        """The same with its weights, and the `inflation` by the correlation (N, N) between nodes of one uncertainty."""
+        """Add the weights, and the `inflation` by the correlation (N, N) between nodes of one uncertainty."""
         weights = self._weights(np.ones(len(self.points), dtype=bool))
         shape, row = (len(self.centres), len(self.points)), self.rows
         x, y = (sp.csr_matrix((weight, (row, self.nodes)), shape=shape) for weight in weights)
@@ -175,7 +176,20 @@ class StrainGauges:
     def gradient(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Displacement gradient (G, 2, 2) and its covariance (G, 4, 4), row by row; displacements (N,) in px."""
+        """Fit the planes to the displacements of one frame.
+
+        Parameters
+        ----------
+        u, v, u_std, v_std : ndarray, shape (N,)
+            In px; NaN where a node has no data.
+
+        Returns
+        -------
+        gradient : ndarray, shape (G, 2, 2)
+            ``H[c, d]``: derivative of the displacement c by the coordinate d.
+        covariance : ndarray, shape (G, 4, 4)
+            Of the gradient row by row.
+        """
         measured = np.isfinite(u + v + u_std + v_std)
         known = self.needed @ (~measured * 1.0) == 0
         weights = self.whole if measured.all() else self._weights(measured)
@@ -194,12 +208,12 @@ class StrainGauges:
     def strain(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray, *, measure: str = MEASURES[0]
     ) -> Strain:
-        """Strain of every gauge from the displacements (N,) of one frame; errors as `strain_of`."""
+        """Compute the strain of every gauge from the displacements (N,) of one frame; errors as `strain_of`."""
         return strain_of_gradient(*self.gradient(u, v, u_std, v_std), measure)
 
     def _weights(self, measured: BoolArray) -> FloatArray:
-        """Weight (2, M) of every node in the slopes along x and y of each gauge; NaN where its nodes lie on a line."""
-        use = measured[self.nodes] * self.shares
+        """Compute the weight (2, M) of every node in the slopes of each gauge; NaN where its nodes lie on a line."""
+        use = measured[self.nodes] * self.fractions
         arm = (self.points[self.nodes] - self.centres[self.rows]).T
         count = np.maximum(self._sum(use), np.finfo(float).tiny)
         x, y = (part - (self._sum(use * part) / count)[self.rows] for part in arm)
@@ -215,7 +229,7 @@ class StrainGauges:
 
 
 def _ring(mesh: Tri3Mesh) -> sp.csr_matrix:
-    """Every node with those that share an element with it, (N, N)."""
+    """Mark every node and those of the same elements, (N, N)."""
     i, j = mesh.neighbours.T
     count = len(mesh.nodes)
     edges = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
@@ -223,7 +237,7 @@ def _ring(mesh: Tri3Mesh) -> sp.csr_matrix:
 
 
 def _reach(mesh: Tri3Mesh, centres: FloatArray, radius: float, needed: sp.csr_matrix) -> sp.csr_matrix:
-    """Nodes (G, N) within `radius` px of each centre that are joined with it by edges inside the circle."""
+    """Find the nodes (G, N) within `radius` px of each centre that are joined with it by edges inside the circle."""
     from scipy.spatial import cKDTree
 
     near = cKDTree(centres).query_ball_tree(cKDTree(mesh.nodes), radius)

@@ -51,7 +51,7 @@ class _Frames(BackendArray):
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
 
     def _read(self, key: tuple[Any, ...]) -> Any:
-        """The part at an outer key (a whole number, a slice or an array for each axis)."""
+        """Read the part at an outer key: a whole number, a slice or an array for each axis."""
         frames = np.arange(len(self.result))[key[0]]
         inner = list(enumerate(key[1:]))[::-1]  # from the last axis: a whole number drops its axis
 
@@ -69,7 +69,7 @@ class _Frames(BackendArray):
 
 
 def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset:
-    """The Dataset that `Result.to_xarray` documents."""
+    """Make the Dataset that `Result.to_xarray` documents."""
     scale = scale_of(result) if scale is None else scale
     variables: dict[str, xr.Variable] = {}
     for name, entry in QUANTITIES.items():
@@ -101,8 +101,8 @@ def _attributes(entry: ResultQuantity) -> dict[str, Any]:
 
 
 def _coordinates(result: Result, scale: ScaleSettings) -> dict[str, xr.Variable]:
-    """Places in px and, where the scale is known, in mm; numbers, names and, where they are known, times of frames."""
-    own = {"to the right": result.nodes[:, 0], "down": result.nodes[:, 1]}
+    """Collect places in px and, where the scale is known, in mm; numbers, names and times of the frames."""
+    places = {"to the right": result.nodes[:, 0], "down": result.nodes[:, 1]}
     factors = {"px": 1.0} | ({} if scale.mm_per_pixel is None else {"mm": scale.mm_per_pixel})
     coordinates = {
         "frame": xr.Variable("frame", np.arange(len(result)), {"long_name": "place of the frame in the result"}),
@@ -113,7 +113,7 @@ def _coordinates(result: Result, scale: ScaleSettings) -> dict[str, xr.Variable]
     }
     coordinates |= {dimension: xr.Variable(dimension, list(parts)) for dimension, parts in _PARTS.values()}
     for unit, factor in factors.items():
-        for axis, (way, values) in zip("xy", own.items(), strict=True):
+        for axis, (way, values) in zip("xy", places.items(), strict=True):
             about = {"units": unit, "long_name": f"position of the node on the reference image, {way}"}
             coordinates[axis if unit == "px" else f"{axis}_{unit}"] = xr.Variable("node", factor * values, about)
     if (times := frame_times(result, scale)) is not None:
@@ -123,7 +123,7 @@ def _coordinates(result: Result, scale: ScaleSettings) -> dict[str, xr.Variable]
 
 
 def _provenance(result: Result, scale: ScaleSettings) -> dict[str, Any]:
-    """What a reader of the Dataset, or of a file that it is saved in, should know; plain numbers and texts."""
+    """Collect the attributes of the Dataset as plain numbers and texts, which a file can hold."""
     kept, places = result.provenance, {"references": list(result.provenance["references"])}
     facts = {name: kept[name] for name in ("created", "finished", "frame_rate", "exposure_ns") if kept.get(name)}
     if scale.mm_per_pixel is not None:

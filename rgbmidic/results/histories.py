@@ -217,14 +217,14 @@ def read_histories(
         made.append(make_probe(covariance, kind, counts[kind], place, probes.measure))
     clock = result.number[there].astype(np.float64) if times is None else times
     nodal, rigid, speed = _read(result, there, covariance, made, probes.rigid_motion, clock)
-    own = {probe.name: probe.histories(part) for probe, part in zip(made, nodal, strict=True)}
-    for name, histories in own.items():
+    by_probe = {probe.name: probe.histories(part) for probe, part in zip(made, nodal, strict=True)}
+    for name, histories in by_probe.items():
         if not any(np.isfinite(history.values).any() for history in histories):
             raise InputError(
                 f"{name} is measured in no frame of {result.path}: the nodes around it are not measured (node_status "
                 "says why); place it elsewhere"
             )
-    read = [*rigid, *(history for part in own.values() for history in part)]
+    read = [*rigid, *(history for part in by_probe.values() for history in part)]
     references = reference_frames(result)[there]
     quantities = [
         column
@@ -242,7 +242,7 @@ def read_histories(
         quantities=(*quantities, *beside, *stress),
         stress_strain=(strain, stress[0].name) if stress and strain else None,
         units=units,
-        remarks=tuple(_remarks(units, speed, exposure(result), there, own, beside)),
+        remarks=tuple(_remarks(units, speed, exposure(result), there, by_probe, beside)),
     )
 
 
@@ -268,9 +268,9 @@ def _read(
             motion = RigidMotion.of(covariance, *field)
             motions[row] = [*zip(motion.shift, motion.shift_std, strict=True), (motion.rotation, motion.rotation_std)]
             field = motion.removed(result.nodes, field) if rigid == "remove" else field
-        for own, probe in zip(kept, probes, strict=True):
-            own.append(field[:, probe.nodes])
-    stacked = [np.stack(own, axis=1) for own in kept]
+        for fields, probe in zip(kept, probes, strict=True):
+            fields.append(field[:, probe.nodes])
+    stacked = [np.stack(fields, axis=1) for fields in kept]
     nodal = [Nodal(u=part[0], v=part[1], u_std=part[2], v_std=part[3]) for part in stacked]
     motions[:, 2] = np.degrees(motions[:, 2])
     names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid != "none" else {}
@@ -282,7 +282,7 @@ def _read(
 
 
 def _in_units(
-    history: History, units: Units, clock: FloatArray, window: int, share: float, references: npt.NDArray[np.bool_]
+    history: History, units: Units, clock: FloatArray, window: int, fraction: float, references: npt.NDArray[np.bool_]
 ) -> Iterator[HistoryColumn]:
     """Convert a history to the reader's units; add its rates over a window of frames, at kinks those of both sides."""
     length = history.unit == "px"
@@ -291,7 +291,7 @@ def _in_units(
     if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
-    found = rates(clock, history.values, history.std, window=span, share=share, references=references)
+    found = rates(clock, history.values, history.std, window=span, common_fraction=fraction, references=references)
     for power, name in enumerate(("velocity", "acceleration") if length else ("velocity",), start=1):
         for side in ("", "_before", "_after"):
             values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")

@@ -54,7 +54,7 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _NEWTONS = {"N": 1.0, "kN": 1e3}
 _UNIT = re.compile(r".*[\s_(\[](kN|N)[)\]]?")
 _DIFFERENT = 0.01
-"""Relative difference of a stated frame rate from that of the frames' time stamps above which a warning says so: stamps
+"""Relative difference of a stated frame rate from that of the time stamps above which a warning names both: stamps
 in whole microseconds give the median interval of 10,000 frames per second to 1 %."""
 
 
@@ -224,7 +224,7 @@ class Channels:
         InputError
             There is none, more than one, or its name does not end in its unit.
         """
-        found = {own: _NEWTONS[unit[1]] for own in self.values if (unit := _UNIT.fullmatch(own))}
+        found = {channel: _NEWTONS[unit[1]] for channel in self.values if (unit := _UNIT.fullmatch(channel))}
         if name is None and len(found) == 1:
             return next(iter(found.items()))
         if name is None or name not in found:

@@ -218,7 +218,7 @@ def _number(file: Path) -> int:
 
 
 class ShardWriter:
-    """Appends records to a file of its own; a copy that is sent to another process opens another.
+    """Writer of records to a file that nobody else writes; a copy that is sent to another process opens another file.
 
     Parameters
     ----------
@@ -236,6 +236,7 @@ class ShardWriter:
         self._count = self._end = 0
 
     def __reduce__(self) -> tuple[type[ShardWriter], tuple[Path, RecordLayout, bytes]]:
+        """Send what the writer was made of; the open file stays here."""
         return ShardWriter, (self.folder, self.layout, self.run)
 
     def append(self, frame: int, record: FrameRecord) -> None:

@@ -32,7 +32,9 @@ def test_velocity_and_acceleration_are_as_far_off_as_they_say():
     still = np.zeros((1, *nodes.shape))
     measured = np.concatenate([still, np.stack([one.displacement for one in solutions])])
     std = np.concatenate([still, np.stack([one.displacement_std for one in solutions])])
-    found = rates(TIMES, measured, std, window=9e-3, share=reference_fraction(1), references=np.arange(FRAMES) == 0)
+    found = rates(
+        TIMES, measured, std, window=9e-3, common_fraction=reference_fraction(1), references=np.arange(FRAMES) == 0
+    )
     step = 1e-6
     before, now, after = (
         np.stack([motion(time + shift).displacement(nodes, SHAPE) for time in TIMES]) for shift in (-step, 0, step)

@@ -26,7 +26,7 @@ def noise(draws: int, references: int) -> np.ndarray:
 def measured(motion: np.ndarray, std: float, draws: int, seed: int) -> tuple[np.ndarray, Rates]:
     """Noisy draws (41, draws) of a motion over `EVEN` and their rates, windows of 7 frames."""
     values = motion[:, None] + std * np.random.default_rng(seed).normal(size=(41, draws))
-    return values, rates(EVEN, values, np.full(values.shape, std), window=6, share=0.0, references=NONE)
+    return values, rates(EVEN, values, np.full(values.shape, std), window=6, common_fraction=0.0, references=NONE)
 
 
 @pytest.mark.parametrize("power", [2, 3, 4])
@@ -34,7 +34,7 @@ def test_a_polynomial_comes_back_with_gaps_in_some_of_the_series(power):
     x = TIMES / 10
     values = np.stack([0.3 * x**power - 2 * x + 1, 5 - x], axis=1)
     values[[4, 5, 17], 1] = np.nan
-    found = rates(TIMES, values, np.full_like(values, 1e-4), window=8, share=0.5, references=FIRST)
+    found = rates(TIMES, values, np.full_like(values, 1e-4), window=8, common_fraction=0.5, references=FIRST)
     slope, bend = power * 0.3 * x ** (power - 1) - 2, power * (power - 1) * 0.3 * x ** (power - 2)
     line, still = -np.ones(30), np.zeros(30)
     truth = {"value": (0.3 * x**power - 2 * x + 1, 5 - x), "velocity": (slope, line), "acceleration": (bend, still)}
@@ -50,7 +50,7 @@ def test_at_rest_the_stated_uncertainty_holds_the_noise_and_leaves_the_reference
     references = np.arange(30) < count
     errors = noise(600, count)
     std = np.where(references, np.sqrt(1 - 1 / count), np.sqrt(1 + 1 / count))
-    options = {"window": 7.0, "share": reference_fraction(count), "references": references}
+    options = {"window": 7.0, "common_fraction": reference_fraction(count), "references": references}
     drawn = rates(TIMES, errors, np.broadcast_to(std[:, None], errors.shape), **options)
     for name in ("value", *NAMES):
         square = (getattr(drawn, name) / np.maximum(getattr(drawn, f"{name}_std"), 1e-9)) ** 2
@@ -109,7 +109,7 @@ def test_lost_frames_at_an_onset_make_no_motion_before_it():
     motion = 0.5 * np.maximum(EVEN - 20, 0)
     values = motion[:, None] + 0.01 * np.random.default_rng(8).normal(size=(41, 60))
     values[[6, 17, 18, 22, 23, 30]] = np.nan
-    found = rates(EVEN, values, np.full(values.shape, 0.01), window=6, share=0.0, references=NONE)
+    found = rates(EVEN, values, np.full(values.shape, 0.01), window=6, common_fraction=0.0, references=NONE)
     assert np.isfinite(found.velocity).all()
     assert np.abs(found.velocity / found.velocity_std)[:17].max() <= 6
     error = (found.velocity - np.where(EVEN > 20, 0.5, 0.0)[:, None]) / found.velocity_std
@@ -120,7 +120,7 @@ def test_rates_follow_the_units_and_forget_a_uniform_motion():
     motion = np.where(EVEN > 20, 0.1 * (EVEN - 20) ** 2, 0)
     values, found = measured(motion, 0.01, 3, 6)
     moved = 3 * values + (5 + 0.7 * EVEN)[:, None]
-    other = rates(EVEN / 1e5 + 7, moved, np.full(values.shape, 0.03), window=6e-5, share=0.0, references=NONE)
+    other = rates(EVEN / 1e5 + 7, moved, np.full(values.shape, 0.03), window=6e-5, common_fraction=0.0, references=NONE)
     np.testing.assert_allclose(other.velocity, (3 * found.velocity + 0.7) * 1e5, rtol=1e-6, atol=1)
     np.testing.assert_allclose(other.velocity_std, 3e5 * found.velocity_std, rtol=1e-5)
     np.testing.assert_allclose(other.acceleration, 3e10 * found.acceleration, rtol=1e-4, atol=1e5)
@@ -129,7 +129,7 @@ def test_rates_follow_the_units_and_forget_a_uniform_motion():
 def test_the_mean_over_pieces_is_that_of_the_naive_sum_over_all_cuts():
     times, random = TIMES[:11], np.random.default_rng(1)
     for values in (random.normal(size=11), 4.0 * np.maximum(np.arange(11) - 5, 0) + random.normal(size=11)):
-        found = rates(times, values, np.ones(11), window=3.5, share=0.0, references=np.zeros(11, dtype=bool))
+        found = rates(times, values, np.ones(11), window=3.5, common_fraction=0.0, references=np.zeros(11, dtype=bool))
         expected = np.array([naive_rate(times, values, place, 3.5 * 1.01) for place in range(11)])
         np.testing.assert_allclose(found.velocity, expected[:, 0], atol=2e-3)
         np.testing.assert_allclose(found.velocity_std, expected[:, 1], rtol=1e-2)
@@ -193,7 +193,7 @@ def test_a_frame_that_is_less_certain_keeps_its_excess_to_itself():
 def test_nothing_is_told_where_too_little_is_known():
     values = np.ones((30, 1))
     values[10:24] = np.nan
-    found = rates(TIMES, values, np.ones_like(values), window=6, share=0.5, references=FIRST)
+    found = rates(TIMES, values, np.ones_like(values), window=6, common_fraction=0.5, references=FIRST)
     assert np.isnan(found.velocity[14:20]).all()
     assert np.isfinite(found.velocity[:9]).all()
     assert np.isnan(found.value[-6:]).sum() == np.isnan(found.velocity_std[-6:]).sum()
@@ -209,4 +209,4 @@ def test_nothing_is_told_where_too_little_is_known():
 )
 def test_wrong_input_is_one_clear_line(times, window, words):
     with pytest.raises(InputError, match=words):
-        rates(times, np.zeros(30), np.ones(30), window=window, share=0.5, references=FIRST)
+        rates(times, np.zeros(30), np.ones(30), window=window, common_fraction=0.5, references=FIRST)

@@ -56,7 +56,7 @@ def ratios(
 def nodal_errors(test: NodalTest, window: float, measured: FloatArray) -> Iterator[tuple[str, FloatArray]]:
     """Displacement, velocity and acceleration at the nodes."""
     std = np.repeat(test.std[..., None], 2, axis=2)
-    found = rates(test.times, measured, std, window=window, share=SHARE, references=test.references)
+    found = rates(test.times, measured, std, window=window, common_fraction=SHARE, references=test.references)
     velocity, acceleration = true_rates(test)
     yield "displacement", (measured - test.truth)[1:] / std[1:]
     yield "velocity", (found.velocity - velocity) / found.velocity_std
@@ -83,7 +83,7 @@ def strain_errors(test: NodalTest, window: float, measured: FloatArray) -> Itera
     found, true = (np.stack([history.values for history in histories[:3]], axis=1) for histories in read)
     spread = np.stack([history.std for history in read[0][:3]], axis=1)
     yield "strain", (found - true)[1:] / spread[1:]
-    options = {"window": window, "share": SHARE, "references": test.references}
+    options = {"window": window, "common_fraction": SHARE, "references": test.references}
     rate, exact = (rates(test.times, one, spread, **options) for one in (found, true))
     yield "strain rate", (rate.velocity - exact.velocity) / rate.velocity_std
 
@@ -102,7 +102,7 @@ def test_rates_without_noise_are_those_of_the_motion(name):
     """What the polynomial cannot follow is less than its uncertainty in noise."""
     test, window = TESTS[name]
     std = np.repeat(test.std[..., None], 2, axis=2)
-    found = rates(test.times, test.truth, std, window=window, share=SHARE, references=test.references)
+    found = rates(test.times, test.truth, std, window=window, common_fraction=SHARE, references=test.references)
     velocity, acceleration = true_rates(test)
     inner = (test.times > test.times[0] + window / 2) & (test.times < test.times[-1] - window / 2)
     assert np.abs(found.velocity - velocity)[inner].max() < np.median(found.velocity_std)
