@@ -229,7 +229,7 @@ def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[
 
 
 def _chosen(settings: FrameSettings, count: int) -> range:
-    """Return the states that the settings choose.
+    """The states that the settings choose.
 
     Raises
     ------

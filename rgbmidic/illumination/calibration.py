@@ -2,11 +2,7 @@
 
 `rgbmidic-calibrate` writes the file, the main job reads it. Camera channels = A . lights (rows of A: camera channels,
 columns: lights), every column divided by its largest entry, so that a light's image is in grey levels of the channel
-that sees it best.
-
-The sections of a calibration file: plain JSON on one side, what they describe on the other.
-
-What reads raises KeyError, TypeError or ValueError where the file is damaged.
+that sees it best. What reads a section raises KeyError, TypeError or ValueError where the file is damaged.
 """
 
 from __future__ import annotations
@@ -118,7 +114,7 @@ class Calibration:
         )
 
     def cropped(self, origin: tuple[int, int] | None, shape: tuple[int, int]) -> Calibration:
-        """The calibration for frames that were cropped out of those it was made with.
+        """Return the calibration for frames that were cropped out of those it was made with.
 
         Parameters
         ----------
@@ -127,15 +123,24 @@ class Calibration:
         shape
             Their rows and columns.
 
+        Returns
+        -------
+        Calibration
+
         Raises
         ------
         CalibrationError
             They reach beyond the calibrated frame; or no origin is stated, they have another size, and the calibration
             depends on the place.
         """
-        whole = self._calibrated_shape()
+        crosstalk, registration, whole = self.crosstalk, self.registration, self.shape
+        field = crosstalk.field if crosstalk else None
+        if whole is None and field is not None:  # older files hold the shape of the captures only in what varies
+            whole = field.shape
+        elif whole is None and registration is not None:
+            whole = round(2 * registration.centre[1] + 1), round(2 * registration.centre[0] + 1)
         if origin is None:
-            if whole is None or whole == shape or not self._depends_on_place():
+            if whole is None or whole == shape or not (field or (registration and registration.depends_on_place)):
                 return self
             raise CalibrationError(
                 f"the calibration was made with frames of {_size(whole)} px and holds what varies over them; those of "
@@ -150,29 +155,24 @@ class Calibration:
             )
         return replace(
             self,
-            crosstalk=self.crosstalk and self.crosstalk.cropped(origin, shape),
-            registration=self.registration and self.registration.cropped(origin),
+            crosstalk=crosstalk and crosstalk.cropped(origin, shape),
+            registration=registration and registration.cropped(origin),
             cfa=self.cfa and shift_cfa(self.cfa, row, column),
             shape=shape,
         )
 
-    def _depends_on_place(self) -> bool:
-        return bool(
-            (self.registration and self.registration.depends_on_place) or (self.crosstalk and self.crosstalk.field)
-        )
-
-    def _calibrated_shape(self) -> tuple[int, int] | None:
-        """Rows and columns of the captures; older files tell them by what depends on the place only."""
-        if self.shape is None and self.crosstalk is not None and self.crosstalk.field is not None:
-            return self.crosstalk.field.shape
-        if self.shape is None and self.registration is not None:
-            x, y = self.registration.centre
-            return round(2 * y + 1), round(2 * x + 1)
-        return self.shape
-
     @classmethod
     def read(cls, path: Path | str) -> Calibration:
         """Read a calibration file.
+
+        Parameters
+        ----------
+        path
+            The file that `rgbmidic-calibrate` wrote.
+
+        Returns
+        -------
+        Calibration
 
         Raises
         ------
@@ -227,7 +227,7 @@ class Calibration:
         )
 
     def to_document(self) -> dict[str, Any]:
-        """The JSON document, as plain dictionaries, lists and numbers."""
+        """Return the JSON document, as plain dictionaries, lists and numbers."""
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION}
         camera: dict[str, Any] = {
             name: getattr(self, name) for name in ("kind", "cfa", "black_level", "white_level", "unevenness")
@@ -270,13 +270,15 @@ _LARGEST = 1e30
 
 
 def read_json(path: Path) -> Any:
-    """The document of a JSON file; OSError, ValueError or RecursionError where there is none."""
+    """Read the document of a JSON file; OSError, ValueError or RecursionError where there is none."""
     text = regular(path).read_text(encoding="utf-8")
-    return json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole_number)
+    return json.loads(
+        text, parse_constant=_number, parse_float=_number, parse_int=lambda text: int(text) if _number(text) else 0
+    )
 
 
 def read_crosstalk(section: dict[str, Any] | None) -> Crosstalk | None:
-    """The crosstalk of its section."""
+    """Return the crosstalk of its section."""
     if section is None:
         return None
     variation = read_section(section, "field")
@@ -297,7 +299,7 @@ def read_crosstalk(section: dict[str, Any] | None) -> Crosstalk | None:
 
 
 def crosstalk_document(crosstalk: Crosstalk) -> dict[str, Any]:
-    """The section of a crosstalk."""
+    """Return the section of a crosstalk."""
     document: dict[str, Any] = {
         "lights": list(crosstalk.lights),
         "matrix": crosstalk.matrix.tolist(),
@@ -317,7 +319,7 @@ def crosstalk_document(crosstalk: Crosstalk) -> dict[str, Any]:
 
 
 def read_registration(section: dict[str, Any] | None) -> Registration | None:
-    """The registration of its section."""
+    """Return the registration of its section."""
     if section is None:
         return None
     return Registration(
@@ -330,7 +332,7 @@ def read_registration(section: dict[str, Any] | None) -> Registration | None:
 
 
 def registration_document(registration: Registration) -> dict[str, Any]:
-    """The section of a registration."""
+    """Return the section of a registration."""
     return {
         "lights": list(registration.lights),
         "parameter_names": ["shift_x_px", "shift_y_px", "rotation_rad", "scale", "radial_at_radius"],
@@ -346,7 +348,7 @@ def _listed(values: FloatArray | None) -> Any:
 
 
 def read_section(document: dict[str, Any], name: str) -> dict[str, Any] | None:
-    """A section of the file, None where it is not there."""
+    """Return a section of the file, None where it is not there."""
     section = document.get(name)
     if section is not None and not isinstance(section, dict):
         raise ValueError(f"{name} must be a section of keys, not {section!r}")
@@ -360,20 +362,15 @@ def _names(lights: Any) -> tuple[str, ...]:
 
 
 def _number(text: str) -> float:
-    """A number of the file; JSON knows neither NaN nor infinity, and no figure of a camera is beyond `_LARGEST`."""
+    """Return a number of the file: JSON has no NaN nor infinity, and no figure of a camera is beyond `_LARGEST`."""
     value = float(text)
     if not abs(value) <= _LARGEST:
         raise ValueError(f"{text[:40]} is not a number of a calibration")
     return value
 
 
-def _whole_number(text: str) -> int:
-    _number(text)
-    return int(text)
-
-
 def read_positive(section: dict[str, Any], key: str) -> float:
-    """A positive number of a section."""
+    """Return a positive number of a section."""
     value = section[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
         raise ValueError(f"{key} must be a positive number, not {value!r}")
@@ -381,7 +378,7 @@ def read_positive(section: dict[str, Any], key: str) -> float:
 
 
 def read_level(camera: dict[str, Any], key: str) -> float | None:
-    """A grey level of the section of the camera; None where it is not stated."""
+    """Return a grey level of the section of the camera; None where it is not stated."""
     value = camera.get(key)
     if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
         raise ValueError(f"camera.{key} must be a number, not {value!r}")

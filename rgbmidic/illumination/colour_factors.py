@@ -1,4 +1,4 @@
-"""How each colour sees the common texture, block by block, from a single mosaic.
+"""Slope of each colour on the common texture, and what is channel-specific, block by block, from a single mosaic.
 
 A sample of camera channel c is ``m_c = mean_c + alpha_c a + e_c``. alpha_c, the slope on the common texture a, is
 smooth; e_c is what only this channel shows there, the erratic part of a reflection and camera noise. Low-passed to the
@@ -105,13 +105,13 @@ class ColourFactors:
         return np.asarray(self.slope * np.sqrt(1 + self.private))
 
     @property
-    def share(self) -> FloatArray:
-        """Share (3, h, w) of the common texture in each channel's variance, 0 to 1."""
+    def common_fraction(self) -> FloatArray:
+        """Fraction (3, h, w) of the common texture in each channel's variance, 0 to 1."""
         return np.asarray(1 / (1 + self.private))
 
 
 def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel | None) -> Moments:
-    """Local means, contrast and local moments of a mosaic.
+    """Return local means, contrast and local moments of a mosaic.
 
     Parameters
     ----------
@@ -120,7 +120,11 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     red
         Position of red in the 2x2 cell.
     noise
-        Camera noise; None counts it with what is private to a channel.
+        Camera noise; None: it counts as channel-specific.
+
+    Returns
+    -------
+    Moments
     """
     mean = local_means(values, red)
     contrast = np.empty_like(values)
@@ -140,7 +144,7 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
 
 
 def enlarged(grid: npt.NDArray[np.floating], block: int, shape: tuple[int, ...], step: int = 1) -> FloatImage:
-    """A grid (n, h, w) of blocks interpolated to every `step`-th pixel of a frame of `shape` (H, W)."""
+    """Interpolate a grid (n, h, w) of blocks to every `step`-th pixel of a frame of `shape` (H, W)."""
     wide = widened(grid, block, shape[1])[:, :, ::step]
     place = np.clip((np.arange(0, shape[0], step) + 0.5) / block - 0.5, 0, grid.shape[1] - 1)
     low = place.astype(np.intp)
@@ -152,7 +156,7 @@ def enlarged(grid: npt.NDArray[np.floating], block: int, shape: tuple[int, ...],
 
 
 def widened(grid: npt.NDArray[np.floating], block: int, columns: int) -> FloatImage:
-    """The rows of a grid (n, h, w) of blocks interpolated to the columns of a frame, (n, h, W)."""
+    """Interpolate the rows of a grid (n, h, w) of blocks to the columns of a frame, (n, h, W)."""
     out = np.empty((*grid.shape[:2], columns), dtype=np.float32)
     for layer, wide in zip(grid, out, strict=True):
         size = grid.shape[2] * block, grid.shape[1]
@@ -161,8 +165,10 @@ def widened(grid: npt.NDArray[np.floating], block: int, columns: int) -> FloatIm
 
 
 def of_mosaic(grid: npt.NDArray[np.floating], block: int, columns: int, red: tuple[int, int]) -> FloatImage:
-    """Of a grid (3, h, w) for each channel, the rows for even and for odd rows of a mosaic, (2, h, W): at each column
-    that of the channel sampled there."""
+    """Interpolate a grid (3, h, w) of the channels to the columns of a mosaic, for its even and odd rows, (2, h, W).
+
+    At each column it is the grid of the channel sampled there.
+    """
     wide = widened(grid, block, columns)
     out = np.empty((2, *wide.shape[1:]), dtype=np.float32)
     for row, column in np.ndindex(2, 2):
@@ -172,7 +178,7 @@ def of_mosaic(grid: npt.NDArray[np.floating], block: int, columns: int, red: tup
 
 
 def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
-    """Local mean (3, h, w) of each channel of a mosaic, NaN where not known, on a grid of `MEAN_BLOCK` px."""
+    """Return the local mean (3, h, w) of each channel of a mosaic, NaN if not known, on a grid of `MEAN_BLOCK` px."""
     sums = np.empty((8, *(-(-side // MEAN_BLOCK) for side in values.shape)), dtype=np.float32)
     kernels.block_sums(values, MEAN_BLOCK, sums)
     r, g, h, b = _planes(red)
@@ -181,13 +187,13 @@ def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
 
 
 def _planes(red: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Of red, of green in red rows, of green in blue rows and of blue the plane (`PLANE_PAIRS`)."""
+    """Return the planes (`PLANE_PAIRS`) of red, of green in red rows, of green in blue rows and of blue."""
     row, column = red
     return 2 * row + column, 2 * row + 1 - column, 2 - 2 * row + column, 3 - 2 * row - column
 
 
 def colour_moments(sums: FloatImage, red: tuple[int, int]) -> FloatImage:
-    """Moments of the colours (7, h, w) from those of the planes (10, h, w).
+    """Return the moments of the colours (7, h, w) from those of the planes (10, h, w).
 
     red², green², blue², red green, red blue, green blue, the greens averaged after multiplying, and the product of the
     two greens.
@@ -200,8 +206,10 @@ def colour_moments(sums: FloatImage, red: tuple[int, int]) -> FloatImage:
 
 
 def _smooth(sums: FloatImage, counts: FloatImage, sigma: float) -> FloatImage:
-    """Mean (n, h, w) in a Gaussian window (blocks) of sums over `counts` entries, (n, h, w) or (1, h, w); the overall
-    mean where none are."""
+    """Average sums over `counts` entries, (n, h, w) or (1, h, w), in a Gaussian window of `sigma` blocks.
+
+    Where no entries are, it is the overall mean.
+    """
 
     def blurred(grid: FloatImage) -> FloatImage:
         if (grid == grid[0, 0]).all():
@@ -219,7 +227,7 @@ def _smooth(sums: FloatImage, counts: FloatImage, sigma: float) -> FloatImage:
 
 
 def learn_texture(moments: Moments, *, samples: int = 80_000) -> TextureModel:
-    """The texture of a specimen from one mosaic; about `samples` pixels are looked at."""
+    """Learn the texture of a specimen from one mosaic; about `samples` pixels are looked at."""
     root = np.sqrt(moments.own)
     padded = scaled(moments, (1 / root).astype(np.float32), pad=0)
     local = np.stack([moments.shared[n] / (root[a] * root[b]) for n, (a, b) in enumerate(_PAIRS)])
@@ -235,7 +243,7 @@ def learn_texture(moments: Moments, *, samples: int = 80_000) -> TextureModel:
 
 
 def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None = None) -> FloatImage:
-    """Contrast times `scale` (3, h, w), mirrored by `pad` px; `width` asks for more columns, which are 0."""
+    """Return contrast times `scale` (3, h, w), mirrored by `pad` px; `width` asks for more columns, which are 0."""
     rows, columns = moments.contrast.shape
     out = np.empty((rows + 2 * pad, max(columns, width or 0) + 2 * pad), dtype=np.float32)
     kernels.scaled_contrast(moments.contrast, of_mosaic(scale, BLOCK, columns, moments.red), BLOCK, pad, out)
@@ -245,7 +253,7 @@ def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None =
 def colour_factors(
     moments: Moments, band: BandEnergy, crosstalk: FloatArray, *, coloured: float = 0.0
 ) -> ColourFactors:
-    """Slopes of the channels on the common texture and what is private to each.
+    """Return the slopes of the channels on the common texture and the channel-specific variances.
 
     Parameters
     ----------
@@ -257,6 +265,10 @@ def colour_factors(
         A in channels = A . lights: one light's sparkle is seen by all channels, which is taken out of their moments.
     coloured
         `TextureModel.private`: 1 for a specimen on which no colour shows the common texture alone.
+
+    Returns
+    -------
+    ColourFactors
     """
     energy = np.array([band.adjacent, band.diagonal, band.adjacent])[:, None, None]
     own = moments.own / band.own

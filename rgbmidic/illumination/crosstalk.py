@@ -1,10 +1,10 @@
-"""The crosstalk between lights and camera channels: ``channels = A @ lights``, everywhere alike or varying slowly.
+"""Crosstalk between lights and camera channels, ``channels = A @ lights``, and its forecast from spectra.
 
 A varies over the field where the light falls on the colour filters at an angle (wide lenses, microlenses). It is then
 ``A(x, y) = matrix + sum of coefficients x Legendre products``: the products average to zero over the field, so `matrix`
 stays the mean and whoever ignores the variation makes the smallest error.
 
-Spectra of lights and cameras, and the crosstalk that follows: A[c, l] = sum over wavelengths of S_c E_l.
+From the spectra of lights and camera follows ``A[c, l] = sum over wavelengths of S_c E_l``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["Crosstalk", "CrosstalkField", "Led", "Sensitivities", "legendre_prod
 
 
 def legendre_products(points: npt.ArrayLike, shape: tuple[int, int], order: int) -> FloatArray:
-    """Products of Legendre polynomials in x and y up to a total degree, on the field scaled to [-1, 1].
+    """Return products of Legendre polynomials in x and y up to a total degree, on the field scaled to [-1, 1].
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class CrosstalkField:
             object.__setattr__(self, "std", np.asarray(self.std, dtype=np.float64).reshape(values.shape))
 
     def departure(self, points: npt.ArrayLike) -> FloatArray:
-        """A(x, y) minus its mean at points (x, y), shape (..., C, k)."""
+        """Return A(x, y) minus its mean at points (x, y), shape (..., C, k)."""
         terms = legendre_products(points, self.shape, self.order)[..., 1:]
         return np.asarray(np.tensordot(terms, self.coefficients, axes=1))
 
@@ -159,7 +159,7 @@ class Crosstalk:
         return cls(matrix=np.eye(len(lights)), lights=lights)
 
     def cropped(self, origin: tuple[int, int], shape: tuple[int, int]) -> Crosstalk:
-        """The same crosstalk on frames of `shape` that begin at `origin` (column, row) of the calibrated ones.
+        """Return the crosstalk on frames of `shape` that begin at `origin` (column, row) of the calibrated ones.
 
         The lights keep their units, so that the largest entries of the new mean need not be 1; its uncertainty is that
         of the whole field's.
@@ -177,7 +177,7 @@ class Crosstalk:
         )
 
     def at(self, points: npt.ArrayLike) -> FloatArray:
-        """A at points (x, y) in px of shape (..., 2): shape (..., C, k)."""
+        """Return A at points (x, y) in px of shape (..., 2): shape (..., C, k)."""
         place = np.asarray(points, dtype=np.float64)
         if self.field is None:
             return np.broadcast_to(self.matrix, (*place.shape[:-1], *self.matrix.shape))
@@ -189,7 +189,7 @@ class Crosstalk:
         return np.asarray(np.linalg.pinv(self.matrix), dtype=np.float64)
 
     def unmixing_at(self, points: npt.ArrayLike) -> FloatArray:
-        """The (pseudo-)inverse of A at points (x, y) in px of shape (..., 2): shape (..., k, C)."""
+        """Return the (pseudo-)inverse of A at points (x, y) in px of shape (..., 2): shape (..., k, C)."""
         if self.field is None:
             return np.broadcast_to(self.unmixing, (*np.shape(points)[:-1], *self.unmixing.shape))
         return np.asarray(np.linalg.pinv(self.at(points)), dtype=np.float64)
@@ -243,7 +243,7 @@ class Led:
             raise InputError(f"an LED has its centre in 200 to 1200 nm and its width in 0 to 300 nm, not {self}")
 
     def power(self, wavelengths: FloatArray) -> FloatArray:
-        """Spectral power at the wavelengths (nm), of unit sum: equal spacing is assumed."""
+        """Return the spectral power at the wavelengths (nm), of unit sum: equal spacing is assumed."""
         g = np.exp(-(((wavelengths - self.centre) * HALF_MAXIMUM / self.width) ** 2))
         shape = (g + 2 * g**5) / 3
         if not shape.sum() > 0:
@@ -279,7 +279,7 @@ class Sensitivities:
 
     @classmethod
     def from_colour(cls, name: str) -> Sensitivities:
-        """A camera of colour-science (``colour.MSDS_CAMERA_SENSITIVITIES``), such as "Nikon 5100 (NPL)"."""
+        """Return a camera of colour-science (``colour.MSDS_CAMERA_SENSITIVITIES``), such as "Nikon 5100 (NPL)"."""
         import colour
 
         known = colour.MSDS_CAMERA_SENSITIVITIES
@@ -299,8 +299,16 @@ class Sensitivities:
         """
         path = Path(path)
         try:
-            rows = _read_json(path) if path.suffix.lower() == ".json" else _read_csv(path)
-            table = np.array(rows, dtype=float)
+            if path.suffix.lower() == ".json":
+                document: Any = json.loads(regular(path).read_text(encoding="utf-8"))
+                spectra = document["spectral_data"]["data"]["main"]
+                rows = [[float(key), *values] for key, values in spectra.items()]
+                table = np.array(sorted(rows), dtype=float)
+            else:
+                with regular(path).open(newline="", encoding="utf-8") as stream:
+                    cells = [row[:4] for row in csv.reader(stream) if row]
+                start = 0 if cells[0][0].replace(".", "", 1).isdigit() else 1
+                table = np.array(cells[start:], dtype=float)
             return cls(wavelengths=table[:, 0], values=table[:, 1:4].T)
         except FileNotFoundError:
             raise InputError(f"sensitivities file not found: {path}") from None
@@ -309,19 +317,19 @@ class Sensitivities:
 
 
 def spectral_response(sensitivities: Sensitivities, lights: tuple[Led, ...]) -> FloatArray:
-    """Response of each camera channel to each light of equal power, shape (3, k): sum of S_c E_l over wavelengths."""
+    """Return the response of each camera channel to each light of equal power.
+
+    Parameters
+    ----------
+    sensitivities
+        S_c of the camera.
+    lights
+        E_l, each of unit power.
+
+    Returns
+    -------
+    ndarray, shape (3, k)
+        Sum of S_c E_l over wavelengths.
+    """
     power = np.stack([light.power(sensitivities.wavelengths) for light in lights], axis=1)
     return sensitivities.values @ power
-
-
-def _read_json(path: Path) -> list[list[float]]:
-    document: Any = json.loads(regular(path).read_text(encoding="utf-8"))
-    spectra = document["spectral_data"]["data"]["main"]
-    return [[float(wavelength), *values] for wavelength, values in sorted(spectra.items(), key=lambda i: float(i[0]))]
-
-
-def _read_csv(path: Path) -> list[list[float]]:
-    with regular(path).open(newline="", encoding="utf-8") as stream:
-        rows = [row for row in csv.reader(stream) if row]
-    start = 0 if rows[0][0].replace(".", "", 1).isdigit() else 1
-    return [[float(value) for value in row[:4]] for row in rows[start:]]

@@ -347,7 +347,7 @@ def _predict(
     unknown = np.zeros(padded.shape, dtype=bool)
     if damaged:
         source = padded.copy()
-        fill_unknown(source, _per_tile(factors.share), *moments.red, pad, padded, unknown)
+        fill_unknown(source, _per_tile(factors.common_fraction), *moments.red, pad, padded, unknown)
     out = np.empty((len(mixing), rows, columns), dtype=np.float32)
     scale, mean = widened(spread, BLOCK, columns), widened(moments.mean, MEAN_BLOCK, columns)
     mixing = mixing.astype(np.float32)

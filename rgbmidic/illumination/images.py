@@ -1,9 +1,7 @@
-"""One image per illumination: what the demosaiced or 3-CCD channels become once the crosstalk is unmixed.
+"""Images of one mechanical state, one per light, and their division by the local mean.
 
-Local normalisation: each light's image divided by its local mean.
-
-A body that turns under fixed lights grows brighter or darker smoothly, and a reflection lifts the mean; dividing by
-the local mean leaves the texture, which is what moves with the surface.
+Lights and illuminations are the same. A body that turns under fixed lights grows brighter or darker smoothly, and a
+reflection lifts the mean; dividing by the local mean leaves the texture, which is what moves with the surface.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ class IlluminationImages:
     full_scale : float
         Grey level of a just saturated camera sample (DN above black).
     reflection : ndarray, shape (k, h, w), or None
-        What `reflection_index` tells, on a grid of blocks of 8 px.
+        What `reflection_index` interpolates, on a grid of blocks of 8 px.
     texture : TextureModel or None
         The speckle's autocorrelation as the separation took it: hand it on to the other frames of a test; None where
         the separation does not use it.
@@ -70,7 +68,18 @@ class IlluminationImages:
 
     @classmethod
     def in_succession(cls, frames: Sequence[LinearChannels], names: Sequence[str] = ()) -> IlluminationImages:
-        """Lights fired one after the other before a monochrome camera, from one frame (1, H, W) of each.
+        """Join lights fired one after the other before a monochrome camera, from one frame (1, H, W) of each.
+
+        Parameters
+        ----------
+        frames
+            One of each light.
+        names
+            The lights' names; by default they are numbered.
+
+        Returns
+        -------
+        IlluminationImages
 
         Raises
         ------
@@ -93,11 +102,20 @@ class IlluminationImages:
         )
 
     def reflection_index(self, step: int = 1, within: tuple[slice, slice] | None = None) -> FloatImage | None:
-        """Share of a light that is not diffuse, from a single frame, (k, H, W) at every `step`-th pixel, of all or
-        of the rows and columns `within`, which begin at whole multiples of 8.
+        """Return the fraction of a light that is not diffuse, from a single frame.
 
-        0 where its contrast is that of the light with the most contrast there, towards 1 in its reflection; None where
-        the separation does not tell.
+        Parameters
+        ----------
+        step
+            Distance in px of the pixels at which it is wanted.
+        within
+            Rows and columns, which begin at whole multiples of 8; None: all.
+
+        Returns
+        -------
+        ndarray, shape (k, H, W), or None
+            0 where a light's contrast is that of the light with the most contrast there, towards 1 in its reflection;
+            None where the separation does not give it.
         """
         from rgbmidic.illumination.colour_factors import BLOCK, enlarged  # reading a result takes no kernels
 
@@ -115,11 +133,11 @@ class IlluminationImages:
 
 
 DARK = 0.01
-"""A light whose local mean is below this share of the full scale does not see the surface there."""
+"""A light whose local mean is below this fraction of the full scale does not see the surface there."""
 _WIDE = 4.0
-"""Standard deviation (px) from which the mean is taken in an image of half the size."""
+"""Standard deviation (px) from which an image of half the size gives the mean: as good, at a sixth of the time."""
 _RESIZED = 1 / 4 + 2 / 3
-"""Variance (square px) that the mean of two pixels and the interpolation between such means add."""
+"""Variance (square px) that the mean of two pixels, 1/4, and the interpolation between such means, 2/3, add."""
 
 
 def normalise(images: FloatImage, sigma: float, full_scale: float) -> FloatImage:
@@ -133,6 +151,10 @@ def normalise(images: FloatImage, sigma: float, full_scale: float) -> FloatImage
         Standard deviation of the Gaussian window in px, several speckles wide.
     full_scale
         Grey level of a just saturated sample; sets what counts as dark (`DARK`).
+
+    Returns
+    -------
+    ndarray, shape (k, H, W), float32
 
     Raises
     ------
@@ -151,7 +173,7 @@ def normalise(images: FloatImage, sigma: float, full_scale: float) -> FloatImage
 
 
 def local_mean(image: FloatImage, sigma: float) -> FloatImage:
-    """Gaussian mean (H, W) of the finite pixels around each pixel; NaN where there is none."""
+    """Return the Gaussian mean (H, W) of the finite pixels around each pixel; NaN where there is none."""
     finite = np.isfinite(image)
     if finite.all():
         return _blur(image, sigma)
@@ -161,7 +183,7 @@ def local_mean(image: FloatImage, sigma: float) -> FloatImage:
 
 
 def _blur(image: FloatImage, sigma: float) -> FloatImage:
-    """Gaussian mean of an image (H, W)."""
+    """Return the Gaussian mean of an image (H, W)."""
     if sigma < _WIDE:
         return _gaussian(image, sigma)
     half = _half_blur(image, sigma)
@@ -169,7 +191,7 @@ def _blur(image: FloatImage, sigma: float) -> FloatImage:
 
 
 def _half_blur(image: FloatImage, sigma: float) -> FloatImage:
-    """Gaussian mean of each two rows, from an image of half the size: as good, at a sixth of the time."""
+    """Return the Gaussian mean of each two rows, from an image of half the size."""
     height, width = image.shape
     odd = height % 2, width % 2
     even = cv2.copyMakeBorder(image, 0, odd[0], 0, odd[1], cv2.BORDER_REPLICATE) if any(odd) else image

@@ -36,7 +36,7 @@ class NoiseModel:
     read_noise: float
 
     def variance(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-        """Variance (DN squared) of samples whose linearised values (DN above black) are `values`."""
+        """Return the variance (DN squared) of samples whose linearised values (DN above black) are `values`."""
         variance: npt.NDArray[np.floating] = self.read_noise**2 + np.maximum(values, 0) / self.gain
         return variance
 
@@ -92,6 +92,10 @@ def linearise(frame: Mosaic | ChannelFrame, noise: NoiseModel | None = None) -> 
         Raw frame; a `Mosaic` gives a `LinearMosaic`, a `ChannelFrame` gives `LinearChannels`.
     noise
         Camera noise for a `LinearMosaic` to carry along, whose separation uses it.
+
+    Returns
+    -------
+    LinearMosaic or LinearChannels
     """
     full_scale = frame.white_level - float(frame.black_level.mean())
     saturated = frame.values >= frame.white_level
@@ -129,7 +133,7 @@ class Quantity:
 
     @classmethod
     def unknown(cls, count: int) -> Quantity:
-        """Not measured, for `count` planes."""
+        """Return figures not measured, for `count` planes."""
         return cls(np.full(count, np.nan), np.full(count, np.nan))
 
 
@@ -206,7 +210,7 @@ class CameraNoise:
         return np.asarray(20 * np.log10(self.full_well.value / np.maximum(self.dark_noise.value, 1e-9)))
 
     def to_document(self) -> dict[str, Any]:
-        """Plain dictionaries, lists and numbers; NaN becomes null."""
+        """Return plain dictionaries, lists and numbers; NaN becomes null."""
         document: dict[str, Any] = {"planes": list(self.planes)}
         for entry in fields(self):
             if isinstance(quantity := getattr(self, entry.name), Quantity):
@@ -216,7 +220,7 @@ class CameraNoise:
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> CameraNoise:
-        """From what `to_document` gave; KeyError, TypeError or ValueError where it is damaged."""
+        """Build it from what `to_document` gave; KeyError, TypeError or ValueError where it is damaged."""
         quantities = {
             entry.name: _quantity(document[entry.name])
             for entry in fields(cls)

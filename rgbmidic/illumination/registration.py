@@ -24,7 +24,7 @@ PARAMETERS = ("shift_x", "shift_y", "rotation", "scale", "radial")
 
 
 def registration_basis(points: npt.ArrayLike, centre: tuple[float, float], radius: float) -> FloatArray:
-    """Displacement (M, 2, 5) at points (x, y) of shape (M, 2) per unit of each of the `PARAMETERS`."""
+    """Return the displacement (M, 2, 5) at points (x, y) of shape (M, 2) per unit of each of the `PARAMETERS`."""
     arm = np.asarray(points, dtype=np.float64) - np.asarray(centre)
     x, y = arm.T
     one, none = np.ones_like(x), np.zeros_like(x)
@@ -90,7 +90,7 @@ class Registration:
         return bool(self.parameters[:, 2:].any())
 
     def cropped(self, origin: tuple[int, int]) -> Registration:
-        """The same registration on frames that begin at the pixel `origin` (column, row) of the calibrated ones."""
+        """Return the registration on frames that begin at the pixel `origin` (column, row) of the calibrated ones."""
         return replace(self, centre=(self.centre[0] - origin[0], self.centre[1] - origin[1]))
 
     def displacement(self, points: npt.ArrayLike) -> FloatArray:
@@ -110,7 +110,7 @@ class Registration:
         return np.asarray(np.einsum("mdp,kp->kmd", basis, self.parameters))
 
     def displacement_std(self, points: npt.ArrayLike) -> FloatArray | None:
-        """Standard uncertainty (k, M, 2) in px of `displacement`; None where the covariance is not known."""
+        """Return the standard uncertainty (k, M, 2) in px of `displacement`; None where the covariance is not known."""
         if self.covariance is None:
             return None
         basis = self._basis(points)
@@ -124,6 +124,6 @@ class Registration:
 
 
 def frame_geometry(shape: tuple[int, int]) -> tuple[tuple[float, float], float]:
-    """Centre (x, y) and half diagonal in px of a frame of `shape` (rows, columns)."""
+    """Return centre (x, y) and half diagonal in px of a frame of `shape` (rows, columns)."""
     height, width = shape
     return ((width - 1) / 2, (height - 1) / 2), float(np.hypot(width, height) / 2)

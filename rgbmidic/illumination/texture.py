@@ -1,8 +1,8 @@
-"""The speckle's autocorrelation: what one sample of the paint tells of its neighbours.
+"""Autocorrelation of the speckle: a model, its fit to products of samples, and the speckle's size.
 
 A DIC speckle is black on white, so one texture a(x) is common to all lights. Its autocorrelation is read from products
 of samples of *different* colours, in which neither camera noise nor the sparkle of a reflection takes part, and is
-fitted by a sum of Gaussians with positive weights, which keeps it positive definite and tells its value at distance 0.
+fitted by a sum of Gaussians with positive weights, which keeps it positive definite and gives its value at distance 0.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["LAGS", "WHITE_ENERGY", "BandEnergy", "TextureModel", "fit_texture", 
 
 
 FARTHEST = 4.3
-"""Products farther apart (px) do not enter: they tell of the spacing of the speckles, not of their edges."""
+"""Products farther apart (px) do not enter: they depend on the spacing of the speckles, not on their edges."""
 LAGS = np.array(
     [(i, j) for i in range(5) for j in range(-4, 5) if (i, j) > (0, 0) and np.hypot(i, j) <= FARTHEST], dtype=np.int64
 )
@@ -34,7 +34,7 @@ NARROWEST = 0.6
 OFFSET_PENALTY = 0.05
 """Least-squares error (of products) that an offset of 1 costs; the true one is -0.02 to -0.15."""
 INDISTINCT = 0.02
-"""Share of its own in a colour's variance under which products do not tell whether it is coarse."""
+"""Channel-specific fraction of a colour's variance under which products do not show whether it is coarse."""
 WIDTHS: FloatArray = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
 COLOURED = 0.5
 """Below this mean correlation of any two colours they do not show the same texture."""
@@ -75,7 +75,7 @@ class TextureModel:
     offset : float
         c: what the removal of the local mean has taken away; not positive.
     private : float
-        Share (0 to 1) of what a colour shows of its own that is as coarse as the speckle: 0 for the sparkle of
+        Fraction (0 to 1) of the channel-specific component that is as coarse as the speckle: 0 for the sparkle of
         reflections, towards 1 for a coloured specimen.
     correlation : float
         Mean correlation of the two colours that agree best, about 1 for a black and white speckle.
@@ -93,26 +93,26 @@ class TextureModel:
             raise InputError(f"a texture needs weights >= 0 and widths > 0, equally many; given are {w} and {s}")
         if not (0 <= self.private <= 1 and self.offset <= 0 and abs(w.sum() + self.offset - 1) < 1e-6):
             raise InputError(
-                f"weights and offset of a texture sum to 1, its private share lies in 0 to 1; given are a sum of "
-                f"{w.sum() + self.offset} and {self.private}"
+                "weights and offset of a texture sum to 1, its channel-specific fraction lies in 0 to 1; given are a "
+                f"sum of {w.sum() + self.offset} and {self.private}"
             )
 
     @classmethod
     def of_speckle(cls, diameter: float) -> TextureModel:
-        """A texture of dark discs whose autocorrelation has about this full width at half maximum (px)."""
+        """Return a texture of dark discs whose autocorrelation has about this full width at half maximum (px)."""
         if not diameter > 0:
             raise InputError(f"the diameter of a speckle must be positive, not {diameter!r}")
         widths = np.maximum(np.array([0.26, 0.36, 0.51]) * diameter, NARROWEST)
         return cls(weights=(0.1, 0.3, 0.6), widths=tuple(widths.tolist()))
 
     def __call__(self, distance: npt.ArrayLike) -> FloatArray:
-        """C at distances in px."""
+        """Return C at distances in px."""
         r = np.asarray(distance, dtype=np.float64)[..., None]
         gaussians = np.exp(-0.5 * (r / np.asarray(self.widths)) ** 2)
         return np.asarray(gaussians @ np.asarray(self.weights) + self.offset)
 
     def spectrum(self, frequency: npt.ArrayLike) -> FloatArray:
-        """Power spectrum (px^2) at distances from frequency 0 in cycles per px, without the offset."""
+        """Return the power spectrum (px^2) at distances from frequency 0 in cycles per px, without the offset."""
         f = np.asarray(frequency, dtype=np.float64)[..., None]
         # a Gaussian's transform; of widths of 0.6 px and more hardly anything folds back
         widths = np.asarray(self.widths)
@@ -135,11 +135,11 @@ class TextureModel:
 
 @lru_cache(maxsize=64)
 def _band_energies(widths: tuple[float, ...]) -> FloatArray:
-    """Moments (M, 3) own, adjacent and diagonal of the low-passed planes for Gaussian autocorrelations."""
+    """Return the moments (M, 3) own, adjacent and diagonal of the low-passed planes for Gaussian autocorrelations."""
     taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
 
     def line(p: int, q: int) -> FloatArray:
-        """Along one axis, planes of parity p and q: Gaussians factorise."""
+        """Sum along one axis, over planes of parity p and q: Gaussians factorise."""
         apart = taps[p][1][:, None] - taps[q][1][None]
         gaussians = np.exp(-0.5 * (apart[None] / np.asarray(widths)[:, None, None]) ** 2)
         return np.asarray(np.einsum("i,mij,j->m", taps[p][0], gaussians, taps[q][0]))
@@ -149,7 +149,7 @@ def _band_energies(widths: tuple[float, ...]) -> FloatArray:
 
 
 def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, agreement: float) -> TextureModel:
-    """Texture from the products of samples at `LAGS`.
+    """Fit a texture to the products of samples at `LAGS`.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     if best < COLOURED:
         met = counts[:, :3] > 0
         r = np.broadcast_to(distance[:, None], met.shape)[met]
-        # one colour's samples are two pixels apart and tell nothing of what is finer
+        # one colour's samples are two pixels apart and show nothing of what is finer
         coarse = WIDTHS[WIDTHS > 1]
         return _mixture(r, sums[:, :3][met] / counts[:, :3][met], best, widths=coarse, private=1.0)
     pairs = counts[:, 3:] * correlations
@@ -187,7 +187,7 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     ratio = float(np.clip(agreement, finest, coarsest))
     fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
     model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, unit=unit, fine=fine)
-    return replace(model, private=_private_share(model, sums, counts, correlations))
+    return replace(model, private=_coarse_fraction(model, sums, counts, correlations))
 
 
 def _mixture(
@@ -200,7 +200,7 @@ def _mixture(
     fine: FloatArray | None = None,
     private: float = 0.0,
 ) -> TextureModel:
-    """Weights w >= 0 and offset c <= 0 of a texture, by least squares.
+    """Fit weights w >= 0 and offset c <= 0 of a texture by least squares.
 
     ``sum w g(r) + c = product`` up to a factor, or, with `unit` (R, M) and `fine` (M + 1,),
     ``sum w (g(r) - product unit) + c (1 - product) = 0`` with ``sum w + c = 1`` and ``fine . (w, -c) = 0``.
@@ -213,7 +213,7 @@ def _mixture(
     else:
         system = np.column_stack([gaussians - product[:, None] * unit, product - 1]) * importance[:, None]
         sum_to_one = np.append(np.ones(len(widths)), -1.0)
-        # short distances tell a constant badly from a wide Gaussian
+        # short distances hardly distinguish a constant from a wide Gaussian
         small_offset = np.append(np.zeros(len(widths)), OFFSET_PENALTY)
         system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
         wanted = np.concatenate([np.zeros(r.size), [1e3, 0.0, 0.0]])
@@ -232,20 +232,20 @@ def _mixture(
     )
 
 
-def _private_share(model: TextureModel, sums: FloatArray, counts: FloatArray, correlations: FloatArray) -> float:
-    """How much of what the colours show of their own is as coarse as the speckle, from products two pixels apart."""
+def _coarse_fraction(model: TextureModel, sums: FloatArray, counts: FloatArray, correlations: FloatArray) -> float:
+    """Return the fraction of the channel-specific component as coarse as the speckle, from products 2 px apart."""
     apart = np.abs(LAGS)
     two = (apart.max(axis=1) == 2) & (apart.min(axis=1) == 0) & (counts[:, :3] > 0).all(axis=1)
     band = model.band
     measured = (sums[two, :3].sum(axis=0) / counts[two, :3].sum(axis=0)).mean()
     common = np.clip(correlations / (np.array([band.adjacent, band.diagonal, band.adjacent]) / band.own), 0, 1).mean()
-    # how much of the colours' own share is still seen two pixels away, shrunk to 0 where that share is nearly nothing
+    # what of the channel-specific fraction is still seen two pixels away, shrunk to 0 where that is nearly nothing
     coarse = measured / max(float(model(2.0)) / band.own, 1e-3) - common
     return float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + INDISTINCT**2), 0, 1))
 
 
 def speckle_diameter(picture: FloatArray) -> float | None:
-    """Size of the speckle in a picture, without the peak that white noise has at distance 0.
+    """Return the size of the speckle in a picture, without the peak that white noise has at distance 0.
 
     Parameters
     ----------
@@ -267,17 +267,11 @@ def speckle_diameter(picture: FloatArray) -> float | None:
     product, distance = (np.bincount(ring, part.ravel()) / np.bincount(ring) for part in (mean, away))
     if not (len(product) > 2 and product[0] > 0):
         return None
-    product[0] = _without_noise(product, distance)
+    if product[1] > product[2] > 0:  # at 0 a Gaussian through the next two, without the peak of white noise there
+        fall = np.log(product[1] / product[2]) / (distance[2] ** 2 - distance[1] ** 2)
+        product[0] = min(product[1] * np.exp(fall * distance[1] ** 2), product[0])
     below = np.flatnonzero(product < 0.5 * product[0])
     if not below.size:
         return None
     ends = slice(below[0], below[0] - 2 if below[0] > 1 else None, -1)
     return float(2 * np.interp(0.5 * product[0], product[ends], distance[ends]))
-
-
-def _without_noise(product: FloatArray, distance: FloatArray) -> float:
-    """The autocorrelation at distance 0 without the peak of white noise there: a Gaussian through the next two."""
-    if not (product[1] > product[2] > 0):
-        return float(product[0])
-    fall = np.log(product[1] / product[2]) / (distance[2] ** 2 - distance[1] ** 2)
-    return float(min(product[1] * np.exp(fall * distance[1] ** 2), product[0]))
