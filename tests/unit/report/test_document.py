@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.report import document, remove_report, style, write_report
-from rgbmidic.report import setup as facts
+from rgbmidic.report import document, remove_report, setup, style, write_report
 from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SetupSettings, TestSettings
@@ -93,7 +92,7 @@ def still(index: int, noise: float, **values: Any) -> FrameRecord:
 
 def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(document, "embedded", lambda figure: style.embedded(figure, dpi=40))  # coarse: for the time
-    for name in ("brightness", "convergence", "map", "residual", "share"):  # have tests of their own
+    for name in ("brightness", "convergence", "map", "residual", "fraction"):  # have tests of their own
         monkeypatch.setattr(document.figures, f"{name}_figure", lambda *_: Figure(facecolor="red"))
     image = np.random.default_rng(0).normal(1000, 100, (3, 80, 120))
     probes = ProbeSettings(points=((60.0, 40.0),))
@@ -224,7 +223,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
     frames = FrameSettings(path=("a",), reference=tuple(range(count)))
     stated = TestSettings(frames=frames, region=RegionSettings(rectangle=(0, 0, 9, 9)))
     origin = {"references": range(count), "settings": stated}
-    floor = facts.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
+    floor = setup.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
     assert floor is not None
     assert floor.count == count
     accuracy = 4 / np.sqrt(2 * (count - 1) * NODES)
@@ -233,7 +232,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
 
 
 def test_one_static_frame_tells_no_noise(tmp_path: Path) -> None:
-    assert facts.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
+    assert setup.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
@@ -243,5 +242,5 @@ def test_speckle_size_is_the_width_of_the_autocorrelation(tmp_path: Path, sigma:
     white, more = np.random.default_rng(0).normal(size=(2, 3, 80, 120)).astype(np.float32)
     texture = np.stack([cv2.GaussianBlur(image, (0, 0), sigma) for image in white])
     reference = texture / texture.std() + noise * more
-    size = facts.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
+    size = setup.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
     assert size == pytest.approx(2 * np.sqrt(2 * np.log(2)) * np.sqrt(2) * sigma, rel=0.08)
