@@ -235,7 +235,7 @@ class _Report:
         result, frame = self.physical.result, self.shown[-1]
         page.heading("Lights and reflections")
         self._show(page, figures.brightness_figure(result), "gain and offset of each light against the reference")
-        self._show(page, figures.residual_figure(result), "residual of each light, and the mean fraction of its weight")
+        self._show(page, figures.residual_figure(result), "residual of each light, and its fraction in the nodes")
         if len(result.lights) > 1:
             caption = f"fraction of each light in what determines the nodes, {self._when(frame)}"
             self._show(page, figures.fraction_figure(result, frame), caption)

@@ -69,12 +69,9 @@ def hardware_rows(physical: Physical, setup: SetupSettings) -> Rows:
     exposure = result.provenance.get("exposure_ns")
     yield "exposure", "not stated by the files" if exposure is None else f"{exposure / 1000:g} µs"
     yield "patterning", setup.pattern or _missing("setup.pattern")
-    size = speckle_size(result)
-    if size is not None:
-        yield (
-            "speckle size",
-            f"{physical.in_units(size)}, full width at half maximum of the reference's autocorrelation",
-        )
+    width = "full width at half maximum of the reference's autocorrelation"
+    if (size := speckle_size(result)) is not None:
+        yield "speckle size", f"{physical.in_units(size)}, {width}"
     if setup.notes:
         yield "notes", setup.notes
 
@@ -86,17 +83,17 @@ def _missing(key: str) -> str:
 def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
     """Yield the parameters of the analysis, in the order of the guide; settings that were not kept are left out."""
     result, set_, mesh = physical.result, physical.result.setting, physical.mesh
-    demosaic, normalise, size = set_("illumination", "demosaic"), set_("illumination", "normalise"), None
+    demosaic, normalise = set_("illumination", "demosaic"), set_("illumination", "normalise")
+    size = set_("mesh", "element_size")
+    separation = f"demosaicing `{demosaic}`, crosstalk unmixed by calibration"
     separated = len(result.lights) > 1 and demosaic is not None
+    strain = "plane fitted to the displacements of the nodes in a virtual strain gauge"
     levels = f"divided by their local mean, σ = {normalise:g} px" if normalise else "as they are"
     side = physical.in_units(mesh.size if size is None else size)
     rows = (
         ("software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"),
         ("reference", reference_text(physical)),
-        (
-            "separation of the lights",
-            f"demosaicing `{demosaic}`, crosstalk unmixed by calibration" if separated else None,
-        ),
+        ("separation of the lights", separation if separated else None),
         ("grey levels", None if normalise is None else levels),
         ("image filter", _PREFILTERS.get(set_("solver", "prefilter"))),
         ("weights of the lights", _WEIGHTS.get(set_("weights", "method"))),
@@ -106,10 +103,7 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         ("interpolant", "cubic B-spline"),
         ("grey-level correction", set_("solver", "brightness")),
         ("rigid motion between lights", set_("solver", "rigid")),
-        (
-            "strain",
-            f"{physical.measure_name}: plane fitted to the displacements of the nodes in a virtual strain gauge",
-        ),
+        ("strain", f"{physical.measure_name}: {strain}"),
         ("virtual strain gauge", f"{physical.in_units(physical.gauges.length)}, at every node"),
         ("smoothing afterwards", "none"),
         ("noise floor", noise_text(physical, floor)),
