@@ -1,16 +1,14 @@
-"""Figures over time: what the nodes of a test tell frame by frame.
-
-Pictures of what probes read off a result: one panel for each kind of quantity, over time, with its uncertainty.
-"""
+"""Figures over time: quantiles of the nodal fields over the frames, and what probes read off a result."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rgbmidic.report.setup import Course, NoiseFloor
-from rgbmidic.report.style import GAP, LEGEND, LINES, NUMBERS, draw_figure, finish_plot, literal, time_unit
+from rgbmidic.report.setup import NoiseFloor, TimeHistory
+from rgbmidic.report.style import GAP, LEGEND, LINES, NUMBERS, OKABE_ITO, draw_figure, finish_plot, literal, time_axis
 from rgbmidic.results import QUANTITIES, Histories, HistoryColumn
 from rgbmidic.typing import FloatArray
 
@@ -20,113 +18,107 @@ if TYPE_CHECKING:
 
     from rgbmidic.results.physical import Physical
 
-__all__ = ["course_figure", "history_figure", "status_figure", "uncertainty_figure"]
+__all__ = ["field_history_figure", "history_figure", "status_figure", "uncertainty_figure"]
 
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#999999")
-"""Of Okabe and Ito, which everybody tells apart."""
-_MARKED = 40
-"""Points up to which each gets a mark of its own."""
+_COLOURS = [OKABE_ITO[name] for name in ("blue", "vermillion", "green")]
+_STATUS = QUANTITIES["node_status"].codes
+_STATUS_COLOURS = (OKABE_ITO["sky blue"], "#333333", OKABE_ITO["vermillion"], OKABE_ITO["yellow"])
+"""Colours of the codes of `node_status` in their order."""
+_MARKED, _MARKED_OF_PROBE = 40, 60
+"""Points up to which each gets a marker, in a panel of half the width and of the whole width: more would touch."""
+_PANEL = 2.4
+"""Height of a panel of `history_figure` in inches, its numbers included: four fill a page."""
+_KINDS = ("velocity", "acceleration", "strain_rate", "rate", "strain", "extension", "direction", "stress")
 
 
-def course_figure(told: Physical, course: Course) -> Figure:
-    """Displacement and strain over the frames: median of the nodes as a line, 5 to 95 % of them as a band."""
-    length = told.units.length
-    panels = {f"displacement ({length})": ("u", "v"), f"strain ({told.measure_name})": ("exx", "eyy", "exy")}
+def field_history_figure(physical: Physical, history: TimeHistory) -> Figure:
+    """Draw displacement and strain over the frames: median of the nodes as a line, 5 to 95 % of them as a band."""
+    panels: dict[str, tuple[str, ...]] = {f"displacement ({physical.units.length})": ("u", "v")}
+    panels[f"strain ({physical.measure_name})"] = ("exx", "eyy", "exy")
 
     def draw(axes: list[Axes]) -> None:
-        for axis, (label, names) in zip(axes, panels.items(), strict=True):
-            times, unit = _times(told, course)
-            for name, colour, line in zip(names, _COLOURS, LINES, strict=False):
-                low, middle, high = course.quantiles[name].T
-                axis.fill_between(times, low, high, color=colour, alpha=0.18, linewidth=0)
-                axis.plot(times, middle, line, color=colour, linewidth=1.2, label=name, **_marks(times))
-            axis.legend(loc="best")
-            finish_plot(axis, unit, label, whole=not told.units.timed)
+        _draw_medians(axes, panels, history)
+        for axis, names in zip(axes, panels.values(), strict=True):
+            for name, colour in zip(names, _COLOURS, strict=False):
+                low, _, high = history.quantiles[name].T
+                axis.fill_between(history.axis[0], low, high, color=colour, alpha=0.18, linewidth=0)
 
     return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
 
 
-def uncertainty_figure(told: Physical, course: Course, floor: NoiseFloor | None) -> Figure:
-    """Stated uncertainty over the frames, median of the nodes, and the noise floor of static frames as thin lines."""
-    panels = {
-        f"standard uncertainty ({told.units.length})": ("u", "v"),
-        "standard uncertainty of strain": ("exx", "eyy", "exy"),
-    }
+def uncertainty_figure(physical: Physical, history: TimeHistory, floor: NoiseFloor | None) -> Figure:
+    """Draw the stated uncertainty over the frames, median of the nodes; the noise floor as thin lines."""
+    panels: dict[str, tuple[str, ...]] = {f"standard uncertainty ({physical.units.length})": ("u_std", "v_std")}
+    panels["standard uncertainty of strain"] = ("exx_std", "eyy_std", "exy_std")
 
     def draw(axes: list[Axes]) -> None:
-        for axis, (label, names) in zip(axes, panels.items(), strict=True):
-            times, unit = _times(told, course)
+        _draw_medians(axes, panels, history)
+        for axis, names in zip(axes, panels.values(), strict=True):
             for name, colour, line in zip(names, _COLOURS, LINES, strict=False):
-                middle = course.quantiles[f"{name}_std"][:, 1]
-                axis.plot(times, middle, line, color=colour, linewidth=1.2, label=f"{name}_std", **_marks(times))
                 if floor is not None:
-                    axis.axhline(floor.measured[name], color=colour, linestyle=line, linewidth=0.6)
+                    axis.axhline(floor.measured[name.removesuffix("_std")], color=colour, linestyle=line, linewidth=0.6)
             axis.set_ylim(bottom=0)
-            axis.legend(loc="best")
-            finish_plot(axis, unit, label, whole=not told.units.timed)
 
     return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
 
 
-def status_figure(told: Physical, course: Course) -> Figure:
-    """Share of the nodes with each status over the frames."""
+def _draw_medians(axes: Sequence[Axes], panels: Mapping[str, Sequence[str]], history: TimeHistory) -> None:
+    """Draw the median over the nodes of some quantities over the frames, a panel for each label."""
+    times, label_of_times = history.axis
+    marker = "o" if len(times) <= _MARKED else None
+    for axis, (label, names) in zip(axes, panels.items(), strict=True):
+        for name, colour, line in zip(names, _COLOURS, LINES, strict=False):
+            median = history.quantiles[name][:, 1]
+            axis.plot(times, median, line, color=colour, linewidth=1.2, label=name, marker=marker, markersize=2.5)
+        axis.legend(loc="best")
+        finish_plot(axis, label_of_times, label, whole=not history.timed)
+
+
+def status_figure(history: TimeHistory) -> Figure:
+    """Draw the fraction of the nodes with each status over the frames."""
 
     def draw(axes: list[Axes]) -> None:
-        times, unit = _times(told, course)
-        colours = ("#56b4e9", "#333333", "#d55e00", "#f0e442")
-        shown = [code for code, share in enumerate(course.shares.T) if code == 0 or share.any()]
-        words = QUANTITIES["node_status"].codes
-        axes[0].stackplot(
-            times,
-            course.shares[:, shown].T,
-            labels=[words[code] for code in shown],
-            colors=[colours[code] for code in shown],
-        )
-        axes[0].set_ylim(0, 1)
-        axes[0].legend(loc="lower left", frameon=True)
-        finish_plot(axes[0], unit, "share of the nodes", whole=not told.units.timed)
+        (axis,), (times, label_of_times) = axes, history.axis
+        shown = [code for code, part in enumerate(history.fractions.T) if code == 0 or part.any()]
+        names, colours = ([source[code] for code in shown] for source in (_STATUS, _STATUS_COLOURS))
+        axis.stackplot(times, history.fractions[:, shown].T, labels=names, colors=colours)
+        axis.set_ylim(0, 1)
+        axis.legend(loc="lower left", frameon=True)
+        finish_plot(axis, label_of_times, "fraction of the nodes", whole=not history.timed)
 
     return draw_figure(draw, count=1, aspect=0.35, beside=GAP)
 
 
-def _times(told: Physical, course: Course) -> tuple[FloatArray, str]:
-    """The frames' times in a unit that suits them, and the name of the axis."""
-    if not told.units.timed:
-        return told.result.number[list(course.frames)].astype(np.float64), "frame"
-    factor, unit = time_unit(course.times)
-    return factor * course.times, f"time ({unit})"
-
-
-def _marks(times: FloatArray) -> dict[str, Any]:
-    return {"marker": "o", "markersize": 2.5} if len(times) <= _MARKED else {}
-
-
-_MARKERS = 60
-"""Known values up to which each gets a marker."""
-_PANEL = 2.4
-"""Height of a panel in inches, its numbers included."""
-_KINDS = ("velocity", "acceleration", "strain_rate", "rate", "strain", "extension", "direction", "stress")
-
-
 def history_figure(histories: Histories) -> Figure:
-    """Every quantity over the time, or the frames where no time is known; two standard uncertainties are shaded.
+    """Draw what probes read, over the time, or over the frames where no time is known.
 
-    Where a stress is known a last panel shows it over the strain.
+    Quantities of one kind and unit share a panel; two standard uncertainties on both sides are shaded. Where a stress
+    is known, a last panel shows it over the strain.
+
+    Parameters
+    ----------
+    histories
+        What the probes read off a result (`rgbmidic.results.histories.read_histories`).
+
+    Returns
+    -------
+    Figure
+        The figure, which `save_figure` writes.
     """
     panels: dict[tuple[str, str], list[HistoryColumn]] = {}
-    for told in histories.quantities:
-        panels.setdefault((_kind(told), told.unit), []).append(told)
-    timed = histories.times is not None
-    over = np.asarray(histories.times if timed else histories.frames, dtype=np.float64)
-    factor, unit_of_time = time_unit(over) if timed else (1.0, "")
-    over, along = factor * over, f"time ({unit_of_time})" if timed else "frame"
+    for quantity in histories.quantities:
+        panels.setdefault((_kind(quantity), quantity.unit), []).append(quantity)
+    times, label_of_times = time_axis(histories.times, histories.frames)
 
     def draw(axes: list[Axes]) -> None:
         for axis, ((kind, unit), quantities) in zip(axes, panels.items(), strict=False):
-            for told in quantities:
-                _line(axis, over, told)
-            _limit(axis, quantities)
-            finish_plot(axis, along, literal(f"{kind} ({unit})" if unit else kind), whole=not timed)
+            for quantity in quantities:
+                _draw_quantity(axis, times, quantity)
+            known = np.concatenate([quantity.values[np.isfinite(quantity.values)] for quantity in quantities])
+            if known.size and np.ptp(known) > 0:  # the values set the limits, not the widest uncertainty among them
+                axis.set_ylim(known.min() - 0.1 * np.ptp(known), known.max() + 0.1 * np.ptp(known))
+            label = literal(f"{kind} ({unit})" if unit else kind)
+            finish_plot(axis, label_of_times, label, whole=histories.times is None)
             axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
         if histories.stress_strain is not None:
             strain, stress = (histories[name] for name in histories.stress_strain)
@@ -137,27 +129,19 @@ def history_figure(histories: Histories) -> Figure:
     return draw_figure(draw, count=count, aspect=0.45, beside=LEGEND, tallest=_PANEL * count + 1)
 
 
-def _kind(told: HistoryColumn) -> str:
-    """What stands on the axis: quantities of one kind and unit share a panel, other channels have one each."""
-    if told.std is None and told.name != "stress":
-        return told.name
-    name = told.name.removesuffix("_before").removesuffix("_after")
+def _kind(quantity: HistoryColumn) -> str:
+    """Name the panel of a quantity: its kind, or the name of a channel that is not a probe's."""
+    if quantity.std is None and quantity.name != "stress":
+        return quantity.name
+    name = quantity.name.removesuffix("_before").removesuffix("_after")
     kind = next((kind for kind in _KINDS if name.endswith(f"_{kind}") or name == kind), "")
-    if kind:
-        return kind.replace("_", " ")
-    return {"deg": "rotation", "": "strain"}.get(told.unit, "displacement")
+    return kind.replace("_", " ") or {"deg": "rotation", "": "strain"}.get(quantity.unit, "displacement")
 
 
-def _line(axis: Axes, over: FloatArray, told: HistoryColumn) -> None:
-    marker = "o" if np.isfinite(told.values).sum() <= _MARKERS else None
-    (line,) = axis.plot(over, told.values, marker=marker, markersize=2.5, linewidth=1, label=literal(told.name))
-    if told.std is not None:
-        low, high = told.values - 2 * told.std, told.values + 2 * told.std
-        axis.fill_between(over, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
-
-
-def _limit(axis: Axes, quantities: list[HistoryColumn]) -> None:
-    """Let the values, and not the widest uncertainty among them, say what is shown."""
-    known = np.concatenate([told.values[np.isfinite(told.values)] for told in quantities])
-    if known.size and np.ptp(known) > 0:
-        axis.set_ylim(known.min() - 0.1 * np.ptp(known), known.max() + 0.1 * np.ptp(known))
+def _draw_quantity(axis: Axes, times: FloatArray, quantity: HistoryColumn) -> None:
+    marker = "o" if np.isfinite(quantity.values).sum() <= _MARKED_OF_PROBE else None
+    label = literal(quantity.name)
+    (line,) = axis.plot(times, quantity.values, marker=marker, markersize=2.5, linewidth=1, label=label)
+    if quantity.std is not None:
+        low, high = quantity.values - 2 * quantity.std, quantity.values + 2 * quantity.std
+        axis.fill_between(times, low, high, color=line.get_color(), alpha=0.2, linewidth=0)

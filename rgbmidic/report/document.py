@@ -1,7 +1,4 @@
-"""The report of a test: one HTML page that needs no other file and no network.
-
-A page of text, tables and pictures, written as Markdown and as HTML at once.
-"""
+"""Report of a test: one HTML page of text, tables and pictures that needs no other file and no network."""
 
 from __future__ import annotations
 
@@ -16,18 +13,18 @@ import numpy as np
 
 from rgbmidic.errors import legible
 from rgbmidic.report import figures
-from rgbmidic.report.curves import course_figure, history_figure, status_figure, uncertainty_figure
+from rgbmidic.report.curves import field_history_figure, history_figure, status_figure, uncertainty_figure
 from rgbmidic.report.setup import (
-    Course,
     NoiseFloor,
+    TimeHistory,
     analysis_rows,
     hardware_rows,
     noise_floor,
-    noise_words,
-    reference_words,
+    noise_text,
+    reference_text,
     settings_rows,
 )
-from rgbmidic.report.style import embedded, time_unit
+from rgbmidic.report.style import embedded, time_text
 from rgbmidic.results import QUANTITIES, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
@@ -40,13 +37,14 @@ if TYPE_CHECKING:
 __all__ = ["Page", "write_report"]
 
 _MOST = 200
-"""Frames that the course of a test is drawn from at most: more lie closer than the dots of a page."""
-_KEY = 3
+"""Frames that the time histories are drawn from at most: a panel is some 450 pixels wide, two for each."""
+_SHOWN = 3
+"""Frames of which maps are shown where none are named: first third, second third and end of a test."""
 _LISTED = 20
-"""Frames that are listed with what befell them."""
-_LOST, _MISFIT, _RATIO, _BLUR = 0.1, 2.0, 1.5, 1.0
-"""From where a warning is worth its line: share of the nodes that are not measured; noise of static frames over the
-stated uncertainty, or the other way round; px that a node moves during the exposure."""
+"""Failed frames that are listed with their reason: half a page."""
+_NO_DATA, _MISFIT, _RATIO, _BLUR = 0.1, 2.0, 1.5, 1.0
+"""Where warnings begin. Chosen: fraction of nodes without data; median misfit (1 is ordinary); noise of static frames
+over the stated uncertainty; px that a node moves during the exposure (the speckle's gradient is resolved to 1 px)."""
 
 
 def write_report(
@@ -57,7 +55,7 @@ def write_report(
     frames: Sequence[int] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write the report of a result.
+    """Write the report of a result as one HTML file.
 
     Parameters
     ----------
@@ -66,7 +64,7 @@ def write_report(
     out
         HTML file to write; it appears once it is complete.
     settings
-        Of which ``[setup]``, ``[scale]`` and ``[probes]`` stand in place of those that were kept; None: those kept.
+        Settings whose ``[setup]``, ``[scale]`` and ``[probes]`` replace those kept in the result; None: those kept.
     frames
         Indices of the frames of which maps are shown; None: three deformed ones that did not fail, evenly spaced,
         the last of them included, and the one that has moved farthest.
@@ -87,42 +85,45 @@ def write_report(
     kept = result.provenance.get("settings", {}).get("setup", {})
     setup = read_section(SetupSettings, "setup", kept) if settings is None else settings.setup
     probes = probes_of(result) if settings is None else settings.probes
-    told = Physical.of(result, None if settings is None else settings.scale)
-    text = _Report.of(told, setup, probes, frames).page().html
+    physical = Physical.of(result, None if settings is None else settings.scale)
+    text = _Report.of(physical, setup, probes, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Report:
-    """What all sections of a report are made from."""
+    """Data that all sections of a report are made from."""
 
-    told: Physical
+    physical: Physical
     setup: SetupSettings
     probes: ProbeSettings
-    course: Course
+    history: TimeHistory
     floor: NoiseFloor | None
     shown: tuple[int, ...]
 
     @classmethod
-    def of(cls, told: Physical, setup: SetupSettings, probes: ProbeSettings, frames: Sequence[int] | None) -> _Report:
-        deformed = figures.shown_frames(told.result)
+    def of(
+        cls, physical: Physical, setup: SetupSettings, probes: ProbeSettings, frames: Sequence[int] | None
+    ) -> _Report:
+        result = physical.result
         for frame in frames or ():
-            told.result.frame(frame)  # what is wrong with one is told before the long work
-        course = Course.of(told, figures.spread(deformed, _MOST))
-        measured = figures.spread(figures.measured_frames(told.result), _KEY)
-        shown = tuple(sorted({*measured, course.farthest})) if frames is None else tuple(frames)
-        return cls(told=told, setup=setup, probes=probes, course=course, floor=noise_floor(told), shown=shown)
+            result.frame(frame)  # an error of one is raised before the long work
+        history = TimeHistory.of(physical, figures.spread(figures.shown_frames(result), _MOST))
+        measured = figures.spread(figures.measured_frames(result), _SHOWN)
+        shown = tuple(sorted({*measured, history.farthest})) if frames is None else tuple(frames)
+        floor = noise_floor(physical)
+        return cls(physical=physical, setup=setup, probes=probes, history=history, floor=floor, shown=shown)
 
     def page(self) -> Page:
-        """The page, section by section."""
-        result = self.told.result
+        """Build the page, section by section."""
+        result = self.physical.result
         page = Page(f"Test report: {result.path.resolve().name}")
         page.text(self._summary())
         page.heading("Warnings")
         page.bullets(list(self._warnings()) or ["none"])
         page.heading("What was measured with what")
-        page.table(("set-up", ""), list(hardware_rows(self.told, self.setup)))
-        page.table(("analysis", ""), list(analysis_rows(self.told, self.floor)))
+        page.table(("set-up", ""), list(hardware_rows(self.physical, self.setup)))
+        page.table(("analysis", ""), list(analysis_rows(self.physical, self.floor)))
         self._fields(page)
         self._probes(page)
         self._uncertainty(page)
@@ -132,159 +133,143 @@ class _Report:
         return page
 
     def _summary(self) -> str:
-        """The test in a few lines."""
-        told, course = self.told, self.course
-        result, length = told.result, told.units.length
-        measured = course.shares[:, 0].mean()
-        lines = [
-            f"{len(result.deformed)} deformed frames against {reference_words(told)}; {len(result.nodes)} nodes, "
-            f"{measured:.1%} of them measured."
-        ]
-        if np.isfinite(course.extreme("u") + course.extreme("v")):
-            lines.append(
-                f"The median node moves by up to {course.extreme('u'):.4g} {length} in x and {course.extreme('v'):.4g} "
-                f"{length} in y, known to {course.median('u_std'):.2g} and {course.median('v_std'):.2g} {length} "
-                "(standard uncertainty, median)."
-            )
-        lines.append("x is to the right and y down, on the reference image; blank means not measured.")
-        return " ".join(lines)
+        """Summarise the test in a few sentences."""
+        history, result, length = self.history, self.physical.result, self.physical.units.length
+        x, y, x_std, y_std = *map(history.extreme, ("u", "v")), *map(history.median, ("u_std", "v_std"))
+        text = f"{len(result.deformed)} deformed frames against {reference_text(self.physical)}; "
+        text += f"{len(result.nodes)} nodes, {history.fractions[:, 0].mean():.1%} of them measured. "
+        if np.isfinite(x + y):
+            text += f"The median node moves by up to {x:.4g} {length} in x and {y:.4g} {length} in y, known to "
+            text += f"{x_std:.2g} and {y_std:.2g} {length} (standard uncertainty, median). "
+        return text + "x is to the right and y down, on the reference image; blank means not measured."
 
     def _warnings(self) -> Iterator[str]:
-        """What a reader of the numbers must know, the gravest first."""
-        told, course = self.told, self.course
-        result = told.result
+        """Yield what a reader of the numbers must know, the gravest first."""
+        units, history, result = self.physical.units, self.history, self.physical.result
         if missing := int((~result.finished).sum()):
             yield f"the run is not finished: {missing} of {len(result)} frames are missing"
         ends = result.status[list(result.deformed)]
-        for code, word in ((2, "failed"), (1, "did not converge")):
+        for code, ended in ((2, "failed"), (1, "did not converge")):
             if count := int((ends == code).sum()):
-                yield f"{count} of {len(ends)} frames {word}"
-        lost = 1 - float(course.shares[:, 0].mean())
-        if lost > _LOST:
-            yield f"{lost:.0%} of the nodes are not measured"
+                yield f"{count} of {len(ends)} frames {ended}"
+        without = 1 - float(history.fractions[:, 0].mean())
+        if without > _NO_DATA:
+            yield f"{without:.0%} of the nodes are not measured"
         if gaps := result.provenance.get("lost_frames"):
             yield f"frames missing between those that are there, by number or time: {gaps}"
-        yield from self._doubts()
-        if told.units.mm_per_pixel is None:
-            yield "no image scale is stated (`scale.mm_per_pixel`): lengths are in px"
-        if not told.units.timed:
-            yield "no frame rate is known (`scale.frame_rate`): time is in frames"
-
-    def _doubts(self) -> Iterator[str]:
-        """Warnings that follow from the numbers."""
-        told, course, floor = self.told, self.course, self.floor
-        exposure = told.result.provenance.get("exposure_ns")
-        if exposure and told.units.timed and course.fastest * exposure * 1e-9 > _BLUR:
+        exposure = result.provenance.get("exposure_ns") or 0
+        blur = history.fastest * exposure * 1e-9 if units.timed else 0.0
+        if blur > _BLUR:
             yield (
-                f"motion blur: the fastest node moves by {course.fastest * exposure * 1e-9:.2g} px while the frame is "
-                f"exposed ({exposure / 1000:g} µs)"
+                f"motion blur: the fastest node moves by {blur:.2g} px while the frame is exposed "
+                f"({exposure / 1000:g} µs)"
             )
-        if floor is not None:
-            ratio = np.hypot(floor.measured["u"], floor.measured["v"]) / np.hypot(
-                course.median("u_std"), course.median("v_std")
-            )
+        if self.floor is not None:
+            stated = np.hypot(history.median("u_std"), history.median("v_std"))
+            ratio = np.hypot(self.floor.measured["u"], self.floor.measured["v"]) / stated
             if ratio > _RATIO:
                 yield f"static frames scatter {ratio:.2g} times as much as the stated uncertainty: vibration, flicker?"
-        if course.median("misfit") > _MISFIT:
+        if history.median("misfit") > _MISFIT:
             yield "half of the nodes fit badly (`misfit`)"
+        if units.mm_per_pixel is None:
+            yield "no image scale is stated (`scale.mm_per_pixel`): lengths are in px"
+        if not units.timed:
+            yield "no frame rate is known (`scale.frame_rate`): time is in frames"
 
     def _fields(self, page: Page) -> None:
-        """Key frames as maps, and the course of the test."""
-        told, length = self.told, self.told.units.length
+        """Add maps of some frames, and the fields over the time."""
+        physical, length = self.physical, self.physical.units.length
         page.heading("Displacement and strain")
         page.text(
-            f"Displacement in {length} and strain ({told.measure_name}, virtual strain gauge of "
-            f"{told.in_units(told.gauges.length)}), at their places on the reference image."
+            f"Displacement in {length} and strain ({physical.measure_name}, virtual strain gauge of "
+            f"{physical.in_units(physical.gauges.length)}), at their places on the reference image."
         )
         for frame in self.shown:
-            values = told.frame(frame)
+            values = physical.frame(frame)
             maps = {f"{name} ({length})": (values[name], values[f"{name}_std"]) for name in ("u", "v")}
-            self._show(page, figures.field_figure(told.result, frame, maps), f"displacement, {self._when(frame)}")
+            self._show(page, figures.field_figure(physical.result, frame, maps), f"displacement, {self._when(frame)}")
             maps = {name: (values[name], values[f"{name}_std"]) for name in ("exx", "eyy", "exy")}
-            self._show(page, figures.field_figure(told.result, frame, maps), f"strain, {self._when(frame)}")
+            self._show(page, figures.field_figure(physical.result, frame, maps), f"strain, {self._when(frame)}")
         caption = "over the test: median of the nodes (line) and 5 to 95 % of them (band)"
-        self._show(page, course_figure(told, self.course), f"displacement and strain {caption}")
+        self._show(page, field_history_figure(physical, self.history), f"displacement and strain {caption}")
 
     def _probes(self, page: Page) -> None:
-        """What the probes of the settings read."""
+        """Add place and time history of the probes."""
         if not self.probes.places:
             return
         from rgbmidic.results.histories import read_histories
 
         page.heading("Probes")
-        page.table(("probe", "place in px"), [(kind, _numbers(place)) for kind, place in self.probes.places])
-        histories = read_histories(self.told.result, self.probes, scale=self.told.scale)
-        self._show(
-            page, history_figure(histories), "what the probes read; the bands are two standard uncertainties wide"
-        )
+        places = [(kind, ", ".join(f"{number:g}" for number in place)) for kind, place in self.probes.places]
+        page.table(("probe", "place in px"), places)
+        histories = read_histories(self.physical.result, self.probes, scale=self.physical.scale)
+        caption = "time history of the probes; the bands extend two standard uncertainties to both sides"
+        self._show(page, history_figure(histories), caption)
         if histories.remarks:
             page.bullets(histories.remarks)
 
     def _uncertainty(self, page: Page) -> None:
-        told, length = self.told, self.told.units.length
+        physical, length = self.physical, self.physical.units.length
         page.heading("Uncertainty")
-        page.text(f"Noise floor: {noise_words(told, self.floor)}.")
-        if told.units.mm_per_pixel_std:
+        page.text(f"Noise floor: {noise_text(physical, self.floor)}.")
+        if physical.units.mm_per_pixel_std:
             page.text(
                 "The uncertainty of the image scale is part of that of every length in mm, the same in all of them."
             )
-        names = [*(f"{name}_std" for name in ("u", "v", "exx", "eyy", "exy"))]
-        rows = [(name, length if name[0] in "uv" else "1", *self._spread_words(name)) for name in names]
+        rows = []
+        for name in ("u_std", "v_std", "exx_std", "eyy_std", "exy_std"):
+            known = self.history.quantiles[name]
+            known = known[np.isfinite(known).all(axis=1)]
+            numbers = [f"{value:.3g}" for value in np.median(known, axis=0)] if len(known) else "---"
+            rows.append((name, length if name[0] in "uv" else "1", *numbers))
         page.table(("standard uncertainty", "unit", "5 % of the nodes below", "median", "95 % below"), rows)
         caption = "stated standard uncertainty over the test, median of the nodes"
         caption += "" if self.floor is None else "; thin lines: noise floor of the static frames"
-        self._show(page, uncertainty_figure(told, self.course, self.floor), caption)
-        frame, values = self.shown[-1], told.frame(self.shown[-1])
+        self._show(page, uncertainty_figure(physical, self.history, self.floor), caption)
+        frame, values = self.shown[-1], physical.frame(self.shown[-1])
         maps = {f"{name} ({length})": (values[name], values[name] * 0) for name in ("u_std", "v_std")}
-        figure = figures.field_figure(told.result, frame, maps, positive=True)
+        figure = figures.field_figure(physical.result, frame, maps, positive=True)
         self._show(page, figure, f"standard uncertainty, {self._when(frame)}")
 
-    def _spread_words(self, name: str) -> Iterator[str]:
-        """Medians over the frames of the quantiles over the nodes."""
-        known = self.course.quantiles[name]
-        known = known[np.isfinite(known).all(axis=1)]
-        return (f"{value:.3g}" for value in np.median(known, axis=0)) if len(known) else iter("---")
-
     def _lights(self, page: Page) -> None:
-        result, frame = self.told.result, self.shown[-1]
+        result, frame = self.physical.result, self.shown[-1]
         page.heading("Lights and reflections")
         self._show(page, figures.brightness_figure(result), "gain and offset of each light against the reference")
-        self._show(page, figures.residual_figure(result), "residual of each light, and its share in what is measured")
+        self._show(page, figures.residual_figure(result), "residual of each light, and its fraction in the nodes")
         if len(result.lights) > 1:
-            caption = f"share of each light in what determines the nodes, {self._when(frame)}"
+            caption = f"fraction of each light in what determines the nodes, {self._when(frame)}"
             self._show(page, figures.fraction_figure(result, frame), caption)
-        reflections = {"reflection index of each light": figures.reflection_figure(result, frame)}
-        reflections["what the weights exclude of each light"] = figures.mask_figure(result, frame)
-        for words, figure in reflections.items():
+        for caption, figure in (
+            ("reflection index of each light", figures.reflection_figure(result, frame)),
+            ("part of each light that the weights exclude", figures.mask_figure(result, frame)),
+        ):
             if figure is not None:
-                self._show(page, figure, f"{words}, {self._when(frame)}")
+                self._show(page, figure, f"{caption}, {self._when(frame)}")
 
     def _quality(self, page: Page) -> None:
-        result, frame = self.told.result, self.shown[-1]
+        result, frame = self.physical.result, self.shown[-1]
         page.heading("Quality")
         ends = result.status[list(result.deformed)]
         rows = [(word, str(int((ends == code).sum()))) for code, word in enumerate(QUANTITIES["status"].codes)]
         page.table(("deformed frames", "number"), rows)
         odd = [index for index in result.deformed if result.status[index] != 0 and result.finished[index]]
         if odd:
-            reasons = [
-                (result.names[index], reason) for index, reason in zip(odd, result.each("reason", odd), strict=True)
-            ]
-            page.table(("frame", "what befell it"), reasons[:_LISTED])
+            names = [result.names[index] for index in odd[:_LISTED]]
+            page.table(("frame", "reason"), list(zip(names, result.each("reason", odd[:_LISTED]), strict=True)))
             if len(odd) > _LISTED:
                 page.text(f"And {len(odd) - _LISTED} more.")
-        if self.course.shares[:, 0].min() < 1:
-            self._show(page, status_figure(self.told, self.course), "how the nodes ended")
+        if self.history.fractions[:, 0].min() < 1:
+            self._show(page, status_figure(self.history), "status of the nodes")
         else:
             page.text("Every node is measured in every frame.")
         self._show(page, figures.convergence_figure(result), "convergence: largest motion of a node in each iteration")
         self._show(page, figures.map_figure(result, frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
 
     def _provenance(self, page: Page) -> None:
-        kept = self.told.result.provenance
+        kept = self.physical.result.provenance
         page.heading("Provenance")
         rows = [("measured", f"{kept['created']} to {kept.get('finished', 'not finished')}")]
-        rows += [("result", str(self.told.result.path.resolve())), ("platform", kept.get("platform", ""))]
+        rows += [("result", str(self.physical.result.path.resolve())), ("platform", kept.get("platform", ""))]
         rows += [(f"version of {name}", text) for name, text in kept["versions"].items()]
         if (calibration := kept.get("calibration")) is not None:
             rows.append(("calibration", f"{calibration['file']}, SHA-256 {calibration['sha256']}"))
@@ -293,18 +278,13 @@ class _Report:
         page.table(("setting", "value"), list(settings_rows(kept.get("settings", {}))))
 
     def _when(self, frame: int) -> str:
-        result, time = self.told.result, self.told.times[frame]
-        factor, unit = time_unit(self.told.times)
-        when = f" at {factor * time:.6g} {unit}" if self.told.units.timed else ""
-        return f"frame {frame} ({result.names[frame]}){when}"
+        times = self.physical.times
+        when = f" at {time_text(times[frame], times)}" if self.physical.units.timed else ""
+        return f"frame {frame} ({self.physical.result.names[frame]}){when}"
 
     @staticmethod
     def _show(page: Page, figure: Figure, caption: str) -> None:
         page.picture(embedded(figure), caption)
-
-
-def _numbers(place: Sequence[float]) -> str:
-    return ", ".join(f"{number:g}" for number in place)
 
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -319,7 +299,13 @@ img{max-height:112mm}.table{overflow:visible}}"""
 
 
 class Page:
-    """Collects blocks in order; `write` puts them into a folder as ``report.md`` and ``report.html``."""
+    """A page of text, tables and pictures, collected in order as Markdown and as HTML.
+
+    Parameters
+    ----------
+    title
+        Its title.
+    """
 
     def __init__(self, title: str) -> None:
         self.title = title
@@ -327,39 +313,35 @@ class Page:
         self._html = [f"<h1>{html.escape(title)}</h1>"]
 
     def heading(self, text: str) -> None:
-        """A section's heading."""
+        """Add the heading of a section."""
         self._markdown.append(f"## {text}")
         self._html.append(f"<h2>{html.escape(text)}</h2>")
 
     def text(self, text: str) -> None:
-        """A paragraph; words between backquotes are code."""
+        """Add a paragraph; words between backquotes are code."""
         self._markdown.append(text)
         self._html.append(f"<p>{_inline(text)}</p>")
 
     def bullets(self, texts: Sequence[str]) -> None:
-        """A list of texts; words between backquotes are code."""
+        """Add a list of texts; words between backquotes are code."""
         self._markdown.append("\n".join(f"- {text}" for text in texts))
         self._html.append("<ul>" + "".join(f"<li>{_inline(text)}</li>" for text in texts) + "</ul>")
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """A table of texts."""
+        """Add a table of texts, a header and rows of as many columns."""
         lines = [header, ["---"] * len(header), *rows]
-        self._markdown.append(
-            "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines)
-        )
+        cells = (" | ".join(cell.replace("|", "\\|") for cell in line) for line in lines)
+        self._markdown.append("\n".join(f"| {line} |" for line in cells))
         head = "".join(f"<th>{_inline(cell)}</th>" for cell in header)
         body = "".join("<tr>" + "".join(f"<td>{_inline(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        self._html.append(
-            f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-        )
+        table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        self._html.append(f'<div class="table">{table}</div>')
 
     def picture(self, source: str, caption: str) -> None:
-        """A picture that lies in the page's folder, or is embedded (`rgbmidic.report.style.embedded`)."""
+        """Add a picture: a file in the page's folder, or a data URL (`rgbmidic.report.style.embedded`)."""
         self._markdown.append(f"![{caption}]({source})\n\n*{caption}*")
-        cell = html.escape(caption)
-        self._html.append(
-            f'<figure><img src="{html.escape(source)}" alt="{cell}"><figcaption>{cell}</figcaption></figure>'
-        )
+        source, caption = html.escape(source), html.escape(caption)
+        self._html.append(f'<figure><img src="{source}" alt="{caption}"><figcaption>{caption}</figcaption></figure>')
 
     @property
     def html(self) -> str:
@@ -372,7 +354,7 @@ class Page:
         )
 
     def write(self, folder: Path) -> tuple[Path, Path]:
-        """Write both pages; gives their paths."""
+        """Write ``report.md`` and ``report.html`` into a folder and return their paths."""
         markdown, page = folder / "report.md", folder / "report.html"
         markdown.write_text(legible("\n\n".join(self._markdown) + "\n"), encoding="utf-8")
         page.write_text(self.html, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Figures of a result. Each function gives a matplotlib `Figure`; `save_figure` writes it."""
+"""Figures of a result: maps of its fields, and quantities over frames and iterations; `save_figure` writes them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ from rgbmidic.report.style import (
     finish_picture,
     finish_plot,
     literal,
+    ordinary_values,
     shade,
     show_image,
+    view_limits,
 )
 from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result, scale_of
 from rgbmidic.typing import FloatArray
@@ -55,44 +57,54 @@ MAPS = {
 }
 """Quantities of each kind of map."""
 _POSITIVE = ("uncertainty", "misfit")
-_DOUBTFUL = 3.0
-"""Nodes whose uncertainty is over this many times the median do not rule the colours of their quantity."""
-_FAILED = 2
+_FAILED = QUANTITIES["status"].codes.index("failed")
 _EQUAL = 1e-9
+"""Fraction of the colour range by which a value may exceed it by rounding alone."""
 _RASTER = 600
-"""Points along the longer side of a map."""
-_MARGIN = 0.06
-"""What is shown around the mesh, as a share of its longer side."""
+"""Points along the longer side of a map: a panel of 4.5 inches has as many pixels at 130 dpi."""
 _MANY_FRAMES = 8
+"""Frames up to which a legend names each: it fills half the height of a panel."""
 _MOST_LINES = 100
-
-View = tuple[tuple[float, float], tuple[float, float]]
+"""Frames of which lines are drawn at most; more cover each other. Chosen; only the picture depends on it."""
 
 
 def shown_frames(result: Result) -> tuple[int, ...]:
-    """The deformed frames that are measured; all that are where there is none, all of the test where none is."""
+    """Select the deformed frames that are measured; else all that are measured; else all of the test."""
     finished = result.finished
     deformed = tuple(index for index in result.deformed if finished[index])
     return deformed or tuple(np.flatnonzero(finished).tolist()) or tuple(range(len(result)))
 
 
 def measured_frames(result: Result) -> tuple[int, ...]:
-    """Those of `shown_frames` in which something is measured; all where nothing is in any."""
+    """Select those of `shown_frames` that did not fail; all of them where all failed."""
     shown = shown_frames(result)
-    return (
-        tuple(frame for frame, end in zip(shown, result.each("status", shown), strict=True) if end != _FAILED) or shown
-    )
+    ends = zip(shown, result.each("status", shown), strict=True)
+    return tuple(frame for frame, end in ends if end != _FAILED) or shown
 
 
 def spread(frames: Sequence[int], most: int) -> tuple[int, ...]:
-    """Some of the frames, evenly spaced up to the last one."""
+    """Select at most `most` of the frames, evenly spaced up to the last one."""
     return tuple(sorted({frames[int(i)] for i in np.linspace(len(frames) - 1, 0, min(most, len(frames))).round()}))
 
 
 def map_figure(result: Result, frame: int, kind: str) -> Figure:
-    """Maps of the quantities of one of `MAPS` in one frame, around the mesh; blank where not measured.
+    """Draw maps of nodal quantities of one frame over the reference image; blank where not measured.
 
     Displacements are in mm where the scale is known.
+
+    Parameters
+    ----------
+    result
+        The result.
+    frame
+        Index of the frame.
+    kind
+        One of `MAPS`.
+
+    Returns
+    -------
+    Figure
+        The figure, one panel per quantity.
 
     Raises
     ------
@@ -107,33 +119,92 @@ def map_figure(result: Result, frame: int, kind: str) -> Figure:
     for name in MAPS[kind]:
         std = known.get(f"{name}_std", np.zeros(len(record.u)))
         label = f"{name} ({unit})" if name in lengths else name
-        maps[label] = known[name], _norm(known[name], std, positive=kind in _POSITIVE)
-    return _maps(result, maps, "plasma" if kind in _POSITIVE else "viridis", _frame_title(result, frame, record))
+        maps[label] = known[name], std
+    return field_figure(result, frame, maps, positive=kind in _POSITIVE)
 
 
 def field_figure(
     result: Result, frame: int, fields: Mapping[str, tuple[FloatArray, FloatArray]], *, positive: bool = False
 ) -> Figure:
-    """Maps of nodal fields (N,) of one frame by their labels, each with its uncertainty, as `map_figure` draws them."""
-    maps = {label: (values, _norm(values, std, positive=positive)) for label, (values, std) in fields.items()}
+    """Draw maps of nodal fields of one frame, as `map_figure` does.
+
+    Parameters
+    ----------
+    result
+        The result.
+    frame
+        Index of the frame.
+    fields
+        Values (N,) and their uncertainties (N,) by their labels; nodes of large uncertainty do not set the colours.
+    positive
+        Whether the values are positive, and their colours logarithmic.
+
+    Returns
+    -------
+    Figure
+        The figure, one panel per field.
+
+    Raises
+    ------
+    InputError, ResultError
+        As `map_figure`.
+    """
+    maps = {}
+    for label, (values, std) in fields.items():
+        known = ordinary_values(values, std)
+        maps[label] = values, colour_scale(known, positive=positive) if known.size else None
     return _maps(result, maps, "plasma" if positive else "viridis", _frame_title(result, frame, result.frame(frame)))
 
 
 def fraction_figure(result: Result, frame: int) -> Figure:
-    """Maps of each light's share in what determines the nodes of one frame; errors as `map_figure`."""
+    """Draw maps of the fraction of each light in what determines the nodes of one frame.
+
+    Parameters
+    ----------
+    result
+        The result.
+    frame
+        Index of the frame.
+
+    Returns
+    -------
+    Figure
+        The figure, one panel per light.
+
+    Raises
+    ------
+    InputError, ResultError
+        As `map_figure`.
+    """
     from matplotlib.colors import Normalize
 
     record = result.frame(frame)
-    shares = np.where(record.light_fraction.sum(axis=1, keepdims=True) > 0, record.light_fraction, np.nan)
-    maps = {
-        literal(f"share of {light}"): (share, Normalize(0, 1))
-        for light, share in zip(result.lights, shares.T, strict=True)
-    }
+    fractions = np.where(record.light_fraction.sum(axis=1, keepdims=True) > 0, record.light_fraction, np.nan)
+    titles = [literal(f"fraction of {light}") for light in result.lights]
+    maps = {title: (part, Normalize(0, 1)) for title, part in zip(titles, fractions.T, strict=True)}
     return _maps(result, maps, "cividis", _frame_title(result, frame, record))
 
 
 def mask_figure(result: Result, frame: int) -> Figure | None:
-    """What the weights of one frame exclude of each light before the solve; None where they exclude nothing."""
+    """Draw what the weights of one frame exclude of each light before the solve.
+
+    Parameters
+    ----------
+    result
+        The result.
+    frame
+        Index of the frame.
+
+    Returns
+    -------
+    Figure or None
+        The figure, one panel per light; None where they exclude nothing, or no reference image was kept.
+
+    Raises
+    ------
+    InputError, ResultError
+        As `map_figure`.
+    """
     record = result.frame(frame)
     excluded = 1 - record.weights_thumbnail / 255
     if not excluded.any():
@@ -142,7 +213,25 @@ def mask_figure(result: Result, frame: int) -> Figure | None:
 
 
 def reflection_figure(result: Result, frame: int) -> Figure | None:
-    """Each light's reflection index in one frame; None where the separation did not tell it."""
+    """Draw the reflection index of each light in one frame.
+
+    Parameters
+    ----------
+    result
+        The result.
+    frame
+        Index of the frame.
+
+    Returns
+    -------
+    Figure or None
+        The figure, one panel per light; None where the separation did not estimate it, or no reference image was kept.
+
+    Raises
+    ------
+    InputError, ResultError
+        As `map_figure`.
+    """
     record = result.frame(frame)
     index = record.reflection_thumbnail / 255
     if not index.size:
@@ -151,24 +240,65 @@ def reflection_figure(result: Result, frame: int) -> Figure | None:
 
 
 def brightness_figure(result: Result) -> Figure:
-    """Gain and offset of every light against the reference over the deformed frames."""
+    """Draw gain and offset of every light against the reference over the deformed frames.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    Figure
+        The figure, one line per light.
+    """
     gain, offset = np.moveaxis(result.brightness, -1, 0)
     return _over_frames(result, {"gain": gain, "offset (grey levels)": offset})
 
 
 def residual_figure(result: Result) -> Figure:
-    """Weighted rms residual of every light, and its share in what determines the nodes, over the deformed frames."""
-    return _over_frames(result, {"residual": result.residual, "mean share in the nodes": result.mean_light_fraction})
+    """Draw the weighted rms residual of every light, and its mean fraction in the nodes, over the deformed frames.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    Figure
+        The figure, one line per light.
+    """
+    return _over_frames(result, {"residual": result.residual, "mean fraction in the nodes": result.mean_light_fraction})
 
 
 def convergence_figure(result: Result) -> Figure:
-    """Largest motion of a measured node in each iteration, a line per deformed frame, and the tolerance if known."""
+    """Draw the largest motion of a measured node in each iteration, and the tolerance where it is known.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    Figure
+        The figure, one line per deformed frame.
+    """
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
     shown = shown_frames(result)
     frames = shown[:: math.ceil(len(shown) / _MOST_LINES)]
 
     def draw(axes: list[Axes]) -> None:
-        axis = axes[0]
-        colours = _colour_per_frame(axis, frames)
+        (axis,) = axes
+        colours: list[Any] = [f"C{index}" for index in range(len(frames))]
+        if len(frames) > _MANY_FRAMES:  # no legend, but a colour bar
+            norm = Normalize(frames[0], frames[-1])
+            colours = [colormaps["viridis"](norm(frame)) for frame in frames]
+            add_colour_bar(axis, ScalarMappable(norm, "viridis"), label="frame")
         for frame, history, colour in zip(frames, result.each("history", frames), colours, strict=True):
             steps, name = np.arange(1, len(history) + 1), literal(result.names[frame])
             axis.plot(steps, history, marker="o", markersize=2.5, linewidth=1, color=colour, label=name)
@@ -183,7 +313,7 @@ def convergence_figure(result: Result) -> Figure:
 
 
 def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
-    """One panel per quantity (T, k), one line per light over the deformed frames."""
+    """Draw a panel per quantity (T, k), with one line per light over the deformed frames."""
     frames = list(shown_frames(result))
 
     def draw(axes: list[Axes]) -> None:
@@ -201,7 +331,7 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
 
 
 def _lengths(result: Result, record: FrameRecord) -> tuple[str, dict[str, FloatArray]]:
-    """The unit of lengths, and the displacements with their uncertainties in it: mm where the scale is known."""
+    """Return the unit of lengths, mm where the scale is known, and the displacements with their uncertainties in it."""
     scale, values = scale_of(result), {name: record.values[name] for name in ("u", "v", "u_std", "v_std")}
     if scale.mm_per_pixel is None:
         return "px", values
@@ -213,19 +343,10 @@ def _lengths(result: Result, record: FrameRecord) -> tuple[str, dict[str, FloatA
     return units.length, values
 
 
-def _norm(values: FloatArray, std: FloatArray, *, positive: bool) -> Normalize | None:
-    """Colours of a quantity, ruled by the nodes whose uncertainty is ordinary; None where nothing is measured."""
-    known = np.isfinite(values)
-    if not known.any():
-        return None
-    doubtful = std > _DOUBTFUL * np.median(std[known])
-    return colour_scale(values[known & ~doubtful], positive=positive)
-
-
 def _maps(
     result: Result, maps: Mapping[str, tuple[FloatArray, Normalize | None]], colour_map: str, title: str
 ) -> Figure:
-    """One map per nodal field, over the reference where there is one."""
+    """Draw one map per nodal field, over the reference where there is one."""
     x, y = _view(result, result.nodes)
     reference = None if result.reference is None else result.reference.mean(axis=0, dtype=np.float32)
 
@@ -245,7 +366,7 @@ def _maps(
 
 
 def _show_field(axis: Axes, result: Result, values: FloatArray, norm: Normalize, colour_map: str) -> None:
-    """A nodal field with its colour bar; blank where a node of the element is not measured."""
+    """Show a nodal field with its colour bar; blank where a node of the element is not measured."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullFormatter
 
@@ -262,7 +383,7 @@ def _show_field(axis: Axes, result: Result, values: FloatArray, norm: Normalize,
 def _raster(
     result: Result, values: FloatArray
 ) -> tuple[np.ma.MaskedArray[Any, Any], tuple[float, float, float, float]]:
-    """A nodal field on a fine grid, linear inside each element as in the solve, with its extent for `imshow`."""
+    """Sample a nodal field on a fine grid, linear inside each element as in the solve; return it and its extent."""
     from matplotlib.tri import LinearTriInterpolator, Triangulation
 
     blank = ~np.isfinite(values)[result.elements].all(axis=1)
@@ -275,62 +396,44 @@ def _raster(
 
 
 def _shaded(
-    result: Result, frame: int, record: FrameRecord, cover: FloatArray, words: Callable[[FloatArray], str]
+    result: Result, frame: int, record: FrameRecord, cover: FloatArray, title_of: Callable[[FloatArray], str]
 ) -> Figure | None:
-    """The reference of each light where the mesh lies and goes, shaded by a reduced picture (k, h, w) of one frame;
-    `words` tells of what is shown of it. None where no reference was kept."""
+    """Show the reference of each light around the mesh, shaded by a reduced picture (k, h, w) of one frame.
+
+    `title_of` describes the part of a light's picture that is shown. None where no reference was kept.
+    """
     if (reference := result.reference) is None:
         return None
     step, origin = -(-reference.shape[1] // cover.shape[1]), result.reference_origin
     moved = result.nodes + np.stack([record.u, record.v], axis=1)
-    x, y = view = _view(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
+    x, y = _view(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
+    columns, rows = (
+        slice(int((low - first + 0.5) // step), math.ceil((high - first + 0.5) / step))
+        for (low, high), first in zip((x, y), origin, strict=True)
+    )
 
     def draw(axes: list[Axes]) -> None:
         for axis, image, part, light in zip(axes, reference, cover, result.lights, strict=True):
             show_image(axis, image, origin)
             shade(axis, part, step, origin)
-            axis.set_title(literal(f"{light}: {words(part[_inside(view, origin, step)])}"))
+            axis.set_title(literal(f"{light}: {title_of(part[rows, columns])}"))
             finish_picture(axis, x, y, first=axis is axes[0])
 
     title = f"{_frame_title(result, frame, record)}, over the reference image"
     return draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=GAP, title=title)
 
 
-def _view(result: Result, points: FloatArray) -> View:
-    """Limits in x and y of a picture around points, inside the image."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = _MARGIN * (high - low).max()
-    low, high = low - margin, high + margin
+def _view(result: Result, points: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the limits in x and in y of a picture around points (N, 2), inside the image."""
+    low, high = view_limits(points)
     if result.reference is not None:
         first, size = np.array(result.reference_origin), np.array(result.reference.shape[:0:-1])
         low, high = (np.clip(end, first - 0.5, first + size - 0.5) for end in (low, high))
     return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
-def _inside(view: View, origin: tuple[int, int], step: int) -> tuple[slice, slice]:
-    """Rows and columns that a view shows of a picture which begins at `origin` and is reduced by `step`."""
-    columns, rows = (
-        (int((a - first + 0.5) // step), math.ceil((b - first + 0.5) / step))
-        for (a, b), first in zip(view, origin, strict=True)
-    )
-    return slice(*rows), slice(*columns)
-
-
-def _colour_per_frame(axis: Axes, frames: Sequence[int]) -> list[Any]:
-    """A few frames get distinct colours and a legend, many a colour bar."""
-    from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    if len(frames) <= _MANY_FRAMES:
-        return [f"C{index}" for index in range(len(frames))]
-    norm, colours = Normalize(frames[0], frames[-1]), colormaps["viridis"]
-    add_colour_bar(axis, ScalarMappable(norm, colours), label="frame")
-    return [colours(norm(frame)) for frame in frames]
-
-
 def _frame_title(result: Result, frame: int, record: FrameRecord) -> str:
-    """Frame, file and how it ended, in words."""
+    """Return the title of a frame: number, file, status, iterations, fraction of nodes without data."""
     blank = np.isnan(record.u).mean()
     missing = f", {blank:.1%} of the nodes not measured" if blank else ""
     end = QUANTITIES["status"].codes[record.status]

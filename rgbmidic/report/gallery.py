@@ -1,4 +1,4 @@
-"""The pictures that `rgbmidic run` leaves beside a result, `rgbmidic figures` draws later, and a new run removes."""
+"""Pictures in the folder of a result: `rgbmidic run` and `rgbmidic figures` write them, a new run removes them."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ REPORT = "report.html"
 """Name of the report that lies in a result's folder."""
 
 _FRAMES = 3
+"""Frames that get pictures where none are named, as in the report."""
 _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
     "convergence": convergence_figure,
     "residual": residual_figure,
@@ -45,22 +46,22 @@ _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
 }
 _OF_FRAME: Mapping[str, Callable[[Result, int], Figure | None]] = {
     **{kind: partial(map_figure, kind=kind) for kind in MAPS},
-    "shares": lambda result, frame: fraction_figure(result, frame) if len(result.lights) > 1 else None,
+    "fractions": lambda result, frame: fraction_figure(result, frame) if len(result.lights) > 1 else None,
     "masks": mask_figure,
     "reflections": reflection_figure,
 }
 _NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)})_[0-9]{{6,}})\.png")
 _FEW = 5
-"""Pictures for which another process does not pay: it starts in one to two seconds, a picture takes half of one."""
+"""Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.5 s."""
 
 _Picture = tuple[str, int | None]
-"""Kind, and frame if it is of one."""
+"""Kind of a picture, and its frame if it is of one."""
 
 
 def write_figures(
     result: Result, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1
 ) -> tuple[Path, ...]:
-    """Write convergence, residual and brightness of a test, and of some frames maps, masks and reflections.
+    """Write figures of convergence, residual and brightness, and of some frames maps, masks and reflections.
 
     Parameters
     ----------
@@ -72,8 +73,8 @@ def write_figures(
         Indices of the frames that get pictures; None: three deformed ones that did not fail, evenly spaced, the
         last of them included.
     processes
-        How many draw, this one among them. With more than one, a script that calls this must be importable
-        (``if __name__ == "__main__":``), as always with processes.
+        Number of processes that draw, this one included. With more than one, a script that calls this function must
+        be importable (``if __name__ == "__main__":``).
 
     Returns
     -------
@@ -92,11 +93,13 @@ def write_figures(
         folder.mkdir(parents=True, exist_ok=True)
     frames = spread(measured_frames(result), _FRAMES) if frames is None else frames
     for frame in frames:
-        result.frame(frame)  # what is wrong with one is told before the first picture
+        result.frame(frame)  # an error of one is raised before the first picture
     pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]
     pictures += [(kind, frame) for frame in frames for kind in _OF_FRAME]
     parts = max(1, min(processes, len(pictures) // _FEW))
-    with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=_end_when_interrupted) as pool:
+    # Ctrl-C reaches all processes: the others end silently, this one reports it
+    ended = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=ended) as pool:
         bare = replace(result)  # without the quantities that were read, which each process reads for itself
         others = [pool.submit(_draw, bare, folder, pictures[part::parts]) for part in range(1, parts)]
         drawn = {*_draw(result, folder, pictures[::parts])}
@@ -109,13 +112,8 @@ def write_figures(
     return tuple(file for picture in pictures if (file := _file(folder, *picture)) in drawn)
 
 
-def _end_when_interrupted() -> None:
-    """Ctrl-C reaches all processes: this one ends without a word, the first one tells."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
-    """Write pictures, one after the other, so that only one is in memory; the files of those that there are."""
+    """Write pictures one after the other, so that only one is in memory; return the files of those that exist."""
     files = []
     for kind, frame in pictures:
         figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](result, frame)
@@ -130,7 +128,7 @@ def _file(folder: Path, kind: str, frame: int | None) -> Path:
 
 
 def remove_figures(folder: Path | str) -> None:
-    """Remove the pictures that an earlier run left, which would show another result; nothing else is touched.
+    """Remove the pictures that an earlier run left, since they would show another result; nothing else is touched.
 
     Raises
     ------
@@ -144,12 +142,12 @@ def remove_figures(folder: Path | str) -> None:
 
 
 def remove_report(folder: Path | str) -> None:
-    """Remove the report in the folder of a result that was measured anew: it would show another one.
+    """Remove the report in a folder whose result is measured anew, since it would show the earlier one.
 
     Raises
     ------
     ResultError
-        It cannot be removed.
+        The report cannot be removed.
     """
     with writing(Path(folder) / REPORT):
         (Path(folder) / REPORT).unlink(missing_ok=True)

@@ -1,6 +1,6 @@
-"""What was measured with what, row by row, as the iDICs good-practice guide (2018) asks of a test report.
+"""Numbers and rows of a test report as the iDICs Good Practices Guide (2018) asks for them.
 
-What a report says in numbers: the course of a test, its noise floor, the size of its speckle.
+Hardware and analysis parameters as rows of tables, quantiles of the fields over time, noise floor, speckle size.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rgbmidic.report.style import time_axis
 from rgbmidic.results import QUANTITIES, Result, speckle_diameter
 from rgbmidic.settings import SetupSettings
 from rgbmidic.typing import FloatArray
@@ -19,20 +20,19 @@ if TYPE_CHECKING:
     from rgbmidic.results.physical import Physical
 
 __all__ = [
-    "Course",
     "NoiseFloor",
+    "TimeHistory",
     "analysis_rows",
     "hardware_rows",
     "noise_floor",
-    "noise_words",
-    "reference_words",
+    "noise_text",
+    "reference_text",
     "settings_rows",
     "speckle_size",
 ]
 
 Rows = Iterator[tuple[str, str]]
 
-_NAMES = {"stand_off": "stand-off distance", "pattern": "patterning", "lamps": "lamps"}
 _PREFILTERS = {"none": "none", "binomial": "[1 2 1]/4 along x and y", "gaussian": "Gaussian, σ = 1 px"}
 _WEIGHTS = {
     "statistics": "by the statistics of each light's residual, robust",
@@ -42,26 +42,36 @@ _WEIGHTS = {
 }
 
 
-def hardware_rows(told: Physical, setup: SetupSettings) -> Rows:
-    """Camera, optics, light, image, pattern, specimen; what nobody stated names the key that would."""
+def hardware_rows(physical: Physical, setup: SetupSettings) -> Rows:
+    """Yield camera, optics, light, image, pattern, specimen; what is not stated names the key that would state it."""
     for entry in fields(setup):
         if entry.name not in ("pattern", "notes"):
-            yield _NAMES.get(entry.name, entry.name), getattr(setup, entry.name) or _missing(f"setup.{entry.name}")
-    result, shape = told.result, told.result.frame_shape
+            name = "stand-off distance" if entry.name == "stand_off" else entry.name
+            yield name, getattr(setup, entry.name) or _missing(f"setup.{entry.name}")
+    result, shape = physical.result, physical.result.frame_shape
+    scale, std = physical.units.mm_per_pixel, physical.units.mm_per_pixel_std
     yield "lights", ", ".join(result.lights)
     if shape is not None:
         rows, columns = shape
-        scale = told.units.mm_per_pixel
         field = "" if scale is None else f"; field of view {columns * scale:.4g} x {rows * scale:.4g} mm"
         yield "image", f"{columns} x {rows} px{field}"
-    yield "image scale", _scale(told)
-    yield "frame rate", _rate(told)
+    if scale is None:
+        yield "image scale", f"{_missing('scale.mm_per_pixel')}: lengths are in px"
+    else:
+        yield "image scale", f"{scale:.6g} mm per px" + (f" ± {std:.2g} (one standard uncertainty)" if std else "")
+    camera = result.provenance.get("frame_rate")
+    if rate := camera or result.setting("scale", "frame_rate"):
+        origin = "by the camera's file" if camera else "as stated"
+        yield "frame rate", f"{rate:g} frames per second ({origin})"
+    else:
+        missing = f"{_missing('scale.frame_rate')}: time is in frames"
+        yield "frame rate", "the frames' own times" if physical.units.timed else missing
     exposure = result.provenance.get("exposure_ns")
-    yield "exposure", "not told by the files" if exposure is None else f"{exposure / 1000:g} µs"
+    yield "exposure", "not stated by the files" if exposure is None else f"{exposure / 1000:g} µs"
     yield "patterning", setup.pattern or _missing("setup.pattern")
-    size = speckle_size(result)
-    if size is not None:
-        yield "speckle size", f"{told.in_units(size)}, full width at half maximum of the reference's autocorrelation"
+    width = "full width at half maximum of the reference's autocorrelation"
+    if (size := speckle_size(result)) is not None:
+        yield "speckle size", f"{physical.in_units(size)}, {width}"
     if setup.notes:
         yield "notes", setup.notes
 
@@ -70,178 +80,175 @@ def _missing(key: str) -> str:
     return f"not stated (`{key}`)"
 
 
-def _scale(told: Physical) -> str:
-    scale, std = told.units.mm_per_pixel, told.units.mm_per_pixel_std
-    if scale is None:
-        return f"{_missing('scale.mm_per_pixel')}: lengths are in px"
-    return f"{scale:.6g} mm per px" + (f" ± {std:.2g} (one standard uncertainty)" if std else "")
-
-
-def _rate(told: Physical) -> str:
-    stated, camera = (
-        told.result.setting("scale", "frame_rate"),
-        told.result.provenance.get("frame_rate"),
+def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
+    """Yield the parameters of the analysis, in the order of the guide; settings that were not kept are left out."""
+    result, set_, mesh = physical.result, physical.result.setting, physical.mesh
+    demosaic, normalise = set_("illumination", "demosaic"), set_("illumination", "normalise")
+    size = set_("mesh", "element_size")
+    separation = f"demosaicing `{demosaic}`, crosstalk unmixed by calibration"
+    separated = len(result.lights) > 1 and demosaic is not None
+    strain = "plane fitted to the displacements of the nodes in a virtual strain gauge"
+    levels = f"divided by their local mean, σ = {normalise:g} px" if normalise else "as they are"
+    side = physical.in_units(mesh.size if size is None else size)
+    rows = (
+        ("software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"),
+        ("reference", reference_text(physical)),
+        ("separation of the lights", separation if separated else None),
+        ("grey levels", None if normalise is None else levels),
+        ("image filter", _PREFILTERS.get(set_("solver", "prefilter"))),
+        ("weights of the lights", _WEIGHTS.get(set_("weights", "method"))),
+        ("elements", f"{len(mesh.elements)} triangles of three nodes, {len(mesh.nodes)} nodes; side {side}"),
+        ("shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"),
+        ("matching criterion", "weighted sum of squared differences over all lights at once"),
+        ("interpolant", "cubic B-spline"),
+        ("grey-level correction", set_("solver", "brightness")),
+        ("rigid motion between lights", set_("solver", "rigid")),
+        ("strain", f"{physical.measure_name}: {strain}"),
+        ("virtual strain gauge", f"{physical.in_units(physical.gauges.length)}, at every node"),
+        ("smoothing afterwards", "none"),
+        ("noise floor", noise_text(physical, floor)),
     )
-    if camera or stated:
-        return f"{camera or stated:g} frames per second" + (" (by the camera's file)" if camera else " (as stated)")
-    return "the frames' own times" if told.units.timed else f"{_missing('scale.frame_rate')}: time is in frames"
+    yield from ((name, text) for name, text in rows if text is not None)
 
 
-def analysis_rows(told: Physical, floor: NoiseFloor | None) -> Rows:
-    """How the frames were analysed."""
-    result, set_ = told.result, told.result.setting
-    yield "software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"
-    yield "reference", reference_words(told)
-    demosaic = set_("illumination", "demosaic")
-    if len(result.lights) > 1 and demosaic is not None:
-        yield "separation of the lights", f"demosaicing `{demosaic}`, crosstalk unmixed by calibration"
-    normalise = set_("illumination", "normalise")
-    if normalise is not None:
-        yield "grey levels", f"divided by their local mean, σ = {normalise:g} px" if normalise else "as they are"
-    yield from _known("image filter", _PREFILTERS.get(set_("solver", "prefilter")))
-    yield from _known("weights of the lights", _WEIGHTS.get(set_("weights", "method")))
-    yield "elements", _elements(told)
-    yield "shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"
-    yield "matching criterion", "weighted sum of squared differences over all lights at once"
-    yield "interpolant", "cubic B-spline"
-    yield from _known("grey-level correction", set_("solver", "brightness"))
-    yield from _known("rigid motion between lights", set_("solver", "rigid"))
-    length = told.in_units(told.gauges.length)
-    yield "strain", f"{told.measure_name}: plane fitted to the displacements of the nodes in a virtual strain gauge"
-    yield "virtual strain gauge", f"{length}, at every node"
-    yield "smoothing afterwards", "none"
-    yield "noise floor", noise_words(told, floor)
-
-
-def _known(name: str, text: str | None) -> Rows:
-    if text is not None:
-        yield name, text
-
-
-def reference_words(told: Physical) -> str:
-    """Which frames are the reference."""
-    frames = told.result.setting("frames", "reference", list(told.result.provenance["references"]))
+def reference_text(physical: Physical) -> str:
+    """State which frames are the reference."""
+    frames = physical.result.setting("frames", "reference", list(physical.result.provenance["references"]))
     if len(frames) == 1:
         return f"frame {frames[0]}"
-    even = frames == list(range(frames[0], frames[-1] + 1))
-    return f"the mean of {len(frames)} frames, " + (
-        f"{frames[0]} to {frames[-1]}" if even else ", ".join(map(str, frames))
-    )
+    listed = f"{frames[0]} to {frames[-1]}" if _successive(frames) else ", ".join(map(str, frames))
+    return f"the mean of {len(frames)} frames, {listed}"
 
 
-def _elements(told: Physical) -> str:
-    mesh, size = told.mesh, told.result.setting("mesh", "element_size")
-    stated = told.in_units(mesh.size if size is None else size)
-    return f"{len(mesh.elements)} triangles of three nodes, {len(mesh.nodes)} nodes; side {stated}"
+def _successive(numbers: Sequence[int]) -> bool:
+    return list(numbers) == list(range(numbers[0], numbers[-1] + 1))
 
 
-def noise_words(told: Physical, floor: NoiseFloor | None) -> str:
-    """What static frames scatter by, one standard deviation."""
+def noise_text(physical: Physical, floor: NoiseFloor | None) -> str:
+    """State the noise floor, one standard deviation of each component."""
     if floor is None:
-        return 'not known: one static frame only; `reference = "0:20"` of frames before the test would tell it'
+        return 'not known: one static frame only; `reference = "0:20"` of frames before the test would show it'
     u, v, *strain = floor.measured.values()
     parts = ", ".join(f"{name} {value * 1e6:.3g}" for name, value in zip(("exx", "eyy", "exy"), strain, strict=True))
-    length = told.units.length
+    length = physical.units.length
     return f"u {u:.3g} {length}, v {v:.3g} {length}; {parts} µm/m (one standard deviation, {floor.count} static frames)"
 
 
 def settings_rows(settings: Mapping[str, Mapping[str, Any]]) -> Rows:
-    """Every key of the settings that says something, with its value; the words of ``[setup]`` stand elsewhere."""
+    """Yield every key of the settings with its value, but for empty lists and for ``[setup]``, which stands elsewhere.
+
+    More than twelve integers in succession are written as their first and last.
+    """
     for section, keys in settings.items():
         for key, value in keys.items():
             if section != "setup" and value != []:
-                yield f"{section}.{key}", _short(value)
+                long = isinstance(value, list) and len(value) > 12 and all(isinstance(entry, int) for entry in value)
+                yield f"{section}.{key}", f"{value[0]} to {value[-1]}" if long and _successive(value) else str(value)
 
 
-def _short(value: Any) -> str:
-    if isinstance(value, list) and len(value) > 12 and all(isinstance(entry, int) for entry in value):
-        step = np.diff(value)
-        if (step == 1).all():
-            return f"{value[0]} to {value[-1]}"
-    return str(value)
-
-
-_TOLD = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "misfit")
+_READ = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "misfit")
 _QUANTILES = (0.05, 0.5, 0.95)
+"""Median, and the band that holds 90 % of the nodes."""
 _STATIC = 50
-"""Static frames that a noise floor is taken from at most: it is known to 2 % then."""
+"""Static frames that a noise floor is taken from at most. A standard deviation over n frames and N nodes has the
+relative uncertainty 1 / sqrt(2 n N) for independent nodes: below 1 % from 100 nodes on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Course:
-    """What the nodes of some frames tell, frame by frame.
+class TimeHistory:
+    """Quantiles over the nodes of the fields of some frames, frame by frame.
 
     Attributes
     ----------
     frames : tuple of int, length F
-        Places in the result.
-    times : ndarray, shape (F,)
-        In the unit of `Physical.units`.
+        Indices of the frames in the result.
+    axis : tuple of ndarray, shape (F,), and str
+        Times, or numbers of the frames where no time is known, and the label of the axis.
+    timed : bool
+        Whether the times are known.
     quantiles : dict
         Of each quantity the 5 %, 50 % and 95 % quantile over the nodes, shape (F, 3); NaN where nothing is measured.
-    shares : ndarray, shape (F, S)
-        Share of the nodes with each `node_status`.
+    fractions : ndarray, shape (F, S)
+        Fraction of the nodes with each `node_status`.
     fastest : float
         Largest velocity of a node between two neighbouring ones of these frames, px per unit of time; 0 where unknown.
     """
 
     frames: tuple[int, ...]
-    times: FloatArray
+    axis: tuple[FloatArray, str]
+    timed: bool
     quantiles: dict[str, FloatArray]
-    shares: FloatArray
+    fractions: FloatArray
     fastest: float
 
     @classmethod
-    def of(cls, told: Physical, frames: Sequence[int]) -> Course:
-        """Of these frames, one after the other; a `ResultError` where one is damaged."""
-        rows: dict[str, list[FloatArray]] = {name: [] for name in _TOLD}
+    def of(cls, physical: Physical, frames: Sequence[int]) -> TimeHistory:
+        """Read frames of a result one after the other.
+
+        Parameters
+        ----------
+        physical
+            The result in the units of its scale.
+        frames
+            Indices of the frames.
+
+        Returns
+        -------
+        TimeHistory
+            Their quantiles.
+
+        Raises
+        ------
+        ResultError
+            A frame is damaged.
+        """
+        rows: dict[str, list[FloatArray]] = {name: [] for name in _READ}
         codes = range(len(QUANTITIES["node_status"].codes))
-        shares, fastest, before = [], 0.0, None
+        fractions, fastest, before = [], 0.0, None
         for frame in frames:
-            values = told.frame(frame)
+            values = physical.frame(frame)
             for name, row in rows.items():
-                row.append(_quantiles(values[name]))
-            shares.append([float((values["node_status"] == code).mean()) for code in codes])
-            here = np.stack([values["u"], values["v"]]) / told.length
+                known = values[name][np.isfinite(values[name])]
+                row.append(np.quantile(known, _QUANTILES) if known.size else np.full(len(_QUANTILES), np.nan))
+            fractions.append([float((values["node_status"] == code).mean()) for code in codes])
+            here = np.stack([values["u"], values["v"]]) / physical.length
             if before is not None:
-                step = np.hypot(*(here - before[1])) / (told.times[frame] - told.times[before[0]])
+                step = np.hypot(*(here - before[1])) / (physical.times[frame] - physical.times[before[0]])
                 fastest = max(fastest, float(np.nan_to_num(step).max(initial=0)))
             before = frame, here
+        chosen = list(frames)
         return cls(
             frames=tuple(frames),
-            times=told.times[list(frames)],
+            axis=time_axis(physical.times[chosen] if physical.units.timed else None, physical.result.number[chosen]),
+            timed=physical.units.timed,
             quantiles={name: np.array(row) for name, row in rows.items()},
-            shares=np.array(shares),
+            fractions=np.array(fractions),
             fastest=fastest,
         )
 
-    def median(self, name: str) -> float:
-        """Median over the frames of a quantity's median over the nodes; NaN where nothing is measured."""
+    def medians(self, name: str) -> FloatArray:
+        """Return the medians over the nodes of a quantity, of the frames in which it is finite; else one NaN."""
         known = self.quantiles[name][:, 1]
-        known = known[np.isfinite(known)]
-        return float(np.median(known)) if known.size else float("nan")
+        return known[np.isfinite(known)] if np.isfinite(known).any() else np.array([np.nan])
+
+    def median(self, name: str) -> float:
+        """Return the median over the frames of a quantity's median over the nodes; NaN where nothing is measured."""
+        return float(np.median(self.medians(name)))
+
+    def extreme(self, name: str) -> float:
+        """Return the value farthest from 0 of a quantity's median over the nodes; NaN where nothing is measured."""
+        return float(max(self.medians(name), key=abs))
 
     @property
     def farthest(self) -> int:
-        """The frame whose median node has moved farthest."""
-        way = np.hypot(self.quantiles["u"][:, 1], self.quantiles["v"][:, 1])
-        return self.frames[int(np.nan_to_num(way).argmax())]
-
-    def extreme(self, name: str) -> float:
-        """The value farthest from 0 of a quantity's median over the nodes; NaN where nothing is measured."""
-        known = self.quantiles[name][:, 1]
-        known = known[np.isfinite(known)]
-        return float(known[np.abs(known).argmax()]) if known.size else float("nan")
-
-
-def _quantiles(values: FloatArray) -> FloatArray:
-    known = values[np.isfinite(values)]
-    return np.quantile(known, _QUANTILES) if known.size else np.full(len(_QUANTILES), np.nan)
+        """The frame whose median displacement is the largest."""
+        length = np.hypot(self.quantiles["u"][:, 1], self.quantiles["v"][:, 1])
+        return self.frames[int(np.nan_to_num(length).argmax())]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoiseFloor:
-    """Scatter of what static frames show, one standard deviation, as that of a single frame against the reference.
+    """Noise floor: standard deviation of the fields of static frames, as of a single frame against the reference.
 
     Attributes
     ----------
@@ -255,19 +262,29 @@ class NoiseFloor:
     measured: dict[str, float]
 
 
-def noise_floor(told: Physical) -> NoiseFloor | None:
-    """Noise floor from the frames of the reference, where several of them are measured; else None.
+def noise_floor(physical: Physical) -> NoiseFloor | None:
+    """Estimate the noise floor from the frames of the reference.
 
-    The reference is their mean, which does not move what they scatter around. A frame of its own scatters against the
-    mean of n by the factor sqrt(1 + 1/n) more than they do around theirs.
+    The reference is the mean of n frames; the differences of these frames among each other do not depend on it. Another
+    frame scatters against the mean by sqrt(1 + 1/n) more than they do around their own mean.
+
+    Parameters
+    ----------
+    physical
+        The result in the units of its scale.
+
+    Returns
+    -------
+    NoiseFloor or None
+        None where fewer than two frames of the reference are measured.
     """
-    result, names = told.result, ("u", "v", "exx", "eyy", "exy")
+    result, names = physical.result, ("u", "v", "exx", "eyy", "exy")
     static = [place for place in result.provenance["references"] if result.status[place] != 2][:_STATIC]
     if len(static) < 2:
         return None
     sums, squares = np.zeros((2, len(names), len(result.nodes)))
     for frame in static:
-        values = told.frame(frame)
+        values = physical.frame(frame)
         one = np.stack([values[name] for name in names]).astype(np.float64)
         sums, squares = sums + one, squares + one**2
     count = len(static)
@@ -279,10 +296,10 @@ def noise_floor(told: Physical) -> NoiseFloor | None:
 
 
 def speckle_size(result: Result) -> float | None:
-    """Full width at half maximum (px) of the reference's autocorrelation, around the mesh; None where none is kept.
+    """Return the full width at half maximum (px) of the reference's autocorrelation; None where none was kept.
 
-    The median over the lights. The pictures are those of the separated lights, filled in at all pixels; `rgbmidic
-    inspect` looks at the samples themselves.
+    It is the median over the lights, around the mesh, of the separated images, which are interpolated at all pixels;
+    `rgbmidic inspect` evaluates the samples themselves.
     """
     if result.reference is None:
         return None

@@ -1,32 +1,34 @@
-"""What a page of a result shows, as the address of the page holds it: it can be kept, and opened again as it was."""
+"""State of the view of a result, as the address of its page holds it: it can be kept and opened again."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 from urllib.parse import urlencode
 
-__all__ = ["KINDS", "OVER", "Look", "Mark"]
+__all__ = ["KINDS", "OVER", "Mark", "ViewState", "probe_marks"]
 
 KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1}
 """Probes that can be set with the pointer, and how many places each takes."""
 OVER = ("reference", "deformed")
 _MOST_MARKS = 200
+"""Marks that an address may set: it has 8 kB at most, of some 25 a mark."""
 _CHOICES = {"over": OVER, "range": ("frame", "test", "hand"), "theme": ("light", "dark")}
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A place that belongs to a probe.
+    """A place on the reference that belongs to a probe.
 
     Attributes
     ----------
     kind
         One of `KINDS`; those that take two places take marks of their kind in pairs.
     x, y
-        In px on the reference.
+        Place in px on the reference.
     """
 
     kind: str
@@ -34,20 +36,29 @@ class Mark:
     y: float
 
 
+def probe_marks(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
+    """Return the marks of each complete probe by its name, such as ``point_1``: those of a kind in the order set."""
+    found: dict[str, list[Mark]] = {}
+    for kind, count in KINDS.items():
+        own = [mark for mark in marks if mark.kind == kind]
+        found |= {f"{kind}_{n + 1}": own[n * count : (n + 1) * count] for n in range(len(own) // count)}
+    return found
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
-    """What is looked at.
+class ViewState:
+    """Frame, field, colours, part of the image and probes in view.
 
     Attributes
     ----------
     frame
-        Place in the result.
+        Index of the frame in the result.
     field
         Name of the field.
     over
-        What it lies over: the ``"reference"`` image, or the ``"deformed"`` one of the frame.
+        Image under the field: the ``"reference"``, or the ``"deformed"`` one of the frame.
     range
-        What rules the colours: this ``"frame"``, the whole ``"test"``, or `low` and `high` (``"hand"``).
+        Source of the colour range: this ``"frame"``, the whole ``"test"``, or `low` and `high` (``"hand"``).
     low, high
         Ends of the colours by hand.
     symmetric
@@ -55,7 +66,7 @@ class Look:
     directions
         Whether principal directions are drawn.
     opacity
-        Of the field, from 0 to 1.
+        Opacity of the field, from 0 to 1.
     curve
         Quantity of the probes whose curve is shown; empty: the first.
     theme
@@ -82,21 +93,37 @@ class Look:
 
     @classmethod
     def from_query(cls, query: Mapping[str, Sequence[bytes]], *, frames: int, names: Sequence[str], frame: int) -> Self:
-        """What an address asks for, as far as it makes sense for a result of `frames` frames with these fields; what
-        does not is as if it were not said, and `frame` stands for a frame that is not said."""
-        told = {key: values[-1].decode("utf-8", "replace") for key, values in query.items() if values}
-        asked = {entry.name: _value(entry.name, told.get(entry.name, ""), names) for entry in fields(cls)}
+        """Read the view from an address; parts that are invalid are left at their defaults.
+
+        Parameters
+        ----------
+        query
+            Values of the address by their keys; the last one of each counts.
+        frames
+            Number of frames of the result.
+        names
+            Names of its fields.
+        frame
+            Index of the frame where the address states none.
+
+        Returns
+        -------
+        ViewState
+            A valid view of the result.
+        """
+        texts = {key: values[-1].decode("utf-8", "replace") for key, values in query.items() if values}
+        asked = {entry.name: _value(entry.name, texts.get(entry.name, ""), names) for entry in fields(cls)}
         known: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-        look = cls(**{"frame": frame, **known})
-        look, plain = replace(look, frame=min(max(look.frame, 0), frames - 1)), cls()
-        return look if look.low < look.high else replace(look, low=plain.low, high=plain.high, range="frame")
+        view = cls(**{"frame": frame, **known})
+        view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1)), cls()
+        return view if view.low < view.high else replace(view, low=plain.low, high=plain.high, range="frame")
 
     def query(self) -> str:
-        """What the address says beside the frame: all that is not as at the beginning."""
+        """Return the address without the frame: all that differs from the defaults."""
         plain = type(self)()
         kept = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "frame"}
-        told = {name: _text(value) for name, value in kept.items() if value != getattr(plain, name)}
-        return urlencode(told, safe=":,;")
+        texts = {name: _text(value) for name, value in kept.items() if value != getattr(plain, name)}
+        return urlencode(texts, safe=":,;")
 
 
 def _text(value: object) -> str:
@@ -108,7 +135,7 @@ def _text(value: object) -> str:
 
 
 def _value(name: str, text: str, names: Sequence[str]) -> object:
-    """What a text means for an entry; None where it means nothing."""
+    """Return the value that a text states for an entry; None where it is invalid."""
     try:
         if name == "frame":
             return int(text)
@@ -121,7 +148,9 @@ def _value(name: str, text: str, names: Sequence[str]) -> object:
             left, top, right, bottom = map(_number, text.split(","))
             return (left, top, right, bottom) if left < right and top < bottom else None
         if name == "marks":
-            return tuple(map(_mark, text.split(";")[:_MOST_MARKS]))
+            places = [re.split("[:,]", mark) for mark in text.split(";")[:_MOST_MARKS]]
+            marks = tuple(Mark(kind, _number(x), _number(y)) for kind, x, y in places)
+            return marks if all(mark.kind in KINDS for mark in marks) else None
     except ValueError:
         return None
     if name == "field":
@@ -129,14 +158,6 @@ def _value(name: str, text: str, names: Sequence[str]) -> object:
     if name in _CHOICES:
         return text if text in _CHOICES[name] else None
     return text[:100]
-
-
-def _mark(text: str) -> Mark:
-    kind, _, place = text.partition(":")
-    x, y = place.split(",")
-    if kind not in KINDS:
-        raise ValueError(kind)
-    return Mark(kind, _number(x), _number(y))
 
 
 def _number(text: str) -> float:

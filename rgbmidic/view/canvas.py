@@ -1,9 +1,4 @@
-"""The plot that shows a window of the image: it tells when another part is in view, and takes marks.
-
-Principal directions of the strain, as short lines on the field.
-
-Pictures of one frame side by side: raw, its separated lights, their reflection index.
-"""
+"""Plots of the image window with its field and marks, of principal directions on it, and of small pictures in rows."""
 
 from __future__ import annotations
 
@@ -11,56 +6,45 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import bokeh.models as bk
 import cv2
 import numpy as np
 import numpy.typing as npt
 from bokeh.core.property.descriptors import UnsetValueError
 from bokeh.document import Document
 from bokeh.events import RangesUpdate
-from bokeh.models import (
-    BoxZoomTool,
-    ColorBar,
-    ColumnDataSource,
-    LinearColorMapper,
-    PanTool,
-    PointDrawTool,
-    Range1d,
-    ResetTool,
-    SaveTool,
-    WheelZoomTool,
-)
 from bokeh.plotting import figure
 
+from rgbmidic.report.style import view_limits
 from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.address import Mark
 from rgbmidic.view.picture import Window
 
 __all__ = ["Canvas", "DirectionLayer", "Tiles", "small"]
 
-_MARGIN = 0.06
 _BAR = 80
-"""Px of the screen for the colour bar, whose numbers change with the frame."""
+"""Px of the screen for the colour bar: seven digits of 12 px, which change with the frame."""
 _SOON = 40
-"""Ms that a view which moves waits for its next move."""
+"""Ms in which the moves of a view are collected: the picture follows at 25 a second."""
 
 
 def small(plot: Any) -> None:
-    """Let the letters at the axes of a plot be those of the page, light or dark."""
+    """Set the size of the text at the axes of a plot to that of the page."""
     for axis in plot.axis:
         axis.update(major_label_text_font_size="12px", axis_label_text_font_size="12px")
 
 
 class Canvas:
-    """The plot, and what is drawn on it.
+    """Plot of a window of the image: field, colour bar, marks, and the tools to move it and to set marks.
 
     Parameters
     ----------
     document
-        Of the page.
+        Document of the page.
     kinds
-        Of the marks that can be set, a tool for each.
+        Kinds of the marks that can be set, with a tool each.
     edges
-        (left, top, right, bottom) of what is in view at first, px.
+        Edges (left, top, right, bottom) of the view at first, px.
     redraw
         Called when another part, or another size, is in view.
 
@@ -69,9 +53,9 @@ class Canvas:
     plot, marks, tools
         The plot, the marks on it, and its tools: to move it, then one for each of `kinds`.
     window
-        What is in view.
+        The part of the image in view.
     wanted
-        Edges of what shall be in view, before the plot's shape adds to it.
+        Edges that were asked for, before the plot's shape adds to them.
     """
 
     def __init__(
@@ -81,8 +65,8 @@ class Canvas:
         self.window = Window(left=left, top=top, right=right, bottom=bottom, width=800, height=600).fitted()
         self._document, self._redraw, self._coming = document, redraw, False
         self.plot = figure(
-            x_range=Range1d(self.window.left, self.window.right),
-            y_range=Range1d(self.window.bottom, self.window.top),
+            x_range=bk.Range1d(self.window.left, self.window.right),
+            y_range=bk.Range1d(self.window.bottom, self.window.top),
             title=" ",
             sizing_mode="stretch_both",
             min_border=4,
@@ -93,21 +77,23 @@ class Canvas:
             toolbar_location="above",
         )
         self.plot.grid.visible = False
-        self._image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")}, name="image")
+        self._image = bk.ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")}, name="image")
         self.plot.image_rgba("image", "x", "y", "dw", "dh", source=self._image)
-        self.colours = LinearColorMapper(palette=["#000000"], low=0, high=1, name="colours")
-        self.bar = ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
+        self.colours = bk.LinearColorMapper(palette=["#000000"], low=0, high=1, name="colours")
+        self.bar = bk.ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
         small(self.plot)
         self.plot.add_layout(self.bar, "right")
-        self.marks = ColumnDataSource({"x": [], "y": [], "kind": []}, name="marks")
+        self.marks = bk.ColumnDataSource({"x": [], "y": [], "kind": []}, name="marks")
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
         self._dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
-        pan, wheel = PanTool(), WheelZoomTool(zoom_on_axis=False)
+        pan, wheel = bk.PanTool(), bk.WheelZoomTool(zoom_on_axis=False)
         draw = [
-            PointDrawTool(renderers=[self._dots], default_overrides={"kind": kind}, visible=False) for kind in kinds
+            bk.PointDrawTool(renderers=[self._dots], default_overrides={"kind": kind}, visible=False) for kind in kinds
         ]
         self.tools = (pan, *draw)
-        self.plot.add_tools(pan, wheel, BoxZoomTool(match_aspect=True), ResetTool(), SaveTool(filename="field"), *draw)
+        self.plot.add_tools(
+            pan, wheel, bk.BoxZoomTool(match_aspect=True), bk.ResetTool(), bk.SaveTool(filename="field"), *draw
+        )
         self.plot.toolbar.active_drag, self.plot.toolbar.active_scroll, self.plot.toolbar.logo = pan, wheel, None
         self.plot.on_event(RangesUpdate, self._moved)
         for name in ("inner_width", "inner_height"):
@@ -115,24 +101,23 @@ class Canvas:
 
     @staticmethod
     def around(points: FloatArray) -> tuple[float, ...]:
-        """Edges of a view of points (N, 2) with a margin."""
-        low, high = points.min(axis=0), points.max(axis=0)
-        margin = _MARGIN * float((high - low).max())
-        return (*(low - margin).tolist(), *(high + margin).tolist())
+        """Return the edges (left, top, right, bottom) of a view of points (N, 2) with a margin."""
+        low, high = view_limits(points)
+        return (*low.tolist(), *high.tolist())
 
     def show(self, image: AnyArray) -> None:
-        """Show a picture of the window, (rows, columns), uint32."""
+        """Show a picture (rows, columns), uint32, of the window."""
         w = self.window
         place = {"x": [w.left], "y": [w.top], "dw": [w.right - w.left], "dh": [w.bottom - w.top]}
         self._image.data = {"image": [image], **place}
 
     def clear(self) -> None:
-        """Show no picture, nor what its colours would mean."""
+        """Show neither picture nor colour bar."""
         self._image.data = {name: [] for name in self._image.data}
         self.plot.title.text, self.bar.visible = " ", False
 
     def colour(self, ends: tuple[float, float], colours: Sequence[str], title: str) -> None:
-        """What the colours mean."""
+        """Set the colour bar: values of its ends, its colours and its title."""
         self.plot.title.text, self.bar.visible = title, True
         self.colours.update(low=ends[0], high=ends[1])
         if self.colours.palette != list(colours):  # which takes as long to check as a frame to paint
@@ -145,16 +130,16 @@ class Canvas:
         return [Mark(str(k), float(x), float(y)) for x, y, k in zip(data["x"], data["y"], data["kind"], strict=True)]
 
     def place(self, marks: Sequence[Mark]) -> None:
-        """Put marks on the plot."""
+        """Place marks on the plot, unless they are there."""
         if list(marks) != self.set:
             data = {"x": [m.x for m in marks], "y": [m.y for m in marks], "kind": [m.kind for m in marks]}
             self.marks.data = data
 
     def resize(self) -> None:
-        """Take the size that the browser tells."""
+        """Take the size that the browser reports."""
         try:
             width, height = self.plot.inner_width, self.plot.inner_height
-        except UnsetValueError:  # it has not told yet
+        except UnsetValueError:  # it has not reported yet
             return
         if min(width, height) > 1 and (width, height) != (self.window.width, self.window.height):
             left, top, right, bottom = self.wanted
@@ -169,40 +154,47 @@ class Canvas:
             self._set(new)
 
     def _set(self, window: Window) -> None:
-        """Show another window, once for all that comes within a few ms."""
+        """Show another window, once for all moves within a few ms."""
         self.window = window.fitted()
         if not np.allclose(self.window.edges, window.edges):
             self.plot.x_range.update(start=self.window.left, end=self.window.right)
             self.plot.y_range.update(start=self.window.bottom, end=self.window.top)
+
+        def come() -> None:
+            self._coming = False
+            self._redraw()
+
         if not self._coming:
             self._coming = True
-            self._document.add_timeout_callback(self._come, _SOON)
-
-    def _come(self) -> None:
-        self._coming = False
-        self._redraw()
+            self._document.add_timeout_callback(come, _SOON)
 
 
 _ACROSS = 24
-"""Lines across the view: enough to follow the directions, few enough to tell them apart."""
+"""Lines across the view. Chosen: they follow the directions and do not touch each other."""
 _COLUMNS = ("x0", "y0", "x1", "y1")
 
 
 class DirectionLayer:
-    """Lines along the larger principal strain on a canvas."""
+    """Lines along the larger principal strain on a canvas.
+
+    Parameters
+    ----------
+    canvas
+        Plot on which they are drawn.
+    """
 
     def __init__(self, canvas: Canvas) -> None:
-        self._canvas, self._lines = canvas, ColumnDataSource({name: [] for name in _COLUMNS}, name="directions")
+        self._canvas, self._lines = canvas, bk.ColumnDataSource({name: [] for name in _COLUMNS}, name="directions")
         for colour, width in (("#15181c", 3.0), ("#ffffff", 1.4)):
             canvas.plot.segment(*_COLUMNS, source=self._lines, line_color=colour, line_width=width)
 
     def hide(self) -> None:
-        """Show none."""
+        """Show no lines."""
         if len(self._lines.data["x0"]):
             self._lines.data = {name: [] for name in _COLUMNS}
 
     def show(self, nodes: FloatArray, degrees: FloatArray) -> None:
-        """Show the directions (N,), in degrees from x towards y, of nodes at (N, 2), evenly thinned out."""
+        """Show the directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
         window = self._canvas.window
         cell = max(window.right - window.left, window.bottom - window.top) / _ACROSS
         known = np.flatnonzero(np.isfinite(degrees) & np.isfinite(nodes).all(axis=1))
@@ -222,14 +214,14 @@ _TILES_COLUMNS = ("image", "x", "y", "dw", "name")
 
 
 class Tiles:
-    """The plot of the pictures; hidden until there are some."""
+    """Plot of small pictures in rows; hidden until there are some."""
 
     def __init__(self) -> None:
-        self._shown = ColumnDataSource({name: [] for name in _TILES_COLUMNS}, name="tiles")
+        self._shown = bk.ColumnDataSource({name: [] for name in _TILES_COLUMNS}, name="tiles")
         self.plot = figure(
             sizing_mode="scale_width",
-            x_range=Range1d(0, 1),
-            y_range=Range1d(1, 0),
+            x_range=bk.Range1d(0, 1),
+            y_range=bk.Range1d(1, 0),
             tools=[],
             toolbar_location=None,
             min_border=0,
@@ -246,7 +238,7 @@ class Tiles:
         self.plot.text("x", "y", "name", source=self._shown, **letters)
 
     def show(self, rows: Sequence[Mapping[str, npt.NDArray[np.uint8]]]) -> None:
-        """Show rows of pictures (H, W) of one size by their names, the ends of the rows one below the other."""
+        """Show rows of pictures (H, W) of one size by their names, aligned at the right."""
         height, width = next(iter(rows[0].values())).shape
         tall = height / width
         across = max(map(len, rows))

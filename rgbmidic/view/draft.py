@@ -1,9 +1,4 @@
-"""The TEST.toml that a page sets up: read as far as it goes, changed where the page says so, comments kept.
-
-The region of interest as it is drawn: marks on the image, and the ``[region]`` that they make.
-
-The region of interest as it is drawn on a frame: marks that can be undone, and the lines they make.
-"""
+"""Draft of a TEST.toml, whose comments are kept, and its region of interest: marks on the image, drawn as lines."""
 
 from __future__ import annotations
 
@@ -25,7 +20,7 @@ from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_
 from rgbmidic.view.address import Mark
 from rgbmidic.view.canvas import Canvas
 
-__all__ = ["HOLES", "OUTLINES", "Draft", "Sketch", "arranged", "marks_of", "region_of", "rings"]
+__all__ = ["HOLES", "OUTLINES", "Draft", "RegionDrawing", "arranged", "marks_of", "region_of", "rings"]
 
 _FILES = (("calibration", "file"), ("region", "mask"), ("weights", "geometry"), ("weights", "height_map"))
 """Keys that name files, beside the frames."""
@@ -38,9 +33,9 @@ class Draft:
     Attributes
     ----------
     file
-        Where it is, or will be written.
+        Path of the TEST.toml, which may not exist yet.
     text
-        What it says.
+        Its content.
     """
 
     file: Path
@@ -48,12 +43,22 @@ class Draft:
 
     @classmethod
     def of(cls, path: Path) -> Self:
-        """Of a TEST.toml, or a new one ``TEST.toml`` here for frames: a movie, a folder or a pattern.
+        """Read a TEST.toml, or begin one in the working directory for frames.
+
+        Parameters
+        ----------
+        path
+            A TEST.toml, or the frames: a movie, a folder or a pattern.
+
+        Returns
+        -------
+        Draft
+            The draft.
 
         Raises
         ------
         ConfigurationError
-            The file is missing or not TOML, or says nothing of the frames.
+            The file is missing, is not TOML, or does not name the frames.
         """
         if path.suffix.lower() == ".toml":
             read_toml(path, "settings file")
@@ -72,35 +77,45 @@ class Draft:
         return tomllib.loads(self.text)
 
     def section(self, name: str) -> dict[str, Any]:
-        """One section; empty where it is not there."""
+        """Return one section; empty where it is not there."""
         found = self.document.get(name, {})
         return found if isinstance(found, dict) else {}
 
     @property
     def frames(self) -> FrameSettings:
-        """The frames; errors as `TestSettings.from_mapping`."""
+        """The settings of the frames; errors as `TestSettings.from_mapping`."""
         if "path" not in self.section("frames"):
             raise ConfigurationError("frames.path is missing")
         return read_section(FrameSettings, "frames", self.section("frames"), self.file.parent)
 
     @property
     def region(self) -> RegionSettings | None:
-        """The region; None where there is none yet."""
+        """The settings of the region; None where there is none yet."""
         content = self.section("region")
         return read_section(RegionSettings, "region", content, self.file.parent) if content else None
 
     @property
     def settings(self) -> TestSettings:
-        """All of it; errors as `TestSettings.from_mapping`."""
+        """The settings of the test; errors as `TestSettings.from_mapping`."""
         return TestSettings.from_mapping(self.document, self.file.parent)
 
     def changed(self, sections: Mapping[str, Mapping[str, Any]]) -> Self:
-        """With other values of some keys, None for a key that goes; comments and order stay.
+        """Return the draft with other values of some keys; comments and order stay.
+
+        Parameters
+        ----------
+        sections
+            Values by section and key; None removes a key.
+
+        Returns
+        -------
+        Draft
+            The changed draft.
 
         Raises
         ------
         ConfigurationError
-            The file is written in a way in which that cannot be done.
+            The TOML is written in a form that cannot be changed without losing something.
         """
         expected = {name: dict(content) for name, content in self.document.items()}
         document = tomlkit.parse(self.text)
@@ -108,8 +123,11 @@ class Draft:
             for name, content in sections.items():
                 section: Any = document.setdefault(name, tomlkit.table())
                 for key, value in content.items():
-                    _change(section, key, value)
-                    _change(expected.setdefault(name, {}), key, value)
+                    for target in (section, expected.setdefault(name, {})):
+                        if value is None:
+                            target.pop(key, None)
+                        elif target.get(key) != value:
+                            target[key] = value
         except (TOMLKitError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"{self.file} cannot be changed: {error}") from None
         changed = replace(self, text=tomlkit.dumps(document))
@@ -118,59 +136,61 @@ class Draft:
         return changed
 
     def at(self, file: Path) -> Self:
-        """The same in another place.
+        """Return the draft at another path.
+
+        Parameters
+        ----------
+        file
+            Path of the TEST.toml, relative to the folder of the present one.
+
+        Returns
+        -------
+        Draft
+            The draft with that path.
 
         Raises
         ------
         ConfigurationError
-            It would no longer find what it names relative to where it was, or the name does not end in .toml.
+            The name does not end in .toml, or files that the draft names by relative paths would not be found.
         """
         file = self.file.parent / file
         if file.suffix.lower() != ".toml":
             raise ConfigurationError(f"{file} must end in .toml")
-        if file.parent != self.file.parent and any(not Path(text).is_absolute() for text in self._paths()):
+        frames = self.section("frames").get("path", [])
+        named = [frames] if isinstance(frames, str) else list(frames)
+        named += [text for section, key in _FILES if (text := self.section(section).get(key)) is not None]
+        if file.parent != self.file.parent and any(not Path(text).is_absolute() for text in named):
             raise ConfigurationError(
                 f"{file} must stay in {self.file.parent}: what it names is relative to that folder"
             )
         return replace(self, file=file)
 
-    def _paths(self) -> list[str]:
-        named = self.section("frames").get("path", [])
-        texts = [named] if isinstance(named, str) else list(named)
-        return texts + [text for section, key in _FILES if (text := self.section(section).get(key)) is not None]
-
     def write(self) -> None:
-        """Write it, once it is a whole test.
+        """Write the TEST.toml.
 
         Raises
         ------
         ConfigurationError
-            It is not; the message names the key.
+            The draft is not a complete test; the message names the key.
         ResultError
-            The disk refuses.
+            The file cannot be written.
         """
         _ = self.settings
         write_complete(self.file, lambda file: file.write(self.text.encode("utf-8")))
 
 
-def _change(section: Any, key: str, value: Any) -> None:
-    if value is None:
-        section.pop(key, None)
-    elif section.get(key) != value:
-        section[key] = value
-
-
 OUTLINES = {"rectangle": 2, "polygon": 3, "circle": 2}
 """Kinds of an outline and the marks that it takes at least: opposite corners; corners; the centre and a place on it."""
 HOLES = {"hole": 3, "round hole": 2}
+"""Kinds of a hole and the marks that it takes at least."""
 _ROUND = 48
-"""Corners of the polygon that stands for a circle: within .2 % of its radius, half a pixel of one of 230 px."""
+"""Corners of the polygon that stands for a circle: within 1 - cos(pi / 48) = 0.2 % of its radius."""
 
 Ring = list[list[float]]
 
 
 def arranged(marks: Sequence[Mark], new: str) -> tuple[Mark, ...]:
-    """The marks after one of the kind `new` was set: there is one outline, of the kind that was drawn last."""
+    """Return the marks after one of the kind `new` was set: there is one outline, of the kind drawn last."""
     if new not in OUTLINES:
         return tuple(marks)
     kept = [mark for mark in marks if mark.kind == new or mark.kind not in OUTLINES]
@@ -181,12 +201,12 @@ def arranged(marks: Sequence[Mark], new: str) -> tuple[Mark, ...]:
 
 
 def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
-    """What ``[region]`` says of an outline and its holes, in plain values; None where no outline is complete."""
+    """Return the keys of ``[region]`` for an outline and its holes; None where no outline is complete."""
     outline = next((kind for kind in OUTLINES if any(mark.kind == kind for mark in marks)), "")
     own = [(mark.x, mark.y) for mark in marks if mark.kind == outline]
     if not outline or len(own) < OUTLINES[outline]:
         return None
-    holes = [ring for ring, _ in _holes(marks)]
+    holes = _holes(marks)
     if outline == "rectangle":
         (x0, y0), (x1, y1) = own
         shape: dict[str, Any] = {"rectangle": _rounded([min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)])}
@@ -196,18 +216,18 @@ def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
 
 
 def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:
-    """The outline and the holes, each as a closed line to draw; what is not complete yet as far as it goes."""
+    """Return the corners of the outline, as far as it is drawn, and of the complete holes."""
     region = region_of(marks) or {}
     if "rectangle" in region:
         x0, y0, x1, y1 = region["rectangle"]
         outline = [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]
     else:
         outline = region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES]
-    return outline, [ring for ring, _ in _holes(marks)]
+    return outline, _holes(marks)
 
 
 def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
-    """The marks that make a region; none for a mask."""
+    """Return the marks that make a region; none for a mask."""
     if region.rectangle is not None:
         x0, y0, x1, y1 = region.rectangle
         outline = [Mark("rectangle", x0, y0), Mark("rectangle", x1, y1)]
@@ -217,15 +237,15 @@ def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
     return (*outline, *holes)
 
 
-def _holes(marks: Sequence[Mark]) -> list[tuple[Ring, str]]:
-    """The complete holes with their names, such as ``"hole 2"`` and ``"round hole 1"``."""
+def _holes(marks: Sequence[Mark]) -> list[Ring]:
+    """Return the corners of the complete holes."""
     names = dict.fromkeys(mark.kind for mark in marks if mark.kind not in OUTLINES)
     found = []
     for name in names:
         kind, own = name.rpartition(" ")[0], [(mark.x, mark.y) for mark in marks if mark.kind == name]
         if len(own) >= HOLES[kind]:
             corners = own if kind == "hole" else _circle(*own[:2])
-            found.append(([_rounded(corner) for corner in corners], name))
+            found.append([_rounded(corner) for corner in corners])
     return found
 
 
@@ -236,27 +256,27 @@ def _circle(centre: tuple[float, float], on: tuple[float, float]) -> list[tuple[
 
 
 def _rounded(numbers: Sequence[float]) -> list[float]:
-    """To a tenth of a pixel, which no outline needs more of."""
+    """Round to a tenth of a pixel, below the precision of a pointer."""
     return [round(float(number), 1) for number in numbers]
 
 
 _SOON = 60
-"""Ms that a mark which moves waits for its next move."""
+"""Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
 _KEPT = 100
-"""Steps that can be undone."""
+"""Steps that can be undone. Chosen; each holds some hundred bytes."""
 
 
-class Sketch:
-    """The marks of the region on a canvas.
+class RegionDrawing:
+    """Marks of the region on a canvas, which can be undone, and the lines that they make.
 
     Parameters
     ----------
     document
-        Of the page.
+        Document of the page.
     canvas
-        Where they are set and drawn.
+        Plot on which they are set and drawn.
     marks
-        The first.
+        Marks at first.
     changed
         Called when they have changed.
     """
@@ -272,26 +292,26 @@ class Sketch:
 
     @property
     def region(self) -> dict[str, Any] | None:
-        """What ``[region]`` says of it; None where no outline is complete."""
+        """Keys of ``[region]``; None where no outline is complete."""
         return region_of(self._history[-1])
 
     def undo(self) -> None:
-        """As it was before the last step."""
+        """Return to the marks before the last step."""
         if len(self._history) > 1:
             self._history.pop()
         self.draw()
 
     def clear(self) -> None:
-        """Without any mark."""
+        """Remove all marks."""
         self._keep(())
 
     def next_hole(self) -> None:
-        """The marks of a hole that come now belong to another one."""
+        """Let the marks of a hole that are set from now on belong to another one."""
         holes = [mark.kind for mark in self._history[-1] if mark.kind.startswith("hole ")]
         self._hole = max((int(kind.rpartition(" ")[2]) for kind in holes), default=0) + 1
 
     def draw(self) -> None:
-        """Draw it."""
+        """Draw the marks and the lines."""
         self._coming = False
         self._canvas.place(self._history[-1])
         outline, holes = rings(self._history[-1])
@@ -304,27 +324,24 @@ class Sketch:
         self._changed()
 
     def _marked(self) -> None:
-        """Marks were set, moved or removed on the plot."""
-        now, before = tuple(self._canvas.set), self._history[-1]
-        if now != before:
-            new = next((mark.kind for mark in now if mark not in before), "")
-            self._keep(arranged(_numbered(now, self._hole), new), moved=len(now) == len(before))
+        """Take the marks as they are on the plot; a new mark of a hole gets the number of its hole.
+
+        A polygon's number is that of the present hole; a round hole is complete with two marks.
+        """
+        before, now = self._history[-1], list[Mark]()
+        for mark in self._canvas.set:
+            number = self._hole
+            if mark.kind == "round hole":
+                number = 1 + sum(other.kind.startswith("round hole ") for other in now) // HOLES["round hole"]
+            now.append(Mark(f"{mark.kind} {number}", mark.x, mark.y) if mark.kind in HOLES else mark)
+        if tuple(self._canvas.set) != before:
+            new = next((mark.kind for mark in self._canvas.set if mark not in before), "")
+            self._keep(arranged(now, new), moved=len(now) == len(before))
 
     def _keep(self, marks: tuple[Mark, ...], *, moved: bool = False) -> None:
-        """Let these be the marks; a mark that is dragged comes many times, and is undone at once."""
+        """Set the marks; the moves of a mark that is dragged are one step."""
         before = self._history[:-1] if moved and self._moved else self._history
         self._history, self._moved = [*before[-_KEPT:], marks], moved
         if not self._coming:
             self._coming = True
             self._document.add_timeout_callback(self.draw, _SOON)
-
-
-def _numbered(marks: Sequence[Mark], hole: int) -> tuple[Mark, ...]:
-    """New marks of holes with the number of theirs: a polygon's is `hole`, a round one is complete with two marks."""
-    done: list[Mark] = []
-    for mark in marks:
-        number = hole
-        if mark.kind == "round hole":
-            number = 1 + sum(one.kind.startswith("round hole ") for one in done) // HOLES["round hole"]
-        done.append(Mark(f"{mark.kind} {number}", mark.x, mark.y) if mark.kind in HOLES else mark)
-    return tuple(done)

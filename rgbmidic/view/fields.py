@@ -1,9 +1,4 @@
-"""The nodal fields of a result that can be looked at: what the field table holds, and what follows from it.
-
-The pictures that a field lies over: the reference that the result keeps, and the frames, where they still are.
-
-What a page says in words: of the frame in view, of the place under the pointer, of what went wrong.
-"""
+"""Nodal fields of a result with units and colour ranges, the images under them, texts on a frame and a place."""
 
 from __future__ import annotations
 
@@ -20,21 +15,22 @@ from bokeh.document import Document
 
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.report.style import colour_range, time_unit
+from rgbmidic.report.figures import spread
+from rgbmidic.report.style import colour_range, ordinary_values, time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Result, scale_of
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.picture import element_at, grey_picture
+from rgbmidic.view.picture import Picture, element_at, grey_picture
 
 __all__ = [
     "Field",
     "Fields",
     "Pictures",
     "Values",
-    "frame_words",
+    "frame_text",
     "guarded",
-    "pointed_words",
+    "pointer_text",
     "robust_range",
     "warning",
     "watched",
@@ -42,13 +38,21 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-Kind = Literal["displacement", "strain", "positive", "share", "angle", "codes"]
+Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
 
-_DOUBTFUL = 3.0
-"""Nodes whose uncertainty is over this many times the median do not rule the colours, as in the report."""
 _MOVED = ("u", "v", "u_std", "v_std")
 _SPREAD = 24
-"""Frames, evenly spread, whose values rule the colours of a whole test."""
+"""Frames, evenly spread, whose values set the colour range of a whole test. Chosen: they are read within a second."""
+_ORDER = ("u", "v", "magnitude", "exx", "eyy", "exy", "e1", "e2", "direction", "equivalent")
+"""Fields that stand first."""
+_KINDS: dict[str, Kind] = {
+    "u": "displacement", "v": "displacement", "node_status": "codes", "direction": "angle", "misfit": "positive",
+    "equivalent": "positive",
+}  # fmt: skip
+"""Kinds of fields; uncertainties are positive, all others strains."""
+_KEPT = 8
+"""Raw frames that are kept as pictures: those around the one in view."""
+_FAILED = QUANTITIES["status"].codes.index("failed")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,13 +62,13 @@ class Field:
     Attributes
     ----------
     name
-        As in the field table; a share is named by its light.
+        As in the field table; a fraction is named by its light.
     unit, meaning
         As in the field table, lengths in the unit of the reader.
     kind
-        What colours suit it, and how its values are written.
+        Kind of the values, which sets colours and format.
     codes
-        What each number means, for a status.
+        Meaning of each number, for a status.
     """
 
     name: str
@@ -90,12 +94,12 @@ class Field:
 
     @property
     def ends(self) -> tuple[float, float] | None:
-        """Values of the first and last colour, where the kind of field says them."""
-        fixed = {"codes": (-0.5, len(self.codes) - 0.5), "share": (0.0, 1.0), "angle": (-90.0, 90.0)}
+        """Values of the first and last colour, where the kind of field sets them."""
+        fixed = {"codes": (-0.5, len(self.codes) - 0.5), "fraction": (0.0, 1.0), "angle": (-90.0, 90.0)}
         return fixed.get(self.kind)
 
     def text(self, value: float, std: float = float("nan")) -> str:
-        """A value with its standard uncertainty in words."""
+        """Return a value with its standard uncertainty and unit as text."""
         if not np.isfinite(value):
             return "not measured"
         if self.codes:
@@ -113,7 +117,7 @@ class Values:
     values, std : ndarray, shape (N,)
         In the unit of the field; NaN where not known.
     moved : ndarray, shape (N, 2)
-        Where the nodes are in this frame, px; NaN where not measured.
+        Deformed places of the nodes, px; NaN where not measured.
     """
 
     values: FloatArray
@@ -130,7 +134,7 @@ class Fields:
     result
         The result.
     physical
-        It in the units of its ``[scale]``.
+        The result in the units of its ``[scale]``.
     """
 
     result: Result
@@ -138,47 +142,56 @@ class Fields:
 
     @classmethod
     def of(cls, result: Result) -> Self:
-        """The fields of a result."""
+        """Return the fields of a result."""
         return cls(result=result, physical=Physical.untimed(result, scale_of(result)))
 
     @cached_property
     def all(self) -> dict[str, Field]:
         """Every field by its name, displacements first."""
-        told = self.physical.quantities
-        length = self.physical.units.length
+        quantities, length = self.physical.quantities, self.physical.units.length
         fields = [Field(name="magnitude", unit=length, meaning="length of the displacement", kind="positive")]
-        for name, entry in told.items():
+        for name, entry in quantities.items():
             if entry.axes == ("node",):
                 meaning = ", ".join(entry.codes) or entry.meaning
-                kind = self._kind(name)
+                kind = _KINDS.get(name, "positive" if name.endswith("_std") else "strain")
                 fields.append(Field(name=name, unit=entry.unit, meaning=meaning, kind=kind, codes=entry.codes))
-        fields += [
-            Field(name=f"share of {light}", unit="", meaning=told["light_fraction"].meaning, kind="share")
-            for light in self.result.lights
-        ]
-        order = ("u", "v", "magnitude", "exx", "eyy", "exy", "e1", "e2", "direction", "equivalent")
-        fields.sort(key=lambda field: order.index(field.name) if field.name in order else len(order))
+        meaning = quantities["light_fraction"].meaning
+        names = [f"fraction of {light}" for light in self.result.lights]
+        fields += [Field(name=name, unit="", meaning=meaning, kind="fraction") for name in names]
+        fields.sort(key=lambda field: _ORDER.index(field.name) if field.name in _ORDER else len(_ORDER))
         return {field.name: field for field in fields}
 
-    def _kind(self, name: str) -> Kind:
-        if name in ("u", "v"):
-            return "displacement"
-        if name == "node_status":
-            return "codes"
-        if name == "direction":
-            return "angle"
-        return "positive" if name.endswith("_std") or name in ("misfit", "equivalent") else "strain"
-
     def read(self, name: str, frame: int) -> Values:
-        """A field in one frame; errors as `Result.frame`."""
-        more = {"share": ("light_fraction", "node_status")}.get(self.all[name].kind, ())
+        """Read a field in one frame.
+
+        Parameters
+        ----------
+        name
+            Name of the field, one of `all`.
+        frame
+            Index of the frame.
+
+        Returns
+        -------
+        Values
+            Its values.
+
+        Raises
+        ------
+        InputError, ResultError
+            As `Result.frame`.
+        """
+        more = {"fraction": ("light_fraction", "node_status")}.get(self.all[name].kind, ())
         own = (name,) if name in QUANTITIES and name not in _MOVED and not self.physical.is_strain(name) else ()
         read = next(self.result.table.each([*_MOVED, *own, *more], [frame]))
         u, v, u_std, v_std = (np.asarray(read[part], dtype=np.float64) for part in _MOVED)
         moved = self.result.nodes + np.stack([u, v], axis=1)
         nothing = np.full(len(u), np.nan)
         if name == "magnitude":
-            length, std = _length(u, v, u_std, v_std)
+            length = np.hypot(u, v)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                std = np.hypot(u * u_std, v * v_std) / length
+            std = np.where(length > 0, std, np.hypot(u_std, v_std))  # at 0 the first order fails: that of the parts
             values, std = self.physical.units.lengths(length, std)
         elif name in _MOVED:
             values, std = self.physical.units.lengths(*((u, u_std) if name.startswith("u") else (v, v_std)))
@@ -187,47 +200,29 @@ class Fields:
             strain = self.physical.strain(u, v, u_std, v_std)
             values, std = strain[name], strain.get(f"{name}_std", nothing)
         elif more:
-            light = self.result.lights.index(name.removeprefix("share of "))
+            light = self.result.lights.index(name.removeprefix("fraction of "))
             values, std = np.where(read["node_status"] == 0, read["light_fraction"][:, light], np.nan), nothing
         else:
             values, std = np.asarray(read[name], dtype=np.float64), nothing
         return Values(values=np.ascontiguousarray(values, dtype=np.float64), std=std, moved=moved)
 
     def range_of_test(self, name: str) -> tuple[float, float]:
-        """Robust ends of the colours over the whole test, from frames evenly spread over what is measured."""
-        there = np.flatnonzero(self.result.finished)
-        chosen = there[np.unique(np.linspace(0, len(there) - 1, min(_SPREAD, len(there))).round().astype(int))]
-        ends = [robust_range(self.read(name, int(frame))) for frame in chosen]
+        """Return the colour range over the whole test, from frames evenly spread over those that are measured."""
+        there = np.flatnonzero(self.result.finished).tolist()
+        ends = [robust_range(self.read(name, frame)) for frame in (spread(there, _SPREAD) if there else ())]
         known = [pair for pair in ends if pair is not None]
-        return (min(a for a, _ in known), max(b for _, b in known)) if known else (0.0, 1.0)
+        return (min(low for low, _ in known), max(high for _, high in known)) if known else (0.0, 1.0)
 
 
 def robust_range(read: Values) -> tuple[float, float] | None:
-    """Ends of the colours of one frame, doubtful nodes and outliers left out; None where nothing is measured."""
-    known = np.isfinite(read.values)
-    if not known.any():
-        return None
-    spread = np.isfinite(read.std)
-    doubtful = read.std > _DOUBTFUL * np.median(read.std[spread]) if spread.any() else ~known
-    kept = known & ~doubtful
-    return colour_range(read.values[kept if kept.any() else known])
-
-
-def _length(u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Length of a displacement and its uncertainty; at 0, where the first order says nothing, that of its parts."""
-    length = np.hypot(u, v)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        std = np.where(length > 0, np.hypot(u * u_std, v * v_std) / length, np.hypot(u_std, v_std))
-    return length, std
-
-
-Picture = npt.NDArray[np.uint8]
-_KEPT = 8
+    """Return the colour range of one frame without doubtful nodes and outliers; None where nothing is measured."""
+    known = ordinary_values(read.values, read.std)
+    return colour_range(known) if known.size else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pictures:
-    """The pictures of a result.
+    """Images under the fields: the reference that the result keeps, and the raw frames, where they still exist.
 
     Attributes
     ----------
@@ -239,8 +234,7 @@ class Pictures:
 
     @cached_property
     def reference(self) -> Picture:
-        """Mean of the lights' reference images, plain beside the part of the frames that was read; plain where none was
-        kept."""
+        """Mean of the lights' reference images, grey where none was kept."""
         kept, (left, top) = self.result.reference, self.result.reference_origin
         columns, rows = np.ceil(self.result.nodes.max(axis=0) + 1).astype(int)
         picture = np.full(self.result.frame_shape or (rows, columns), 60, dtype=np.uint8)
@@ -249,7 +243,7 @@ class Pictures:
         return picture
 
     def frame(self, place: int) -> tuple[Picture, str]:
-        """The raw frame of a place in the result; the reference, and why, where it cannot be read."""
+        """Return the raw frame of an index in the result; where it cannot be read, the reference and the reason."""
         try:
             return self._read(place), ""
         except (RgbmidicError, OSError, IndexError, KeyError) as error:
@@ -266,16 +260,13 @@ class Pictures:
         return open_series(settings.frames, settings.base)
 
 
-_FAILED = 2
-
-
 def warning(text: str) -> str:
-    """A remark that is to be seen, as HTML."""
+    """Return a remark as HTML that stands out."""
     return f'<b style="color:var(--warn)">{html.escape(text)}</b>'
 
 
 def guarded(act: Callable[[], None], complain: Callable[[str], None]) -> None:
-    """Do something; what goes wrong is told in one line, and the page goes on."""
+    """Call `act`; an error is reported in one line by `complain`, and the page goes on."""
     try:
         act()
     except (RgbmidicError, OSError) as error:
@@ -286,22 +277,21 @@ def guarded(act: Callable[[], None], complain: Callable[[str], None]) -> None:
 
 
 def watched(document: Document) -> bool:
-    """Whether a browser shows the page: one that was left lives on for a while, and does nothing more."""
+    """Return whether a browser shows the page: one that was left exists for a while, and shall do nothing more."""
     session = document.session_context.session if document.session_context else None
     return session is None or session.connection_count > 0
 
 
-def frame_words(result: Result, place: int, field: Field, values: Values, remark: str) -> str:
-    """What is in view, as HTML: the frame, how it ended, the field and what there is to remark."""
+def frame_text(result: Result, place: int, field: Field, values: Values, remark: str) -> str:
+    """Describe what is in view, as HTML: the frame, how it ended, the field and a remark."""
     read = next(result.table.each(["status", "reason", "iterations", "node_status", "time_ns"], [place]))
     missing = float(np.mean(read["node_status"] != 0))
     measured = bool(result.finished[place])
     end = QUANTITIES["status"].codes[read["status"]] if measured else "not measured yet"
     seconds = read["time_ns"] * 1e-9
-    factor, unit = time_unit(np.array([seconds]))
-    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {factor * seconds:.6g} {unit}"
-    lost = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
-    lines = [f"Frame {place} of {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{lost}"]
+    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {time_text(seconds, np.array([seconds]))}"
+    without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
+    lines = [f"Frame {place} of {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{without}"]
     if read["reason"] and measured:
         lines[1] = warning(f"{end}: {read['reason']}")
     if not np.isfinite(values.values).any():
@@ -310,10 +300,10 @@ def frame_words(result: Result, place: int, field: Field, values: Values, remark
     return "<br>".join([*lines, *([html.escape(remark)] if remark else [])])
 
 
-def pointed_words(
+def pointer_text(
     field: Field, values: Values, nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
 ) -> str:
-    """The value at a place of the image, as HTML."""
+    """Return the value at a place of the image, as HTML."""
     found = element_at(nodes, elements, x, y)
     if found is None:
         return f"x {x:.1f}, y {y:.1f} px: outside the mesh"

@@ -1,4 +1,4 @@
-"""The page of a result: a field over the image, frame after frame, with curves of what is marked on it."""
+"""Page of a result: a field over the image, frame by frame, with the curves of the probes that are marked on it."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from bokeh.layouts import column, row
 from rgbmidic.fields.strain import shortest_gauge
 from rgbmidic.results import Result
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import KINDS, OVER, Look
+from rgbmidic.view.address import KINDS, OVER, ViewState
 from rgbmidic.view.canvas import Canvas, DirectionLayer
-from rgbmidic.view.curves import Course, CurvePanel, TimeLine, as_csv, places
+from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, places
 from rgbmidic.view.fields import (
     Fields,
     Pictures,
     Values,
-    frame_words,
+    frame_text,
     guarded,
-    pointed_words,
+    pointer_text,
     robust_range,
     warning,
     watched,
 )
-from rgbmidic.view.models import Asked, MarkLayer, controls, wire
+from rgbmidic.view.models import MarkLayer, ResultControls, SharedState
 from rgbmidic.view.picture import AROUND, paint, palette, palette_name
 
 __all__ = ["ResultPage"]
 
 _TICK, _IDLE = 200, 1000
-"""Ms between two looks at frames not yet in the time line; at a result that may have grown, and for its picture."""
+"""Ms between two parts of the time line; between two checks whether a result has grown, and pictures of that."""
 _HELP = (
     "Choose <b>Point</b>, <b>Gauge</b> (two clicks), <b>Line</b> (two) or <b>Strain</b>, then click on the field: its "
     "curve appears beside it. Drag a mark to move it; Backspace removes a chosen one. Keys: ← → a frame, space plays."
@@ -44,36 +44,36 @@ _HELP = (
 
 
 class ResultPage:
-    """One opened page, which changes what it shows as its visitor asks.
+    """Page of a result that one visitor has opened.
 
     Parameters
     ----------
     document
-        Of the visitor.
+        Document of the visitor.
     result
-        As it was when the page was opened.
-    look
-        What the address asks for.
-    course
-        Of the result; other pages may have filled it.
+        The result when the page was opened.
+    view
+        View that the address asks for.
+    progress
+        Status of the frames, which other pages of the result may have filled.
     """
 
-    def __init__(self, document: Document, result: Result, look: Look, course: Course) -> None:
-        self.document, self.result, self.look = document, result, look
-        self.fields, self.pictures, self.course = Fields.of(result), Pictures(result=result), course
+    def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
+        self.document, self.result, self.view = document, result, view
+        self.fields, self.pictures, self.progress = Fields.of(result), Pictures(result=result), progress
         self.values: Values | None = None
         self._pointer: tuple[float, float] | None = None
         self._key = ("", -1, -1)
         self._test_range = lru_cache(8)(lambda name, changes: self.fields.range_of_test(name))
         self._changes = self._size = 0
-        self.asked, self.dark = Asked(name="state", asked=look.frame, shown=look.frame), look.theme == "dark"
-        self.parts = p = controls(len(result), dark=self.dark)
-        self.canvas = Canvas(document, list(KINDS), look.window or Canvas.around(result.nodes), self._redraw)
+        self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
+        self.parts = p = ResultControls(len(result) - 1, view.frame, dark=self.dark)
+        self.canvas = Canvas(document, list(KINDS), view.window or Canvas.around(result.nodes), self._redraw)
         self.directions, self.marks = DirectionLayer(self.canvas), MarkLayer(self.canvas, result.elements)
-        self.timeline = TimeLine(len(result), look.frame)
-        self.curves = CurvePanel(document, chosen=look.curve, select=p.curve, told=p.told, hint=_HELP)
+        self.timeline = TimeLine(len(result), view.frame)
+        self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, message=p.message, hint=_HELP)
         self._begin()
-        wire(self.asked, self.parts, self.canvas.tools, self.timeline.now, self.curves.plot)
+        p.wire(self.state, self.canvas.tools, self.timeline.now, self.curves.plot)
         self._listen()
 
     @property
@@ -81,27 +81,26 @@ class ResultPage:
         """The parts of the page by the names that its template gives their places."""
         p, wide = self.parts, partial(row, sizing_mode="stretch_width")
         side = column(
-            p.words, p.field, p.over, p.opacity, p.range, wide(p.low, p.high), p.symmetric, p.directions,
-            p.mode, p.curve, wide(p.clear, p.csv, p.png), p.told, p.theme, sizing_mode="stretch_width",
+            p.description, p.field, p.over, p.opacity, p.range, wide(p.low, p.high), p.symmetric, p.directions,
+            p.mode, p.curve, wide(p.clear, p.csv, p.png), p.message, p.theme, sizing_mode="stretch_width",
         )  # fmt: skip
-        player = wide(p.play, p.step, p.frame)
-        drawn = {"plot": self.canvas.plot, "course": self.timeline.plot, "curves": self.curves.plot}
-        return {"head": p.head, "under": p.under, "side": side, "player": player, **drawn}
+        drawn = {"plot": self.canvas.plot, "timeline": self.timeline.plot, "curves": self.curves.plot}
+        return {"head": p.head, "under": p.under, "side": side, "player": p.player, **drawn}
 
     def _begin(self) -> None:
-        """Let the controls show what the address asks for."""
-        p, look = self.parts, self.look
+        """Set the controls to the view."""
+        p, view = self.parts, self.view
         p.field.options = [(name, field.label) for name, field in self.fields.all.items()]
-        p.field.value, p.opacity.value, p.range.value = look.field, look.opacity, look.range
-        p.over.active = OVER.index(look.over)
-        p.low.value, p.high.value, p.symmetric.active = look.low, look.high, look.symmetric
-        p.directions.active, p.frame.value = look.directions, look.frame
-        p.told.text, p.head.text = _HELP, self._title()
+        p.field.value, p.opacity.value, p.range.value = view.field, view.opacity, view.range
+        p.over.active = OVER.index(view.over)
+        p.low.value, p.high.value, p.symmetric.active = view.low, view.high, view.symmetric
+        p.directions.active = view.directions
+        p.message.text, p.head.text = _HELP, self._title()
 
     def _listen(self) -> None:
         p = self.parts
         for model, key, change in (
-            (self.asked, "asked", lambda frame: {"frame": min(frame, len(self.result) - 1)}),
+            (self.state, "asked", lambda frame: {"frame": min(frame, len(self.result) - 1)}),
             (p.field, "value", lambda name: {"field": name}),
             (p.range, "value", lambda name: {"range": name}),
             (p.opacity, "value", lambda value: {"opacity": value}),
@@ -112,10 +111,10 @@ class ResultPage:
             (p.low, "value", lambda low: self._by_hand()),
             (p.high, "value", lambda high: self._by_hand()),
         ):
-            model.on_change(key, partial(self._changed, change))
+            model.on_change(key, lambda attr, old, new, change=change: self.show(**change(new)))
         self.canvas.marks.on_change("data", lambda attr, old, new: self._marked())
         p.clear.on_click(lambda: self.canvas.place([]))
-        p.csv.on_click(lambda: self._save())
+        p.csv.on_click(self._save)
         self.canvas.plot.on_event(MouseMove, self._hover)
         for plot in (self.timeline.plot, self.curves.plot):
             plot.on_event(Tap, self._jump)
@@ -124,31 +123,29 @@ class ResultPage:
     def _ready(self) -> None:
         self.canvas.resize()
         self.show()
-        if self.look.marks:
+        if self.view.marks:
             self._read_curves()
-        for act, every in ((self._tick, _TICK), (self._grow, _IDLE), (self._tell_course, _IDLE)):
-            self.document.add_periodic_callback(partial(self._regularly, act), every)
+        advance = partial(self._while_watched, lambda: self.progress.advance(self.result))
+        self.document.add_periodic_callback(advance, _TICK)
+        for act in (self._grow, self._draw_progress):
+            self.document.add_periodic_callback(partial(self._while_watched, act), _IDLE)
 
-    def _regularly(self, act: Callable[[], None]) -> None:
-        """Do something, unless the browser has gone and nobody looks."""
+    def _while_watched(self, act: Callable[[], None]) -> None:
         if watched(self.document):
             guarded(act, self.complain)
 
     def complain(self, text: str) -> None:
-        """Tell what went wrong; the page goes on."""
-        self.parts.words.text = warning(text)
-        self.asked.shown = self.asked.asked
-
-    def _changed(self, change: Callable[[Any], dict[str, Any]], attr: str, old: object, new: Any) -> None:
-        self.show(**change(new))
+        """Report an error; the page goes on."""
+        self.parts.description.text = warning(text)
+        self.state.shown = self.state.asked
 
     def _by_hand(self) -> dict[str, float]:
         low, high = self.parts.low.value, self.parts.high.value
         return {"low": float(low), "high": float(high)} if None not in (low, high) and low < high else {}
 
     def show(self, **changes: Any) -> None:
-        """Draw the page with what changed."""
-        self.look = replace(self.look, **changes)
+        """Draw the page with other values of some entries of the view."""
+        self.view = replace(self.view, **changes)
         self.document.hold("combine")
         try:
             guarded(self._draw, self._blank)
@@ -156,99 +153,88 @@ class ResultPage:
             self.document.unhold()
 
     def _blank(self, text: str) -> None:
-        """Show nothing of what cannot be drawn, least of all what was drawn before it."""
+        """Show an error and nothing of the view that cannot be drawn, nor of the one before it."""
         self.values, self._key = None, ("", -1, -1)
         self.canvas.clear()
         self.directions.hide()
         self._read_out()
-        self.curves.point(self.look.frame)
-        self.asked.query = self.look.query()
+        self.curves.point(self.view.frame)
+        self.state.query = self.view.query()
         self.complain(text)
 
     def _draw(self) -> None:
-        look, field = self.look, self.fields.all[self.look.field]
+        view, field = self.view, self.fields.all[self.view.field]
         values = self.values = self._read()
-        picture, remark = self.pictures.frame(look.frame) if look.over == "deformed" else (self.pictures.reference, "")
+        picture, remark = self.pictures.frame(view.frame) if view.over == "deformed" else (self.pictures.reference, "")
         ends, colours = self._ends(values), palette(palette_name(field.kind, symmetric=self._symmetric))
-        if look.range == "hand" and (self.parts.low.value, self.parts.high.value) != (look.low, look.high):
-            remark = f"The colours go from {look.low:g} to {look.high:g}: the lowest number must be below the highest."
-        over = (self._nodes(values), self.result.elements, values.values)
-        around = AROUND[self.dark]
-        image = paint(
-            self.canvas.window,
-            picture,
-            over,
-            ends,
-            colours,
-            opacity=look.opacity,
-            stepped=field.stepped,
-            around=around,
-        )
-        self.canvas.show(image)
+        if view.range == "hand" and (self.parts.low.value, self.parts.high.value) != (view.low, view.high):
+            remark = f"The colours go from {view.low:g} to {view.high:g}: the lowest number must be below the highest."
+        nodes, window, around = self._nodes(values), self.canvas.window, AROUND[self.dark]
+        over = (nodes, self.result.elements, values.values)
+        options: dict[str, Any] = {"opacity": view.opacity, "stepped": field.stepped, "around": around}
+        self.canvas.show(paint(window, picture, over, ends, colours, **options))
         self.canvas.colour(ends, colours, field.label)
-        self.parts.low.visible = self.parts.high.visible = look.range == "hand"
-        self.parts.symmetric.visible = field.signed and look.range != "hand"
-        self.parts.words.text = frame_words(self.result, look.frame, field, values, remark)
-        self.marks.place(look.marks, self.result.nodes, over[0])
-        if look.directions:
-            self.directions.show(over[0], self.fields.read("direction", look.frame).values)
+        self.parts.low.visible = self.parts.high.visible = view.range == "hand"
+        self.parts.symmetric.visible = field.signed and view.range != "hand"
+        self.parts.description.text = frame_text(self.result, view.frame, field, values, remark)
+        self.marks.place(view.marks, self.result.nodes, nodes)
+        if view.directions:
+            self.directions.show(nodes, self.fields.read("direction", view.frame).values)
         else:
             self.directions.hide()
         self._read_out()
-        self.curves.point(look.frame)
-        self.asked.query, self.asked.shown = look.query(), self.asked.asked
+        self.curves.point(view.frame)
+        self.state.query, self.state.shown = view.query(), self.state.asked
 
     def _redraw(self) -> None:
-        """Another part of the image is in view."""
+        """Draw another part of the image."""
         wanted = self.canvas.wanted
         self.show(window=() if wanted == Canvas.around(self.result.nodes) else wanted)
 
     def _read(self) -> Values:
-        """The field in the frame; read anew where another one is asked for, or the frame was measured since."""
-        key = (self.look.field, self.look.frame, self._changes)
+        """Read the field in the frame, unless it was read and has not been measured since."""
+        key = (self.view.field, self.view.frame, self._changes)
         if self.values is None or key != self._key:
-            read = self.fields.read(self.look.field, self.look.frame)
-            self._key = key
+            read, self._key = self.fields.read(self.view.field, self.view.frame), key
             return read
         return self.values
 
     @property
     def _symmetric(self) -> bool:
-        return self.look.symmetric and self.fields.all[self.look.field].signed
+        return self.view.symmetric and self.fields.all[self.view.field].signed
 
     def _ends(self, values: Values) -> tuple[float, float]:
-        """Values of the first and last colour."""
-        look, field = self.look, self.fields.all[self.look.field]
-        if look.range == "hand":
-            return look.low, look.high
+        """Return the values of the first and the last colour."""
+        view, field = self.view, self.fields.all[self.view.field]
+        if view.range == "hand":
+            return view.low, view.high
         if field.ends is not None:
             return field.ends
-        if look.range == "test":
-            low, high = self._test_range(look.field, self._changes)
+        if view.range == "test":
+            low, high = self._test_range(view.field, self._changes)
         else:
             low, high = robust_range(values) or (0.0, 1.0)
         return (-max(abs(low), abs(high)), max(abs(low), abs(high))) if self._symmetric else (low, high)
 
     def _nodes(self, values: Values) -> FloatArray:
-        """Where the nodes are drawn."""
-        return values.moved if self.look.over == "deformed" else self.result.nodes
+        """Return the places (N, 2) at which the nodes are drawn."""
+        return values.moved if self.view.over == "deformed" else self.result.nodes
 
     def _hover(self, event: Any) -> None:
-        """The pointer is at another place."""
         if event.x is not None and event.y is not None:
             self._pointer = event.x, event.y
             self._read_out()
 
     def _read_out(self) -> None:
-        """The value where the pointer is, of the field and the frame that are shown."""
-        words = ""
+        """Show the value under the pointer, of the field and the frame in view."""
+        text = ""
         if self.values is not None and self._pointer is not None:
-            field, nodes = self.fields.all[self.look.field], self._nodes(self.values)
-            words = pointed_words(field, self.values, nodes, self.result.elements, *self._pointer)
-        self.parts.under.text = words
+            field, nodes = self.fields.all[self.view.field], self._nodes(self.values)
+            text = pointer_text(field, self.values, nodes, self.result.elements, *self._pointer)
+        self.parts.under.text = text
 
     def _marked(self) -> None:
-        """Marks were set, moved or removed."""
+        """Take marks that were set, moved or removed."""
         if self.values is None:
             return
         marks = self.marks.taken(self._nodes(self.values), self.result.nodes)
@@ -259,36 +245,31 @@ class ResultPage:
     def _read_curves(self) -> None:
         self.curves.colours = self.marks.colours
         gauge = shortest_gauge(self.fields.physical.mesh)
-        self.curves.read(self.result, self.look.marks, gauge, lambda: self.curves.point(self.look.frame))
+        self.curves.read(self.result, self.view.marks, gauge, lambda: self.curves.point(self.view.frame))
 
     def _save(self) -> None:
         if self.curves.reading:
-            self.parts.told.text = "The curves are still being read: save them once they are drawn."
+            self.parts.message.text = "The curves are still being read: save them once they are drawn."
         elif self.curves.histories is None:
-            self.parts.told.text = "There is no curve yet: set a mark on the field first."
+            self.parts.message.text = "There is no curve yet: set a mark on the field first."
         else:
-            self.asked.csv = as_csv(self.curves.histories)
+            self.state.csv = as_csv(self.curves.histories)
 
     def _jump(self, event: Any) -> None:
-        """To the frame that was clicked in the time line or among the curves."""
+        """Go to the frame that was clicked in the time line or among the curves."""
         frame = self.curves.frame(event.x) if event.model is self.curves.plot else event.x
         self.parts.frame.value = min(max(round(float(frame)), 0), len(self.result) - 1)
 
-    def _tick(self) -> None:
-        """Look at some frames more for the time line."""
-        self.course.advance(self.result)
-
-    def _tell_course(self) -> None:
-        self.timeline.draw(self.course)
+    def _draw_progress(self) -> None:
+        self.timeline.draw(self.progress)
         self.parts.head.text = self._title()
 
     def _title(self) -> str:
-        return (
-            f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {self.course.words(int(self.result.finished.sum()))}"
-        )
+        summary = self.progress.summary(int(self.result.finished.sum()))
+        return f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {summary}"
 
     def _grow(self) -> None:
-        """Take in what a run has added or measured again; who looks at the last frame goes on with it."""
+        """Take in frames that a run has added or measured again; a view of the last frame follows it."""
         size = sum(file.stat().st_size for file in self.result.path.glob("solution/*"))
         if size == self._size:
             return
@@ -298,7 +279,7 @@ class ResultPage:
         before, after = np.flatnonzero(self.result.finished), np.flatnonzero(new.finished)
         self.result, self.fields, self._changes = new, replace(self.fields, result=new), self._changes + 1
         self._read_curves()
-        follows = not len(before) or self.look.frame == before[-1]
+        follows = not len(before) or self.view.frame == before[-1]
         if follows and self.parts.frame.value != after[-1]:
             self.parts.frame.value = int(after[-1])
         else:

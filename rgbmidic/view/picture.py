@@ -1,9 +1,9 @@
-"""What the screen shows of a field: a window of the image, its pixels, colours and the triangles over it."""
+"""Picture of a field on the screen: window of the image, resampling, colours, elements."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
@@ -14,16 +14,23 @@ from rgbmidic._kernels.interpolation import paint_field
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.typing import AnyArray, FloatArray
 
-__all__ = ["AROUND", "Window", "element_at", "grey_picture", "paint", "palette", "palette_name"]
+__all__ = ["AROUND", "Picture", "Window", "element_at", "grey_picture", "paint", "palette", "palette_name", "stretched"]
+
+Picture = npt.NDArray[np.uint8]
+"""A grey picture (H, W)."""
 
 _LARGEST = 2_000_000
 """Pixels of a picture that is sent to the screen: all of a window of 1920 x 1080, less than all of a larger one."""
 _COLOURS = 256
+"""Colours of a palette: the screen has as many levels."""
 AROUND = {False: 235, True: 30}
 """Grey level outside the image, by whether the page is dark."""
-_PALETTES = {"displacement": "viridis", "strain": "viridis", "positive": "plasma", "share": "cividis"}
+_PALETTES = {
+    "displacement": "viridis", "strain": "viridis", "positive": "plasma", "fraction": "cividis", "angle": "twilight",
+    "codes": "codes",
+}  # fmt: skip
 _STATUS = ("#2c7fb8", "#bdbdbd", "#d95f0e", "#fec44f")
-"""Measured, not seen, decorrelated, filled: told apart without telling red from green."""
+"""Measured, not seen, decorrelated, filled: distinct without distinguishing red from green."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,18 +58,11 @@ class Window:
         return self.left, self.top, self.right, self.bottom
 
     def fitted(self) -> Window:
-        """The same centre with as many screen pixels to a px in both directions, nothing of it cut off."""
+        """Widen the window to as many screen pixels per px in both directions, about the same centre."""
         step = max((self.right - self.left) / self.width, (self.bottom - self.top) / self.height)
         x, y = (self.left + self.right) / 2, (self.top + self.bottom) / 2
         half_x, half_y = step * self.width / 2, step * self.height / 2
-        return Window(
-            left=x - half_x,
-            top=y - half_y,
-            right=x + half_x,
-            bottom=y + half_y,
-            width=self.width,
-            height=self.height,
-        )
+        return replace(self, left=x - half_x, top=y - half_y, right=x + half_x, bottom=y + half_y)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -77,7 +77,7 @@ class Window:
         return (self.right - self.left) / columns, (self.bottom - self.top) / rows
 
     def place(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Column and row of points (N, 2) in the picture."""
+        """Return column and row of points (N, 2) in the picture."""
         across, down = self.steps
         return (points[:, 0] - self.left) / across - 0.5, (points[:, 1] - self.top) / down - 0.5
 
@@ -93,7 +93,7 @@ def paint(
     stepped: bool = False,
     around: int = 40,
 ) -> npt.NDArray[np.uint32]:
-    """A field over a grey picture as the window shows it.
+    """Paint a field over a grey picture as the window shows it.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def paint(
     colours
         As ``"#rrggbb"``.
     opacity
-        Of the field, from 0 to 1.
+        Opacity of the field, from 0 to 1.
     stepped
         Whether values between those of two nodes mean nothing.
     around
@@ -123,13 +123,14 @@ def paint(
     out = np.empty(grey.shape, dtype=np.uint32)
     nodes, elements, values = field or (np.zeros((1, 2)), np.zeros((0, 3), dtype=np.int32), np.zeros(1))
     x, y = window.place(nodes)
-    share = round(256 * (1 - opacity))
-    paint_field(out, grey, x, y, elements, values, *map(float, ends), _packed(tuple(colours), share), share, stepped)
+    grey_part = round(256 * (1 - opacity))
+    packed = _packed(tuple(colours), grey_part)
+    paint_field(out, grey, x, y, elements, values, *map(float, ends), packed, grey_part, stepped)
     return out
 
 
 def _resampled(window: Window, picture: AnyArray, around: int) -> npt.NDArray[np.uint8]:
-    """The image in the window, reduced by whole factors first, so that nothing fine turns into moiré."""
+    """Resample the image in the window, reduced by whole factors first, against moiré."""
     across, down = window.steps
     factor = max(1, int(min(across, down)))
     small = picture
@@ -149,42 +150,44 @@ def _resampled(window: Window, picture: AnyArray, around: int) -> npt.NDArray[np
 
 
 @cache
-def _packed(colours: tuple[str, ...], share: int) -> npt.NDArray[np.uint32]:
+def _packed(colours: tuple[str, ...], grey_part: int) -> npt.NDArray[np.uint32]:
     rgb = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours], dtype=np.uint32)
-    red, green, blue = (rgb * (256 - share) >> 8).T
+    red, green, blue = (rgb * (256 - grey_part) >> 8).T
     return np.asarray(red | green << 8 | blue << 16 | 0xFF000000, dtype=np.uint32)
 
 
 def palette_name(kind: str, *, symmetric: bool) -> str:
-    """Name of the colours that suit a kind of field, as matplotlib names them; all are safe for the colour-blind."""
-    if kind == "codes":
-        return kind
-    return {"angle": "twilight"}.get(kind) or ("RdBu_r" if symmetric else _PALETTES[kind])
+    """Return matplotlib's name of the colours that suit a kind of field; all are safe for the colour-blind."""
+    return "RdBu_r" if symmetric and kind not in ("codes", "angle") else _PALETTES[kind]
 
 
 @cache
 def palette(name: str) -> tuple[str, ...]:
-    """The colours of a palette as ``"#rrggbb"``."""
+    """Return the colours of a palette as ``"#rrggbb"``."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
     return _STATUS if name == "codes" else tuple(map(to_hex, colormaps[name](np.linspace(0, 1, _COLOURS))))
 
 
-def grey_picture(frame: Mosaic | ChannelFrame) -> npt.NDArray[np.uint8]:
-    """A raw frame as one grey picture, stretched: the mean of its channels, of the cell around each mosaic sample."""
+def grey_picture(frame: Mosaic | ChannelFrame) -> Picture:
+    """Return a raw frame as one stretched picture: the mean of its channels, or of the cell around each sample."""
     if isinstance(frame, Mosaic):
-        image = cv2.blur(frame.values.astype(np.float32), (2, 2))
-    else:
-        image = frame.values.mean(axis=0, dtype=np.float32)
-    low, high = np.percentile(image[::4, ::4], [1, 99])
-    return np.asarray(np.clip(255 * (image - low) / max(high - low, 1e-6), 0, 255), dtype=np.uint8)
+        return stretched(cv2.blur(frame.values.astype(np.float32), (2, 2)))
+    return stretched(frame.values.mean(axis=0, dtype=np.float32))
+
+
+def stretched(image: AnyArray) -> Picture:
+    """Stretch an image (H, W) between its 1 % and 99 % quantiles, of every fourth pixel, to 0 to 255; NaN is 0."""
+    known = image[::4, ::4][np.isfinite(image[::4, ::4])]
+    low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 1.0)
+    return np.asarray(np.clip(255 * (np.nan_to_num(image) - low) / max(high - low, 1e-6), 0, 255), dtype=np.uint8)
 
 
 def element_at(
     nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
 ) -> tuple[npt.NDArray[np.int32], FloatArray] | None:
-    """Nodes (3,) of the element that holds a point, and what each counts there; None outside."""
+    """Return the nodes (3,) of the element that holds a point, and their shape functions (3,); None outside."""
     a, b, c = (nodes[elements[:, corner]] for corner in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
         area = _cross(b - a, c - a)

@@ -1,4 +1,4 @@
-"""The server of the viewer: for this machine only, behind an address that nobody guesses, without any other file."""
+"""Server of the viewer: for this machine only, at an address with a random token, without any other file."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from tornado.web import ErrorHandler
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.results import Result
 from rgbmidic.results.provenance import PROVENANCE
-from rgbmidic.view.address import Look
-from rgbmidic.view.curves import Course
+from rgbmidic.view.address import ViewState
+from rgbmidic.view.curves import Progress
 from rgbmidic.view.fields import Fields
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup_panel import Run
@@ -41,16 +41,16 @@ __all__ = ["serve", "start"]
 
 _HOST = "127.0.0.1"
 _FORGOTTEN = 15_000
-"""Ms after which what a closed page held is let go."""
+"""Ms after which the data of a closed page are freed. Chosen: a page that is loaded anew takes less."""
 _BREATH = 0.05
-"""Seconds that belong to others after each such page: as many as a visitor needs for an answer."""
+"""Seconds for other pages after each page that is freed: an answer takes as long."""
 _THEMES = {"dark": "dark_minimal"}
 
 
 class _Site(Application):  # type: ignore[misc]  # see pyproject.toml
-    """What builds the pages of an address; others are served between two that are let go.
+    """Builder of the pages of an address, which serves others between two pages that are freed.
 
-    Bokeh lets go of all pages that were left in a row, and collects garbage twice for each: .1 to .3 s a time.
+    Bokeh frees all pages that were left in a row, and collects garbage twice for each: measured, 0.1 to 0.3 s a time.
     """
 
     async def on_session_destroyed(self, session_context: Any) -> None:
@@ -59,7 +59,7 @@ class _Site(Application):  # type: ignore[misc]  # see pyproject.toml
 
 
 class _Application(BokehTornado):  # type: ignore[misc]  # see pyproject.toml
-    """Bokeh's server, whose pages load no more scripts than they need: a third of them."""
+    """Bokeh's server, whose pages load only the scripts that they need, a third of all."""
 
     def resources(self, absolute_url: str | bool | None = None) -> Any:
         return super().resources(absolute_url).clone(components=["bokeh", "bokeh-widgets"])
@@ -77,7 +77,7 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
     browser
         Whether to open the browser.
     tell
-        Is given the address.
+        Called with the address.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
     InputError
         The port is in use.
     """
-    for library in ("bokeh", "tornado"):  # what they say of a strange request is for programmers
+    for library in ("bokeh", "tornado"):  # their messages on a malformed request are for programmers
         logging.getLogger(library).setLevel(logging.CRITICAL)
     server, address = start(path, port=port)
     gc.collect()
@@ -101,7 +101,7 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
 
 
 def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
-    """A server that answers once its loop runs, and its address; errors as `serve`."""
+    """Start a server, which answers once its loop runs; return it and its address. Errors as `serve`."""
     pages = _pages(path)
     token = secrets.token_urlsafe(24)
     try:
@@ -130,16 +130,16 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
 
 
 def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
-    """What is served: a result, or a test that is set up and the result of its run; bad input is told at once."""
-    courses: dict[tuple[Path, str], Course] = {}
+    """Return the pages: a result, or a test to set up and the result of its run; bad input is reported at once."""
+    shared: dict[tuple[Path, str], Progress] = {}
     if (path / PROVENANCE).exists():
         Result.open(path, partial=True, check=False)
-        return {"/": partial(_told, partial(_fill, path, courses))}
+        return {"/": partial(_or_error, partial(_fill, path, shared))}
     from rgbmidic.view.draft import Draft
     from rgbmidic.view.setup import SetupPage
-    from rgbmidic.view.setup_panel import Footage
+    from rgbmidic.view.setup_panel import DraftFrames
 
-    Footage.of(Draft.of(path))
+    DraftFrames.of(Draft.of(path))
     runs: list[Run] = []
 
     def setup(document: Document) -> None:
@@ -150,13 +150,13 @@ def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
     def result(document: Document) -> None:
         if not runs:
             raise ResultError("no run was started yet")
-        _fill(runs[-1].out, courses, document)
+        _fill(runs[-1].out, shared, document)
 
-    return {"/": partial(_told, setup), "/result": partial(_told, result)}
+    return {"/": partial(_or_error, setup), "/result": partial(_or_error, result)}
 
 
-def _told(fill: Callable[[Document], None], document: Document) -> None:
-    """A page, or what is wrong in one line of it."""
+def _or_error(fill: Callable[[Document], None], document: Document) -> None:
+    """Fill a page, or report an error in one line of it."""
     try:
         fill(document)
     except RgbmidicError as error:
@@ -169,20 +169,20 @@ def _query(document: Document) -> dict[str, list[bytes]]:
     return {} if context is None or context.request is None else context.request.arguments
 
 
-def _fill(path: Path, courses: dict[tuple[Path, str], Course], document: Document) -> None:
-    """The page of a result as it is now, looked at as the address says."""
+def _fill(path: Path, shared: dict[tuple[Path, str], Progress], document: Document) -> None:
+    """Fill the page of a result as it is now, with the view of the address."""
     result = Result.open(path, partial=True, check=False)
     there = np.flatnonzero(result.finished)
     last = int(there[-1]) if len(there) else 0
     names = list(Fields.of(result).all)
-    look = Look.from_query(_query(document), frames=len(result), names=names, frame=last)
-    course = courses.setdefault((path, result.provenance["created"]), Course(len(result)))
-    page = ResultPage(document, result, look, course)
-    _place(document, page.roots, f"rgbmidic: {result.path.name}", look.theme)
+    view = ViewState.from_query(_query(document), frames=len(result), names=names, frame=last)
+    progress = shared.setdefault((path, result.provenance["created"]), Progress(len(result)))
+    page = ResultPage(document, result, view, progress)
+    _place(document, page.roots, f"rgbmidic: {result.path.name}", view.theme)
 
 
 def _place(document: Document, roots: Mapping[str, Model], title: str, theme: str) -> None:
-    """Put the parts of a page into its frame, with its style and its keys."""
+    """Place the parts of a page in its template, with its style and its keys."""
     with document.models.freeze():  # else all models are counted anew for each
         for name, root in roots.items():
             root.name = name

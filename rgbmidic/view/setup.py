@@ -1,4 +1,4 @@
-"""The page that sets a test up: frames, region with holes, mesh and uncertainty to expect, TEST.toml, the run."""
+"""Page that sets a test up: frames, region with holes, mesh and expected uncertainty, TEST.toml, the run."""
 
 from __future__ import annotations
 
@@ -21,82 +21,82 @@ from rgbmidic.pipeline.plan import read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.settings import RegionSettings, read_section
 from rgbmidic.view.canvas import Canvas, Tiles
-from rgbmidic.view.draft import HOLES, OUTLINES, Draft, Sketch, marks_of
+from rgbmidic.view.draft import HOLES, OUTLINES, Draft, RegionDrawing, marks_of
 from rgbmidic.view.fields import guarded, warning, watched
-from rgbmidic.view.models import TOOL, Asked, pump
+from rgbmidic.view.models import TOOL, SharedState
 from rgbmidic.view.picture import AROUND, paint, palette
-from rgbmidic.view.setup_panel import RAW, Footage, Run, inspected, pictures, setup_controls, side_by_side
+from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, inspected, pictures, side_by_side
 
 __all__ = ["SetupPage"]
 
 _MOST_EDGES = 20_000
-"""Elements whose edges are drawn: more are a grey surface."""
+"""Elements whose edges are drawn: more are a grey surface on a screen of two million pixels."""
 _TICK = 500
-"""Ms between two looks at the run."""
+"""Ms between two reports of the run."""
 _EXPECTED = "expected uncertainty"
 _GLARE = np.uint32(0xFF2030FF)
 _OTHER = f"if (cb_obj.active === null) return; {TOOL}; other.active = null"
 _HELP = (
     "1. Choose a shape and click on the frame: Rectangle (two opposite corners), Polygon, Circle (centre, then "
     "a place on it); holes likewise. Marks can be dragged; Backspace removes a chosen one.<br>2. Choose the element "
-    "size.<br>3. <b>Inspect</b> tells what uncertainty to expect.<br>4. Write the file, and run it."
+    "size.<br>3. <b>Inspect</b> shows what uncertainty to expect.<br>4. Write the file, and run it."
 )
 
 
 class SetupPage:
-    """One opened page.
+    """Page that one visitor has opened to set a test up.
 
     Parameters
     ----------
     document
-        Of the visitor.
+        Document of the visitor.
     draft
         The test as far as it is known.
     runs
-        The runs that pages have started, the last of which is told; this one's come to it, so that they can be served.
+        Runs that pages have started, the last of which is reported; this page adds its own, so that they are served.
     dark
         Whether the page is dark.
     """
 
     def __init__(self, document: Document, draft: Draft, runs: list[Run], *, dark: bool) -> None:
         self.document, self.draft, self.dark, self.runs = document, draft, dark, runs
-        self.footage = Footage.of(draft)
+        self.source = DraftFrames.of(draft)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
         self._inspected = self._number = 0
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
-        self.asked = Asked(name="state", asked=reference, shown=reference)
-        self.parts = setup_controls(draft, len(self.footage.series) - 1, out, dark=dark)
+        self.state = SharedState(name="state", asked=reference, shown=reference)
+        self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
         self.tiles, self._reader = Tiles(), ThreadPoolExecutor(1)
-        rows, columns = self.footage.shape
+        rows, columns = self.source.shape
         self.canvas = Canvas(document, (*OUTLINES, *HOLES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
         self._edges = ColumnDataSource({"xs": [], "ys": []})
         self.canvas.plot.multi_line(
             "xs", "ys", source=self._edges, line_color="#ffd166", line_width=0.7, line_alpha=0.7
         )
         marks = () if draft.region is None else marks_of(draft.region)
-        self.sketch = Sketch(document, self.canvas, marks, self._remesh)
+        self.drawing = RegionDrawing(document, self.canvas, marks, self._remesh)
         self._listen()
 
     @property
     def roots(self) -> dict[str, Any]:
         """The parts of the page by the names that its template gives their places."""
         p = self.parts
-        beside = column(p.told, p.file, p.write, p.out, p.go, p.ran, self.tiles.plot, sizing_mode="stretch_width")
+        beside = column(p.message, p.file, p.write, p.out, p.go, p.ran, self.tiles.plot, sizing_mode="stretch_width")
         return {"head": p.head, "side": p.side, "plot": self.canvas.plot, "curves": beside, "player": p.player}
 
     def _listen(self) -> None:
         p, tools = self.parts, list(self.canvas.tools)
-        for model, key in ((self.asked, "asked"), (p.picture, "value"), (p.glare, "active")):
+        for model, key in ((self.state, "asked"), (p.picture, "value"), (p.glare, "active")):
             model.on_change(key, lambda attr, old, new: self.show())
         p.size.on_change("value", lambda attr, old, new: self._remesh())
         p.calibration.on_change("value", lambda attr, old, new: self._guarded(self._reopen))
         for button, act in (
-            (p.undo, self.sketch.undo), (p.next, self.sketch.next_hole), (p.clear, self.sketch.clear),
+            (p.undo, self.drawing.undo), (p.next, self.drawing.next_hole), (p.clear, self.drawing.clear),
             (p.inspect, self._inspect), (p.write, self._write), (p.go, self._run),
         ):  # fmt: skip
             button.on_click(partial(self._guarded, act))
-        pump(self.asked, p.frame, p.play, p.step)
+        p.ask(self.state)
         p.mode.js_on_change("active", CustomJS(args={"tools": tools[:4], "other": p.hole}, code=_OTHER))
         p.hole.js_on_change("active", CustomJS(args={"tools": tools[4:], "other": p.mode}, code=_OTHER))
         self.document.on_event(DocumentReady, lambda event: self._ready())
@@ -106,24 +106,21 @@ class SetupPage:
     def _ready(self) -> None:
         self.canvas.resize()
         self.show()
-        self.sketch.draw()
+        self.drawing.draw()
 
     def _guarded(self, act: Callable[[], None]) -> None:
-        guarded(act, self._complain)
-
-    def _complain(self, text: str) -> None:
-        self.parts.told.text = warning(text)
+        guarded(act, lambda text: self.parts.message.update(text=warning(text)))
 
     def show(self) -> None:
         """Draw the picture."""
         self._guarded(self._draw)
-        self.asked.shown = self.asked.asked
+        self.state.shown = self.state.asked
 
     def _draw(self) -> None:
-        index = min(self.asked.asked, len(self.footage.series) - 1)
-        name = html.escape(self.footage.series.name(index))
-        self.parts.words.text = f"Frame {index} of {len(self.footage.series) - 1}: {name}"
-        raw, full = self.footage.raw(index)
+        index = min(self.state.asked, len(self.source.series) - 1)
+        name = html.escape(self.source.series.name(index))
+        self.parts.description.text = f"Frame {index} of {len(self.source.series) - 1}: {name}"
+        raw, full = self.source.raw(index)
         chosen = self.parts.picture.value
         picture = self.pictures.get(chosen, raw)
         field, ends = None, (0.0, 1.0)
@@ -138,47 +135,43 @@ class SetupPage:
         self.canvas.show(image)
         title = f"{chosen} (px)" if field else chosen
         if chosen != RAW and index != self._inspected:  # what was inspected stays while other frames are looked at
-            title += f", of frame {self._inspected}: {self.footage.series.name(self._inspected)}"
+            title += f", of frame {self._inspected}: {self.source.series.name(self._inspected)}"
         self.canvas.colour(ends, colours, title)
         self.canvas.bar.visible = field is not None
 
-    def _forget(self) -> None:
-        """Drop what was inspected, or is being: it was of another region, element size or calibration."""
+    def _remesh(self) -> None:
+        """Draw the mesh of the region; drop the inspection, of another region, element size or calibration."""
         self._number += 1
         if self.inspection is not None:
             self.inspection, self.pictures = None, {}
             self.tiles.plot.visible = False
             self.parts.picture.value, self.parts.picture.options = RAW, [RAW]
-
-    def _remesh(self) -> None:
-        """Draw the mesh that the region gets."""
-        self._forget()
         self._edges.data = {"xs": [], "ys": []}
         self._guarded(self._make_mesh)
 
     def _make_mesh(self) -> None:
-        content = self.sketch.region
+        content = self.drawing.region
         if content is None or not self.parts.size.value:
-            self.parts.told.text = _HELP
+            self.parts.message.text = _HELP
             return
         mesh = Tri3Mesh.from_region(self._region(content), float(self.parts.size.value))
-        self.parts.told.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
+        self.parts.message.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
         if len(mesh.elements) <= _MOST_EDGES:
             corners = mesh.nodes[mesh.elements][:, [0, 1, 2, 0]]
             self._edges.data = {"xs": list(corners[..., 0]), "ys": list(corners[..., 1])}
 
     def _region(self, content: dict[str, Any]) -> Region:
-        return read_region(read_section(RegionSettings, "region", content), self.footage.shape)
+        return read_region(read_section(RegionSettings, "region", content), self.source.shape)
 
     def _inspect(self) -> None:
-        """Look at the frame in view as `rgbmidic inspect` does, beside the page."""
-        content = self.sketch.region
+        """Inspect the frame in view as `rgbmidic inspect` does, in another thread."""
+        content = self.drawing.region
         if content is None:
-            self.parts.told.text = "Draw the region first."
+            self.parts.message.text = "Draw the region first."
             return
-        self.parts.told.text = "inspecting …"
+        self.parts.message.text = "inspecting …"
         index, size = int(self.parts.frame.value), float(self.parts.size.value)
-        task = self._reader.submit(lambda: inspected(self.footage, index, self._region(content), size))
+        task = self._reader.submit(lambda: inspected(self.source, index, self._region(content), size))
         have = partial(self._guarded, partial(self._have, task, index, self._number))
         task.add_done_callback(lambda _: self.document.add_next_tick_callback(have))
 
@@ -187,21 +180,21 @@ class SetupPage:
             return
         found, self._inspected = task.result(), index
         self.inspection = found
-        self.pictures = pictures(found, self.footage.shape)
-        self.tiles.show(side_by_side(found, self.pictures, self.footage.raw(index)[0]))
+        self.pictures = pictures(found, self.source.shape)
+        self.tiles.show(side_by_side(found, self.pictures, self.source.raw(index)[0]))
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
         known = found.std[np.isfinite(found.std)]
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
-        self.parts.told.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
+        self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
         if self.parts.picture.value == _EXPECTED:
             self.show()
         else:
             self.parts.picture.value = _EXPECTED
 
     def _changed(self) -> Draft:
-        """The draft with all that the page says."""
-        p, content, end = self.parts, self.sketch.region, len(self.footage.series) - 1
+        """Return the draft with the values of all controls."""
+        p, content, end = self.parts, self.drawing.region, len(self.source.series) - 1
         frames: dict[str, Any] = {"first": int(p.first.value) or None}
         frames["last"] = None if int(p.last.value) == end else int(p.last.value)
         if int(p.reference.value) != self.draft.frames.reference[0]:
@@ -214,10 +207,10 @@ class SetupPage:
         return self.draft.changed(changes)
 
     def _reopen(self) -> None:
-        """Take what the page says, once it can be read."""
+        """Take the values of the controls, once the frames can be read with them."""
         draft = self._changed()
         other = draft.section("calibration") != self.draft.section("calibration")
-        self.draft, self.footage = draft, Footage.of(draft)
+        self.draft, self.source = draft, DraftFrames.of(draft)
         if other:
             self._remesh()
         self.show()
@@ -226,11 +219,11 @@ class SetupPage:
         self._reopen()
         self.draft = self.draft.at(Path(self.parts.file.value))
         self.draft.write()
-        self.parts.told.text = f"{html.escape(str(self.draft.file))} is written."
+        self.parts.message.text = f"{html.escape(str(self.draft.file))} is written."
 
     def _run(self) -> None:
         if self.runs and self.runs[-1].going:
-            self.parts.told.text = "The run still goes on."
+            self.parts.message.text = "The run still goes on."
             return
         self._write()
         self.runs.append(Run.start(self.draft.file, Path(self.parts.out.value)))
@@ -238,5 +231,7 @@ class SetupPage:
     def _tick(self) -> None:
         if self.runs:
             run = self.runs[-1]
-            link = '<br><a id="result" href="result">look at the result as it grows</a>' if run.begun else ""
-            self.parts.ran.text = html.escape(run.words()) + link
+            link = (
+                '<br><a id="result" href="result">look at the result as it grows</a>' if run.result is not None else ""
+            )
+            self.parts.ran.text = html.escape(run.summary()) + link

@@ -41,9 +41,9 @@ def test_file(tmp_path):
 def test_a_region_with_a_hole_is_drawn_written_run_and_watched(test_file, tmp_path):
     with chromium() as driver, serving(test_file) as address:
         page = Page(driver, address)
-        assert "Frame 0 of 2: frame_0.tif" in page.run("model('words').text")
+        assert "Frame 0 of 2: frame_0.tif" in page.run("model('description').text")
         page.do("model('frame').value = 2")
-        page.until("model('words').text.includes('frame_2.tif')")
+        page.until("model('description').text.includes('frame_2.tif')")
         page.do("model('mode').active = 2")
         corners = [(12, 10), (135, 12), (130, 105), (15, 100)]
         for number, corner in enumerate(corners, start=1):
@@ -57,11 +57,11 @@ def test_a_region_with_a_hole_is_drawn_written_run_and_watched(test_file, tmp_pa
         page.until("model('marks').data.kind.length === 8")
         page.driver.execute_script(*click("Undo"))
         page.until("model('marks').data.kind.length === 7")
-        before = page.until("model('told').text.includes(' nodes, ') && model('told').text")
+        before = page.until("model('message').text.includes(' nodes, ') && model('message').text")
         page.do("model('size').value = 15")
-        told = page.until(f"model('told').text !== {before!r} && model('told').text")
+        told = page.until(f"model('message').text !== {before!r} && model('message').text")
         page.driver.execute_script(*click("Write TEST.toml"))
-        page.until("model('told').text.includes('is written')")
+        page.until("model('message').text.includes('is written')")
         written = test_file.read_text(encoding="utf-8")
         assert "# the plate, second try" in written
         assert "# one lamp" in written
@@ -91,7 +91,7 @@ def test_what_the_frame_tells_is_shown_and_bad_input_is_told(test_file):
         page = Page(driver, address)
         page.driver.execute_script(*click("Inspect"))
         page.until("model('picture').value === 'expected uncertainty'", patience=120)
-        page.until("model('told').text.includes('uncertainty to expect')")
+        page.until("model('message').text.includes('uncertainty to expect')")
         assert page.run("Array.from(model('tiles').data.name)") == ["raw frame", "light: light"]
         low, high = page.run("[model('colours').low, model('colours').high]")
         assert 0 < low < high < 0.1
@@ -100,7 +100,7 @@ def test_what_the_frame_tells_is_shown_and_bad_input_is_told(test_file):
         page.do("model('frame').value = 2")
         page.until("model('plot').title.text === 'light: light, of frame 0: frame_0.tif'")
         page.do("model('size').value = 15")
-        page.until("model('plot').title.text === 'raw frame' && !model('told').text.includes('median uncertainty')")
+        page.until("model('plot').title.text === 'raw frame' && !model('message').text.includes('median uncertainty')")
         assert page.run("model('picture').options") == ["raw frame"]
         for name, value, words in (
             ("calibration", "none.json", "none.json"),
@@ -110,5 +110,5 @@ def test_what_the_frame_tells_is_shown_and_bad_input_is_told(test_file):
             before = page.run(f"model('{name}').value")
             page.do(f"model('{name}').value = {value!r}")
             page.driver.execute_script(*click("Write TEST.toml"))
-            page.until(f"model('told').text.includes({words!r})")
+            page.until(f"model('message').text.includes({words!r})")
             page.do(f"model('{name}').value = {before!r}")

@@ -45,8 +45,8 @@ def driver():
 
 def shown(page, frame):
     """The words on the page once it shows a frame."""
-    page.until(f"model('state').shown === {frame} && model('words').text.startsWith('Frame {frame} ')")
-    return page.run("model('words').text")
+    page.until(f"model('state').shown === {frame} && model('description').text.startsWith('Frame {frame} ')")
+    return page.run("model('description').text")
 
 
 def test_frames_are_scrubbed_and_the_address_holds_what_is_shown(driver, address, result):
@@ -215,6 +215,6 @@ def test_a_damaged_frame_is_told_and_the_page_goes_on(driver, tmp_path):
     with serving(made.path) as told:
         page = Page(driver, told)
         page.do("model('frame').value = 1")
-        page.until("model('words').text.includes('damaged in frame 1')")
+        page.until("model('description').text.includes('damaged in frame 1')")
         page.do("model('frame').value = 0")
         shown(page, 0)

@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.report import document, remove_report, style, write_report
-from rgbmidic.report import setup as facts
+from rgbmidic.report import document, remove_report, setup, style, write_report
 from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SetupSettings, TestSettings
@@ -145,6 +144,7 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["frame rate"].startswith("50000 frames per second")
     assert page.rows["exposure"] == "1.5 µs"
     assert page.rows["virtual strain gauge"] == f"{3 * MESH.size:.4g} px ({0.15 * MESH.size:.3g} mm), at every node"
+    assert page.rows["elements"].endswith(f"side {stated.element_size:.4g} px ({0.05 * stated.element_size:.3g} mm)")
     assert page.rows["image filter"].startswith("[1 2 1]")
     assert page.rows["u_std"].startswith("mm | ")
     assert "by number or time: 2" in page.words
@@ -224,7 +224,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
     frames = FrameSettings(path=("a",), reference=tuple(range(count)))
     stated = TestSettings(frames=frames, region=RegionSettings(rectangle=(0, 0, 9, 9)))
     origin = {"references": range(count), "settings": stated}
-    floor = facts.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
+    floor = setup.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
     assert floor is not None
     assert floor.count == count
     accuracy = 4 / np.sqrt(2 * (count - 1) * NODES)
@@ -233,7 +233,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
 
 
 def test_one_static_frame_tells_no_noise(tmp_path: Path) -> None:
-    assert facts.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
+    assert setup.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
@@ -243,5 +243,5 @@ def test_speckle_size_is_the_width_of_the_autocorrelation(tmp_path: Path, sigma:
     white, more = np.random.default_rng(0).normal(size=(2, 3, 80, 120)).astype(np.float32)
     texture = np.stack([cv2.GaussianBlur(image, (0, 0), sigma) for image in white])
     reference = texture / texture.std() + noise * more
-    size = facts.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
+    size = setup.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
     assert size == pytest.approx(2 * np.sqrt(2 * np.log(2)) * np.sqrt(2) * sigma, rel=0.08)

@@ -25,7 +25,7 @@ from rgbmidic.view.fields import Pictures
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 X, Y = MESH.nodes.T
 SETTINGS = {"frames": {"path": "x.cine", "kind": "monochrome"}, "region": {"rectangle": [0, 0, 9, 9]}}
-EVERY_FRAME = {"displacement", "uncertainty", "strain", "misfit", "shares"}
+EVERY_FRAME = {"displacement", "uncertainty", "strain", "misfit", "fractions"}
 
 
 def _one_frame(

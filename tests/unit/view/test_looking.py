@@ -16,13 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, NODES, make_origin, make_result, random_record, smooth_record
 
+from rgbmidic.report.style import time_axis
 from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.results.histories import write_histories
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.view import curves
-from rgbmidic.view.address import KINDS, Look, Mark
-from rgbmidic.view.curves import Course, CurvePanel, TimeLine
-from rgbmidic.view.fields import Fields, Values, frame_words, pointed_words, robust_range, watched
+from rgbmidic.view.address import KINDS, Mark, ViewState
+from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
+from rgbmidic.view.fields import Fields, Values, frame_text, pointer_text, robust_range, watched
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import Window, element_at, paint, palette, palette_name
 
@@ -30,7 +31,7 @@ NAMES = ("u", "v", "e1")
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
 marks = st.lists(st.builds(Mark, st.sampled_from(list(KINDS)), numbers, numbers), max_size=4).map(tuple)
 looks = st.builds(
-    Look,
+    ViewState,
     frame=st.integers(0, 9),
     field=st.sampled_from(NAMES),
     over=st.sampled_from(["reference", "deformed"]),
@@ -42,27 +43,29 @@ looks = st.builds(
 )
 
 
-def opened(query: str) -> Look:
+def opened(query: str) -> ViewState:
     arguments = {key: [value.encode() for value in values] for key, values in parse_qs(query).items()}
-    return Look.from_query(arguments, frames=10, names=NAMES, frame=9)
+    return ViewState.from_query(arguments, frames=10, names=NAMES, frame=9)
 
 
 @given(looks)
-def test_an_address_opens_what_it_was_made_of(look):
-    assert opened(f"frame={look.frame}&{look.query()}") == look
+def test_an_address_opens_what_it_was_made_of(view):
+    assert opened(f"frame={view.frame}&{view.query()}") == view
 
 
 @given(
-    st.dictionaries(st.sampled_from([*Look.__dataclass_fields__, "x"]), st.lists(st.binary(max_size=30), max_size=2))
+    st.dictionaries(
+        st.sampled_from([*ViewState.__dataclass_fields__, "x"]), st.lists(st.binary(max_size=30), max_size=2)
+    )
 )
 @settings(max_examples=200)
 def test_an_address_of_nonsense_opens_something_that_can_be_shown(query):
-    look = Look.from_query(query, frames=10, names=NAMES, frame=9)
-    assert 0 <= look.frame < 10
-    assert look.field in NAMES
-    assert look.low < look.high
-    assert 0 <= look.opacity <= 1
-    assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in KINDS for mark in look.marks)
+    view = ViewState.from_query(query, frames=10, names=NAMES, frame=9)
+    assert 0 <= view.frame < 10
+    assert view.field in NAMES
+    assert view.low < view.high
+    assert 0 <= view.opacity <= 1
+    assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in KINDS for mark in view.marks)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +80,9 @@ def result(tmp_path_factory):
 def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
     fields = Fields.of(result)
     assert list(fields.all)[:3] == ["u", "v", "magnitude"]
-    assert {"e1", "equivalent", "node_status", "u_std", *(f"share of {light}" for light in LIGHTS)} <= set(fields.all)
+    assert {"e1", "equivalent", "node_status", "u_std", *(f"fraction of {light}" for light in LIGHTS)} <= set(
+        fields.all
+    )
     assert fields.all["u"].label == "u (mm)"
     read, record = fields.read("u", 3), result.frame(3)
     np.testing.assert_allclose(read.values, 0.5 * record.u)
@@ -86,8 +91,8 @@ def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
     np.testing.assert_allclose(fields.read("magnitude", 3).values, 0.5 * np.hypot(record.u, record.v))
     np.testing.assert_array_equal(fields.read("node_status", 3).values, record.node_status)
     np.testing.assert_allclose(fields.read("e1", 3).values, fields.physical.frame(3)["e1"])
-    share = fields.read("share of green", 3).values
-    assert np.isnan(share[record.node_status != 0]).all()
+    fraction = fields.read("fraction of green", 3).values
+    assert np.isnan(fraction[record.node_status != 0]).all()
     for name in fields.all:
         assert fields.read(name, 3).values.shape == (NODES,)
 
@@ -194,13 +199,13 @@ def test_the_time_line_tells_failed_frames_and_lost_nodes(tmp_path):
     records = [random_record(0), FrameRecord.failed("no start", nodes=NODES, lights=3), random_record(3)]
     for index, record in enumerate(records):
         store.write_frame(index, record)
-    result, course = Result.open(tmp_path / "result", partial=True), Course(4)
+    result, progress = Result.open(tmp_path / "result", partial=True), Progress(4)
     for _ in range(2):
-        course.advance(result)
-        assert course.known == 3
-    assert course.status.tolist() == [0, 2, 1, -1]
-    np.testing.assert_allclose(course.share[:3], [(r.node_status == 0).mean() for r in records])
-    assert course.words(3) == "3 of 4 frames measured, 1 not converged, 1 failed"
+        progress.advance(result)
+        assert progress.known == 3
+    assert progress.status.tolist() == [0, 2, 1, -1]
+    np.testing.assert_allclose(progress.fraction[:3], [(r.node_status == 0).mean() for r in records])
+    assert progress.summary(3) == "3 of 4 frames measured, 1 not converged, 1 failed"
     store.release()
 
 
@@ -208,13 +213,13 @@ def test_a_frame_that_is_measured_again_or_taken_back_is_looked_at_again(tmp_pat
     store = ResultStore.create(tmp_path / "result", make_origin(3))
     for index in range(3):
         store.write_frame(index, FrameRecord.failed("no start", nodes=NODES, lights=3))
-    course, line = Course(3), TimeLine(3, 0)
-    course.advance(Result.open(store.path, partial=True))
-    line.draw(course)
+    progress, line = Progress(3), TimeLine(3, 0)
+    progress.advance(Result.open(store.path, partial=True))
+    line.draw(progress)
     store.write_frame(1, smooth_record(1))
-    course.advance(Result.open(store.path, partial=True))
-    line.draw(course)
-    assert course.words(3) == "3 of 3 frames measured, 2 failed"
+    progress.advance(Result.open(store.path, partial=True))
+    line.draw(progress)
+    assert progress.summary(3) == "3 of 3 frames measured, 2 failed"
     assert line.plot.select_one({"name": "faults"}).data["x"] == [0, 2]
     store.release()
 
@@ -223,7 +228,7 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(5))
     for index in (0, 1, 4):
         store.write_frame(index, smooth_record(index))
-    panel = CurvePanel(Document(), chosen="", select=Select(), told=Div(), hint="")
+    panel = CurvePanel(Document(), chosen="", select=Select(), message=Div(), hint="")
     panel.histories = curves.read(Result.open(store.path, partial=True), [Mark("point", 50, 40)], 60.0)
     shown = []
     for frame in range(5):
@@ -236,10 +241,10 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
 def test_curves_go_over_the_time_in_the_unit_that_suits_it(tmp_path):
     result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
     histories = curves.read(result, [Mark("point", 50, 40)], 60.0)
-    x, name = curves.over(histories)
+    x, name = time_axis(histories.times, histories.frames)
     assert name == "time (µs)"
     np.testing.assert_allclose(x, [0, 20, 40, 60])
-    words = frame_words(result, 3, Fields.of(result).all["u"], Fields.of(result).read("u", 3), "")
+    words = frame_text(result, 3, Fields.of(result).all["u"], Fields.of(result).read("u", 3), "")
     assert "frame 3, 60 µs" in words
 
 
@@ -255,7 +260,7 @@ class Walk:
     def __init__(self, folder):
         self.store = ResultStore.create(folder / "result", make_origin(8))
         self.store.write_frame(0, smooth_record(1))
-        self.page = ResultPage(Document(), self.opened, Look(), Course(8))
+        self.page = ResultPage(Document(), self.opened, ViewState(), Progress(8))
         self.page.show()
 
     @property
@@ -268,7 +273,7 @@ class Walk:
             x, y = choose.uniform(0, 120), choose.uniform(0, 80)
             page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=x, y=y))
         elif what == "frame":
-            page.asked.asked = choose.randrange(8)
+            page.state.asked = choose.randrange(8)
         elif what == "field":
             parts.field.value = choose.choice([name for name, _ in parts.field.options])
         elif what == "over":
@@ -278,23 +283,23 @@ class Walk:
         else:
             self.store.write_frame(choose.randrange(8), smooth_record(choose.randrange(1, 9)))
             page._grow()
-            page.asked.asked = parts.frame.value if parts.frame.value != page.look.frame else page.asked.asked
+            page.state.asked = parts.frame.value if parts.frame.value != page.view.frame else page.state.asked
 
     def check(self):
         """All that is shown is of the frame and the field in view, as the result holds them now."""
-        page, look, result = self.page, self.page.look, self.opened
+        page, view, result = self.page, self.page.view, self.opened
         fields = Fields.of(result)
-        field, values = fields.all[look.field], fields.read(look.field, look.frame)
-        nodes = values.moved if look.over == "deformed" else result.nodes
+        field, values = fields.all[view.field], fields.read(view.field, view.frame)
+        nodes = values.moved if view.over == "deformed" else result.nodes
         pointer = page._pointer
-        told = "" if pointer is None else pointed_words(field, values, nodes, result.elements, *pointer)
+        told = "" if pointer is None else pointer_text(field, values, nodes, result.elements, *pointer)
         assert page.parts.under.text == told
-        remark = page.pictures.frame(look.frame)[1] if look.over == "deformed" else ""
-        assert page.parts.words.text == frame_words(result, look.frame, field, values, remark)
+        remark = page.pictures.frame(view.frame)[1] if view.over == "deformed" else ""
+        assert page.parts.description.text == frame_text(result, view.frame, field, values, remark)
         assert page.canvas.plot.title.text == field.label
         if field.ends is None:
-            whole = fields.range_of_test(look.field)
-            ends = whole if look.range == "test" else robust_range(values) or (0.0, 1.0)
+            whole = fields.range_of_test(view.field)
+            ends = whole if view.range == "test" else robust_range(values) or (0.0, 1.0)
             assert (page.canvas.colours.low, page.canvas.colours.high) == ends
 
 
@@ -313,43 +318,43 @@ def test_what_is_told_is_always_that_of_what_is_shown(tmp_path, seed):
 
 def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
     made = make_result(tmp_path / "result", frames=3, record=smooth_record)
-    page = ResultPage(Document(), made, Look(frame=0), Course(3))
+    page = ResultPage(Document(), made, ViewState(frame=0), Progress(3))
     page.show()
     page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=50, y=40))
     file = next((made.path / "solution").glob("*.frames"))
     content = bytearray(file.read_bytes())
     content[int(made.table.start[1]) + 3] ^= 255
     file.write_bytes(content)
-    page.asked.asked = 1
-    assert "damaged in frame 1" in page.parts.words.text
+    page.state.asked = 1
+    assert "damaged in frame 1" in page.parts.description.text
     assert page.parts.under.text == ""
     assert not len(page.canvas._image.data["image"])
     assert not page.canvas.bar.visible
-    page.asked.asked = 2
-    assert page.parts.words.text.startswith("Frame 2 of 2")
+    page.state.asked = 2
+    assert page.parts.description.text.startswith("Frame 2 of 2")
     assert "u = " in page.parts.under.text
     assert page.canvas.bar.visible
 
 
 def test_curves_that_are_being_read_are_not_saved(tmp_path):
-    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), Look(), Course(2))
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
     page.curves.histories = curves.read(page.result, [Mark("point", 50, 40)], 60.0)
     page.curves.reading = True
     page._save()
-    assert page.asked.csv == ""
-    assert "still being read" in page.parts.told.text
+    assert page.state.csv == ""
+    assert "still being read" in page.parts.message.text
     page.curves.reading = False
     page._save()
-    assert page.asked.csv.startswith("frame,")
+    assert page.state.csv.startswith("frame,")
 
 
 def test_a_range_by_hand_that_makes_no_sense_is_told(tmp_path):
-    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), Look(), Course(2))
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
     page.parts.range.value = "hand"
     page.parts.low.value = 5.0
-    assert "The colours go from -1 to 1" in page.parts.words.text
+    assert "The colours go from -1 to 1" in page.parts.description.text
     page.parts.high.value = 9.0
-    assert "The colours go" not in page.parts.words.text
+    assert "The colours go" not in page.parts.description.text
     assert (page.canvas.colours.low, page.canvas.colours.high) == (5, 9)
 
 

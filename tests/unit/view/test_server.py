@@ -19,7 +19,7 @@ from viewer import serving
 
 from rgbmidic import cli
 from rgbmidic.command import execute
-from rgbmidic.view.address import Look
+from rgbmidic.view.address import ViewState
 from rgbmidic.view.server import start
 
 REQUESTS = 300
@@ -84,7 +84,7 @@ def test_what_is_no_request_is_dropped(address, content):
 
 
 def test_a_page_is_served_whatever_its_query_says(address):
-    choose, names = random.Random(3), list(Look.__dataclass_fields__)
+    choose, names = random.Random(3), list(ViewState.__dataclass_fields__)
     for _ in range(2):
         words = ["".join(choose.choices(NOISE + "\0é", k=choose.randrange(9))) for _ in names]
         query = "&".join(f"{name}={quote(word)}" for name, word in zip(names, words, strict=True))
