@@ -35,9 +35,8 @@ __all__ = ["Deformed", "Reference", "drawn"]
 
 _SHARED = 0.85
 """Correlation of a light's gradient with the mean of the others', median over the region, from which theirs takes its
-place. Lights of one paint reach .95 to 1. At .85 the error of two lights with
-noise grows by an eighth so (derived), that of three whose paint is their own by 18 % of the variance by a tenth
-(measured); below it they would lose more."""
+place. Lights of one paint reach .95 to 1. At .85 the error of two lights with noise grows by an eighth so (derived),
+that of three whose paint is their own by 18 % of the variance by a tenth (measured); below it they would lose more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,6 +61,7 @@ class Deformed:
     partial: npt.NDArray[np.int32] = field(init=False)
 
     def __post_init__(self) -> None:
+        """Count the blocks with a weight other than 1."""
         object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
 
     @property
@@ -78,8 +78,28 @@ class Deformed:
         prefilter: str = "none",
         origin: tuple[int, int] = (0, 0),
     ) -> Deformed:
-        """Fill, filter and prefilter images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]; they begin
-        at column and row `origin` of the frame."""
+        """Fill holes of images, filter them and prepare their splines.
+
+        Parameters
+        ----------
+        images : ndarray, shape (k, H, W), float32
+            Grey levels, NaN where invalid.
+        weights : ndarray, shape (k, H, W), float32, optional
+            In [0, 1]; 1 without.
+        prefilter
+            One of `PREFILTERS`.
+        origin
+            Column and row of the frame at which the images begin.
+
+        Returns
+        -------
+        Deformed
+
+        Raises
+        ------
+        InputError
+            Unknown prefilter.
+        """
         return cls(
             coefficients=spline_coefficients(images, prefilter),
             weights=_usable_weights(images, weights, prefilter),
@@ -96,13 +116,14 @@ class Reference:
     mesh, pixels, assembly, colouring
         TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
     material : Tri3Mesh
-        The mesh on the first frame, where fields are recovered and strains count: `mesh` itself before any renewal.
+        The mesh on the first frame, where fields are recovered and strains count: `mesh` itself before any reference
+        update.
     linear_offset : ndarray, shape (N, 3)
         What a linear fit makes of fields curved on `material` (`linear_fit_offset`).
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded.
     unfitted : float
-        Share of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
+        Fraction of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
     values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
     texture : ndarray, shape (2, P), float32
@@ -143,13 +164,31 @@ class Reference:
         prefilter: str = "none",
         origin: tuple[int, int] = (0, 0),
     ) -> Reference:
-        """Prepare reference images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]; they begin at column
-        and row `origin` of the frame, region and mesh count from there.
+        """Prepare the reference state.
+
+        Parameters
+        ----------
+        images : ndarray, shape (k, H, W), float32
+            Grey levels, NaN where invalid.
+        region
+            Pixels to measure; region and mesh count from the first pixel of the images.
+        weights : ndarray, shape (k, H, W), float32, optional
+            In [0, 1]; 1 without.
+        mesh
+            Of the region.
+        prefilter
+            One of `PREFILTERS`.
+        origin
+            Column and row of the frame at which the images begin.
+
+        Returns
+        -------
+        Reference
 
         Raises
         ------
         InputError
-            The region belongs to images of another size.
+            The region belongs to images of another size; unknown prefilter.
         """
         if region.mask.shape != images.shape[1:]:
             raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
@@ -210,9 +249,19 @@ class Reference:
         weight: FloatImage,
         moments: FloatArray,
     ) -> None:
-        """A light's deformed image brought back by a nodal displacement (N, 2) and compared with reference grey levels
-        `values` (P,): `difference` (P,), `weight` (P,), the reference's times the deformed image's there, and the
-        `moments` (E, 6), as in `Residual`."""
+        """Warp a light's deformed image by a nodal displacement (N, 2) and compare it with reference grey levels.
+
+        Parameters
+        ----------
+        deformed, light
+            The deformed state and the number of the light.
+        values : ndarray, shape (P,), float32
+            Reference grey levels.
+        displacement : ndarray, shape (N, 2)
+            px.
+        difference, weight, moments : ndarray, shape (P,), (P,), (E, 6)
+            Receive the light's part of those of `Residual`; the weight is the reference's times the deformed image's.
+        """
         images = (
             deformed.coefficients[light],
             deformed.weights[light],
@@ -226,22 +275,24 @@ class Reference:
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
     ) -> FloatArray:
-        """A light's right-hand side (2 N,) for reference grey levels `values` (P,)."""
+        """Sum a light's right-hand side (2 N,) for reference grey levels `values` (P,)."""
         parts = np.empty((len(self.mesh.elements), 3, 2))
         gradient, motion = (self.gradient_x[light], self.gradient_y[light]), displacement - self.offset(deformed)
         element_right_side(deformed.coefficients[light], values, *gradient, weight, *self._geometry(), motion, parts)
         return self.assembly.vector(parts)
 
     def projected(self, light: int, weight: FloatImage, difference: FloatImage) -> FloatArray:
-        """The same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
+        """Sum the same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
         parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
         geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
         element_vector(weight, difference, self.gradient_x[light], self.gradient_y[light], *geometry, parts)
         return self.assembly.vector(parts)
 
     def channel_specific_pulls(self, weights: FloatImage, difference: FloatImage) -> FloatArray:
-        """The same of every light, (k, 2 N), with its channel-specific gradient, for `weights` and `difference` (k, P);
-        of no light where there is but one."""
+        """Sum the same of every light, (k, 2 N), with its channel-specific gradient.
+
+        `weights` and `difference` are (k, P); the result is empty where there is but one light.
+        """
         parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
         geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
         pulls = np.empty((self.channel_specific.shape[1], self.assembly.size))
@@ -251,7 +302,7 @@ class Reference:
         return pulls
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:
-        """Sums over each element of fields (n, P), and of them times a `factor` (P,); shape (n, E, 2)."""
+        """Sum fields (n, P) over each element, and their products with a `factor` (P,); shape (n, E, 2)."""
         out = np.empty((len(values), len(self.mesh.elements), 2))
         element_sums(values, factor, self.pixels.offsets, out)
         return out
@@ -268,7 +319,7 @@ class Reference:
 
 
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
-    """The weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
+    """Return the weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
     given = np.ones_like(images) if weights is None else weights
     usable, reach = np.zeros_like(images), usable_reach(prefilter)
     for image, weight, out in zip(images, given, usable, strict=True):
@@ -335,8 +386,13 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
 
 
 def _regression(own: FloatImage, mean: FloatImage, used: FloatImage, pixels: PixelMap) -> tuple[FloatImage, float]:
-    """Local regression coefficient (P,) of a light's `own` gradient (2, P) on the `mean` (2, P), at least 0, and the
-    median of their correlation coefficient."""
+    """Regress a light's `own` gradient (2, P) on the `mean` (2, P), locally.
+
+    Returns
+    -------
+    tuple
+        The coefficient (P,), at least 0, and the median of the correlation coefficient.
+    """
     products = np.stack([(mean * own).sum(axis=0), (mean**2).sum(axis=0), (own**2).sum(axis=0)])
     along, square, power = window_means(pixels, products, np.broadcast_to(used, products.shape))
     known = (square > 0) & (power > 0)

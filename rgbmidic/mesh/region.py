@@ -286,7 +286,7 @@ def _outline_points(outlines: list[FloatArray], size: float) -> FloatArray:
 _STEP = 0.5
 """Distance (px) of the points at which a path is looked at: no pixel that it crosses by more than half is missed."""
 _FINE = 1.0
-"""How far (px) the row of nodes may be beside the stated path: pixels that near to its edges are left out (`usable_pixels`)."""
+"""How far (px) the row of nodes may be beside the stated path: pixels that near its edges are left out."""
 _CRACKS_CROWDED = 0.5
 """Least distance of nodes along a path, and most by which a branch moves along the path it leaves, in elements: the
 nodes of an earlier path are at most an element apart."""
