@@ -5,8 +5,9 @@ The prefilter of the splines and their evaluation follow Unser (IEEE Signal Proc
 Other loops move values between the owned pixels and images, or coarse grids of square blocks, of the rectangle around
 them. `lines` (R, 4) int32 are the rows of pixels of the elements in the order of the image's rows: first slot, number
 of pixels, row and column in the rectangle; row r has ``line_offsets[r]:line_offsets[r + 1]``. Pixels are counted
-without sign: an index that may be negative would be looked at each time. What is summed is first added up along the columns of
-a block's rows, side by side in memory. The last one paints a field on a triangle mesh as the pixels of a screen.
+without sign: an index that may be negative would be looked at each time. What is summed is first added up along the
+columns of a block's rows, side by side in memory. The last one paints a field on a triangle mesh as the pixels of a
+screen.
 """
 
 from __future__ import annotations

@@ -388,7 +388,7 @@ def unfitted_fraction(
 
     def summed(signs: FloatImage | np.float32) -> FloatArray:
         out = np.zeros((len(pixels.origin), 3, 3, 3))
-        own, geometry = np.empty_like(out), (pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric)
+        own, geometry = np.empty_like(out), pixels.positions
         for gx, gy, weight in zip(*gradient, weights, strict=True):
             element_hessian(gx, gy, weight * signs, *geometry, own)
             out += own

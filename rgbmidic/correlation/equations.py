@@ -23,8 +23,8 @@ __all__ = ["SEEN", "Equations", "Estimate", "Problem", "UnsolvableError", "compa
 
 _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian. Chosen;
-with a tenth or ten times of it three lights under a moving reflection differ by 4e-5 and 4e-4 px at most
-(benchmarks/constants.py)."""
+with a tenth or ten times of it three lights under a moving reflection differ by 4e-5 and 4e-4 px at most, beside a gap
+by 7e-4 and 6e-3 (benchmarks/constants.py)."""
 _CONSTANT = 1e-9
 """Multiple of the identity, relative to the same, that fixes the constant which the smoothness leaves free where
 nothing is seen: 1e5 times less than the smoothness, 1e7 times more than rounding (derived)."""

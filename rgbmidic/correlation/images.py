@@ -130,8 +130,8 @@ def spline_values(coefficients: FloatImage) -> FloatImage:
 
 _RANGE = 8.0
 """Standard deviation (px) of the window: its 800 px, 4 pi times the square, give a variance to 5 % (derived), and it is
-narrow beside a reflection. Chosen; with half or twice of it lights under one differ by 4e-3 px at most, their
-uncertainty by 6 % (benchmarks/constants.py)."""
+narrow beside a reflection. Chosen; with half or twice of it lights under one differ by 4e-3 px at most, beside a gap by
+.1 px, their uncertainty by 7 % (benchmarks/constants.py)."""
 _COARSE = 4
 """Reduction of the grid on which that window is applied: half its standard deviation, to which it adds 1 %."""
 

@@ -37,20 +37,20 @@ __all__ = [
 ]
 
 _LEAST_RATIO = 1e-2
-"""Least fraction of a residual's variance that is taken to displace. Chosen; with half or twice of it nothing
-changes (benchmarks/constants.py)."""
+"""Least fraction of a residual's variance that is taken to displace. Chosen; with half or twice of it nothing changes
+(benchmarks/constants.py)."""
 _LEAST_FRACTION = 0.05
 """Least fraction of a direction in the texture: nodes with less of the median are not measured (`SEEN`)."""
 _EVEN = 0.6
-"""Standard deviation (blocks) of the window in which the information of a block is taken. Chosen; with half
-or twice of it lights differ by 1e-4 px at most, their uncertainty by 1 % (benchmarks/constants.py)."""
+"""Standard deviation (blocks) of the window in which the information of a block is taken. Chosen; with half or twice of
+it lights differ by 1e-4 px at most, beside a gap by 4e-3, their uncertainty by 4 % (benchmarks/constants.py)."""
 _SCORE_RANGE = 30.0
 """Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to 12 %
-(derived). With half or twice of it lights differ by 2e-3 px at most, their uncertainty by 8 %
+(derived). With half or twice of it lights differ by 2e-3 px at most, beside a gap by 1e-2, their uncertainty by 10 %
 (benchmarks/constants.py)."""
 _LEAST_FREEDOM = 0.25
-"""Least number of blocks, less one, that is taken, where a region has one block: the variance
-is stated 5 times larger then, for it is hardly known (derived)."""
+"""Least number of blocks, less one, that is taken, where a region has one block: the variance is stated 4 times larger
+then, for it is hardly known (derived)."""
 _PRIOR = 0.1
 """Blocks for which the region's typical score counts in that window: beside a hole there are few."""
 
@@ -237,8 +237,8 @@ def _blur(image: AnyArray, sigma: float) -> AnyArray:
 
 _FREEDOM = 4.0
 """Degrees of freedom of the Student distribution taken for the residual (Lange et al., J. Am. Stat. Assoc. 84, 1989,
-who found 4 to work well). With 2 or 8 lights under a reflection differ by 2e-3 px at most, their uncertainty by 2 %
-(benchmarks/constants.py)."""
+who found 4 to work well). With 2 or 8 lights under a reflection differ by 2e-3 px at most, beside a gap by 4e-2, their
+uncertainty by 11 % (benchmarks/constants.py)."""
 _OWN = 0.1
 """Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same."""
 _LEAST_BEND = 0.1
@@ -326,8 +326,8 @@ _MATCHED = (0.4, 0.6)
 _MATCHED_PRECISE = (0.4, 0.9)
 """The same where the lights count by their precision, so that a reflection in one of them is no mismatch."""
 _WORSE = 8.0
-"""In between: how many times farther from 1 than the median of the elements around. Chosen; with half or
-twice of it lights do not change (benchmarks/constants.py)."""
+"""In between: how many times farther from 1 than the median of the elements around. Chosen; with half or twice of it
+lights do not change (benchmarks/constants.py)."""
 _AROUND = 61
 """Elements around: a square of some 5.5 elements a side, of which a crack takes a third."""
 

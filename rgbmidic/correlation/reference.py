@@ -108,18 +108,56 @@ class Deformed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reference:
-    """The reference state with its mesh; everything a frame needs and no frame changes.
+class ReferenceGeometry:
+    """The mesh of a reference and what follows from it; the grey levels of the images have no part in it.
 
     Attributes
     ----------
-    mesh, pixels, assembly, colouring
-        TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
+    mesh, pixels, assembly
+        TRI3 mesh, pixel map, sparse structure of the normal equations.
     material : Tri3Mesh
         The mesh on the first frame, where fields are recovered and strains count: `mesh` itself before any reference
         update.
+    colouring : NodeColouring
+        Of `material`, for the uncertainty: its distances are those where the sides of a crack meet.
     linear_offset : ndarray, shape (N, 3)
         What a linear fit makes of fields curved on `material` (`linear_fit_offset`).
+    origin : tuple of int
+        Column and row of the frame at which the images begin; mesh and pixels count from there.
+    """
+
+    mesh: Tri3Mesh
+    pixels: PixelMap
+    assembly: Assembly
+    material: Tri3Mesh
+    colouring: NodeColouring
+    linear_offset: FloatArray
+    origin: tuple[int, int]
+
+    @classmethod
+    def of(
+        cls, mesh: Tri3Mesh, region: Region, origin: tuple[int, int], first: ReferenceGeometry | None
+    ) -> ReferenceGeometry:
+        """Prepare the geometry of a mesh and its region; `first` is that of the first frame, None for itself."""
+        return cls(
+            mesh=mesh,
+            pixels=PixelMap.from_mesh(mesh, region),
+            assembly=Assembly.from_mesh(mesh),
+            material=mesh if first is None else first.material,
+            colouring=NodeColouring.from_mesh(mesh) if first is None else first.colouring,
+            linear_offset=linear_fit_offset(mesh) if first is None else first.linear_offset,
+            origin=origin,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reference:
+    """The reference state: its geometry and its images; everything a frame needs and no frame changes.
+
+    Attributes
+    ----------
+    geometry : ReferenceGeometry
+        Mesh, pixels and what follows from them.
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded.
     unfitted : float
@@ -131,16 +169,10 @@ class Reference:
     channel_specific : ndarray, shape (2, k, P), float32
         What each light's own gradient has beyond that of the common texture; of no light where there is but one.
     prefilter : str
-    origin : tuple of int
-        Column and row of the frame at which the images begin; mesh and pixels count from there.
+        One of `PREFILTERS`.
     """
 
-    mesh: Tri3Mesh
-    pixels: PixelMap
-    assembly: Assembly
-    colouring: NodeColouring
-    material: Tri3Mesh
-    linear_offset: FloatArray
+    geometry: ReferenceGeometry
     unfitted: float
     images: FloatImage
     weights: FloatImage
@@ -151,7 +183,6 @@ class Reference:
     texture: FloatImage
     channel_specific: FloatImage
     prefilter: str
-    origin: tuple[int, int] = (0, 0)
 
     @classmethod
     def prepare(
@@ -163,6 +194,7 @@ class Reference:
         mesh: Tri3Mesh,
         prefilter: str = "none",
         origin: tuple[int, int] = (0, 0),
+        first: ReferenceGeometry | None = None,
     ) -> Reference:
         """Prepare the reference state.
 
@@ -180,6 +212,8 @@ class Reference:
             One of `PREFILTERS`.
         origin
             Column and row of the frame at which the images begin.
+        first
+            Geometry of the first frame, where this is a later one; its nodes are those of `mesh`.
 
         Returns
         -------
@@ -197,19 +231,15 @@ class Reference:
             usable = usable * usable_pixels(region.mask, prefilter)
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
             usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
-        pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
+        geometry = ReferenceGeometry.of(mesh, region, origin, first)
+        pixels = geometry.pixels
         ready = spline_values(coefficients)
         weighted = pixels.gather(usable)
         own = _gradient(coefficients, pixels)
         gradient = _common_gradient(own, weighted, pixels)
         return cls(
-            mesh=mesh,
-            pixels=pixels,
-            assembly=assembly,
-            colouring=NodeColouring.from_mesh(mesh),
-            material=mesh,
-            linear_offset=linear_fit_offset(mesh),
-            unfitted=unfitted_fraction(pixels, assembly, gradient, weighted, block_side(pixels, mesh.size)),
+            geometry=geometry,
+            unfitted=unfitted_fraction(pixels, geometry.assembly, gradient, weighted, block_side(pixels, mesh.size)),
             images=ready,
             weights=usable,
             values=pixels.gather(ready),
@@ -219,8 +249,27 @@ class Reference:
             texture=gradient.sum(axis=1),
             channel_specific=(own - gradient)[:, : len(images) if len(images) > 1 else 0],
             prefilter=prefilter,
-            origin=origin,
         )
+
+    @property
+    def mesh(self) -> Tri3Mesh:
+        """TRI3 mesh, counted from the first pixel of the images."""
+        return self.geometry.mesh
+
+    @property
+    def pixels(self) -> PixelMap:
+        """Pixel map of the mesh."""
+        return self.geometry.pixels
+
+    @property
+    def assembly(self) -> Assembly:
+        """Sparse structure of the normal equations."""
+        return self.geometry.assembly
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Column and row of the frame at which the images begin."""
+        return self.geometry.origin
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin."""
@@ -230,9 +279,7 @@ class Reference:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""
         pixels = self.pixels
         out = np.zeros((len(self.mesh.elements), 3, 3, 3))
-        element_hessian(
-            gradient_x, gradient_y, weight, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, out
-        )
+        element_hessian(gradient_x, gradient_y, weight, *pixels.positions, out)
         return out
 
     def hessian_blocks(self, light: int, weight: FloatImage) -> FloatArray:
@@ -284,7 +331,7 @@ class Reference:
     def projected(self, light: int, weight: FloatImage, difference: FloatImage) -> FloatArray:
         """Sum the same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
         parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
-        geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+        geometry = pixels.positions
         element_vector(weight, difference, self.gradient_x[light], self.gradient_y[light], *geometry, parts)
         return self.assembly.vector(parts)
 
@@ -294,7 +341,7 @@ class Reference:
         `weights` and `difference` are (k, P); the result is empty where there is but one light.
         """
         parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
-        geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+        geometry = pixels.positions
         pulls = np.empty((self.channel_specific.shape[1], self.assembly.size))
         for light, pull in enumerate(pulls):
             element_vector(weights[light], difference[light], *self.channel_specific[:, light], *geometry, parts)

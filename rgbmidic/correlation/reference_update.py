@@ -184,7 +184,9 @@ class ReferenceUpdate:
         motion = displacement - np.subtract(origin, self.first.origin)
         moved = Tri3Mesh(nodes=mesh.nodes + motion, elements=mesh.elements)
         region = _region(self.first, moved, measured, images.shape[1:])
-        reference = Reference.prepare(images, region, weights, mesh=moved, prefilter=prefilter, origin=origin)
+        reference = Reference.prepare(
+            images, region, weights, mesh=moved, first=self.first.geometry, prefilter=prefilter, origin=origin
+        )
         step = displacement - self.displacement
         gaps = np.where(measured[:, None], step, np.nan)
         deformed = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
@@ -192,13 +194,7 @@ class ReferenceUpdate:
         turn = np.eye(2) + self.reference.mesh.element_gradient(step)
         return ReferenceUpdate(
             first=self.first,
-            # distances on the first frame, where the sides of a crack meet; strains against it
-            reference=replace(
-                reference,
-                colouring=self.first.colouring,
-                material=self.first.mesh,
-                linear_offset=self.first.linear_offset,
-            ),
+            reference=reference,
             displacement=displacement,
             variance=_single(solution.displacement_std) ** 2,
             strain=_single(solution.strain),
@@ -242,7 +238,7 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, 
     residual, known = _residual(reference, deformed, displacement, rigid)
     pixels = reference.pixels
     total, parts = np.zeros((len(pixels.origin), 2)), np.zeros((len(pixels.origin), 3, 2))
-    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+    geometry = pixels.positions
     fields = residual.weights, residual.difference, reference.gradient_x, reference.gradient_y
     for light in zip(*fields, strict=True):
         element_vector(*light, *geometry, parts)

@@ -100,7 +100,7 @@ class Residual:
         """
         known, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
         images = self.difference, known.gradient_x, known.gradient_y
-        deviation = curved_deviation(known.material, pixels.barycentric, carried, curvature)
+        deviation = curved_deviation(known.geometry.material, pixels.barycentric, carried, curvature)
         subtract_quadratic(*images, deviation, pixels.local_x, pixels.local_y, pixels.offsets, out)
         return replace(self, difference=out)
 
@@ -193,7 +193,7 @@ def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: Floa
     system = assembly.matrix(reference.blocks(weight, g, np.ones_like(g)))
     smooth = _SMOOTHNESS * system.diagonal().mean() * assembly.smoothness.data
     parts = np.zeros((len(reference.mesh.elements), 3, 2))
-    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+    geometry = pixels.positions
     element_vector(weight, f, g, np.ones_like(g), *geometry, parts)
     nodal = assembly.factorise(with_data(system, system.data + smooth))(assembly.vector(parts)).reshape(-1, 2)
     fields = np.empty((2, f.size), dtype=np.float32)

@@ -302,13 +302,13 @@ def _nothing_left(weighting: Weighting) -> str:
 @stage("conclusion")
 def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
     """Conclude the solve: which nodes count as measured, their values and uncertainty."""
-    reference, options, mesh = problem.reference, problem.options, problem.reference.mesh
+    options, geometry, mesh = problem.options, problem.reference.geometry, problem.reference.mesh
     mismatched = np.zeros(len(mesh.nodes), dtype=bool)
     mismatched[mesh.elements[~weighting.matched]] = True
     used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(reference.material, used, equations.information(reference), reference.linear_offset)
+    recovery = Recovery.over(geometry.material, used, equations.information(problem.reference), geometry.linear_offset)
     fitted = estimate.displacement
-    residual = weighting.residual.without(*recovery.bend(fitted, reference.linear_offset))
+    residual = weighting.residual.without(*recovery.bend(fitted, geometry.linear_offset))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
     squares = weighting.residual.squares(equations.weights)
     misfits = misfit(mesh, squares, equations.textured)

@@ -120,6 +120,11 @@ class PixelMap:
         )
 
     @property
+    def positions(self) -> tuple[FloatImage, FloatImage, npt.NDArray[np.int64], FloatArray]:
+        """Local x and y, offsets and shape functions: where the owned pixels lie, for kernels."""
+        return self.local_x, self.local_y, self.offsets, self.barycentric
+
+    @property
     def rows(self) -> npt.NDArray[np.int64]:
         """Row of every owned pixel in the image (P,)."""
         return self.of_elements(np.ones(len(self.origin), dtype=bool))[2]
