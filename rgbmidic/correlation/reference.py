@@ -292,9 +292,7 @@ class Reference:
         light: int,
         values: FloatImage,
         displacement: FloatArray,
-        difference: FloatImage,
-        weight: FloatImage,
-        moments: FloatArray,
+        out: tuple[FloatImage, FloatImage, FloatArray],
     ) -> None:
         """Warp a light's deformed image by a nodal displacement (N, 2) and compare it with reference grey levels.
 
@@ -306,8 +304,9 @@ class Reference:
             Reference grey levels.
         displacement : ndarray, shape (N, 2)
             px.
-        difference, weight, moments : ndarray, shape (P,), (P,), (E, 6)
-            Receive the light's part of those of `Residual`; the weight is the reference's times the deformed image's.
+        out : tuple of ndarray, shape (P,), (P,), (E, 6)
+            Receive the light's difference, weight and moments as in `Residual`; the weight is the reference's times the
+            deformed image's.
         """
         images = (
             deformed.coefficients[light],
@@ -317,7 +316,7 @@ class Reference:
             self.pixel_weights[light],
         )
         motion = displacement - self.offset(deformed)
-        warp(*images, *self._geometry(), motion, difference, weight, moments)
+        warp(*images, *self._geometry(), motion, *out)
 
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray

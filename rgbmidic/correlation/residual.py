@@ -57,7 +57,7 @@ class Residual:
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
             out = difference[light], weights[light], moments[light]
-            reference.warp(deformed, light, values[light], displacement, *out)
+            reference.warp(deformed, light, values[light], displacement, out)
         return cls(reference=reference, values=values, weights=weights, difference=difference, moments=moments)
 
     @property
