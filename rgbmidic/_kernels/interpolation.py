@@ -351,12 +351,16 @@ def paint_field(start, stop, out, grey, x, y, elements, values, low, high, colou
 
     Parameters
     ----------
+    start, stop
+        Range of rows that this call does.
     out : (H, W) uint32
         Receives red, green, blue and an opacity of 255, the lowest byte first.
     grey : (H, W) uint8
+        The picture.
     x, y : (N,)
         Where each node is on the screen, in its pixels; the centre of the first is (0, 0).
-    elements : (E, 3)
+    elements, values : (E, 3), (N,)
+        Nodes of the triangles, and what is painted.
     low, high
         Values of the first and the last of the colours; beyond them these stay.
     colours : (C,) uint32

@@ -86,9 +86,14 @@ def interpolate_nodal(start, stop, out, x, y, nodes, elements, values, box, firs
 
     Parameters
     ----------
+    start, stop
+        Range of points that this call does.
     out : (M, 2)
+        Written: the interpolation.
     x, y : (M,)
+        Points, px.
     nodes, elements, values : (N, 2), (E, 3), (N, 2)
+        The mesh (px) and what is interpolated.
     box : (5,)
         Bins that list the elements: x0, y0, side, columns, rows.
     first, members
@@ -197,6 +202,10 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
 
     Parameters
     ----------
+    start, stop
+        Range of rows of tiles that this call does.
+    size
+        Side of the square of samples, px.
     padded : (H + 2 pad, 16 w + 2 pad) float32
         Scaled contrast, finite, with pad = size // 2.
     index : (h, w) int32
@@ -205,9 +214,13 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
         By row parity, channel and tap; the last axis runs over the columns of the tile, which alternate between two
         phases.
     scale, mean : (3, h, W) float32
-        Rows of grids of `scale_block` and `mean_block` px, widened to the pixels.
+        Rows of grids, widened to the pixels.
+    scale_block, mean_block
+        Sides of their blocks, px.
     mixing : (n, 3) float32
+        Factors of the channels in each output.
     out : (n, H, W) float32
+        Written: the mixtures.
     """
     rows, columns = out.shape[1:]
     lines, channels = np.empty((size * size, _STRIP), np.float32), np.empty((3, TILE, _STRIP), np.float32)

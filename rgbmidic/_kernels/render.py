@@ -383,6 +383,14 @@ def trace_rows(
 
     Parameters
     ----------
+    start, stop
+        Range of rows of pixels that this call does.
+    lens, frame, body, affine, paint
+        Parameter vectors, see the module.
+    counts : (n,)
+        Probabilities up to which a cell's number of droplets is 0, 1 and so on.
+    seed
+        Of the paint.
     out : (k, n, samples, W) float32
         Written: light j on the sub-pixel rows of n rows of pixels.
     first_row : int
