@@ -76,7 +76,7 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     grid, needed = np.tile(np.eye(3, dtype=np.float32) + np.float32(0.1), (2, 2, 1, 1)), np.eye(3, dtype=bool)
     return [
         ("right-hand side", owned, 20, lambda: reference.right_side(deformed, 0, values, weights, motion)),
-        ("comparison", owned, 20, lambda: reference.warp(deformed, 0, *compared)),
+        ("comparison", owned, 20, lambda: reference.warp(deformed, 0, *compared[:2], compared[2:])),
         ("Hessian", owned, 20, lambda: reference.hessian_blocks(0, weights)),
         ("spline coefficients", count, 16, lambda: bspline_coefficients(image[0], coefficients)),
         ("unmixing, 3 lights", count, 30, lambda: unmix(channels, known, grid, size, needed, lights, lit)),

@@ -31,17 +31,20 @@ _TWO_THIRDS = np.float32(2.0 / 3.0)
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
 _LEVEL = np.float32(1e-7)
+"""Drift (px per pixel) under which a run stays between two rows: 100 pixels then drift by what float32 resolves."""
 BLOCK = 8
-"""Side (px) of the blocks of which `warp` is told whether all their weights are 1."""
+"""Side (px) of the blocks for each of which `warp` knows whether all weights are 1: eight bytes, compared in one go."""
 _LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
 
 @helper(forceinline=True, fastmath=_FAST)
 def _spline(coefficients, first, width, i, tx, ty):
-    """Cubic B-spline value from the coefficients (one row of `width` after the other) at the `first` + i-th, the next
-    three and those below, at the fraction (tx, ty). No view of them is made: each counts its owners, and the threads
-    would wait for each other."""
+    """Return the cubic B-spline value at the fraction (tx, ty) of a cell.
+
+    The cell's first coefficient is the `first` + i-th of the rows of `width`. No view of them is made: each view counts
+    its owners, and the threads would wait for each other.
+    """
     t2 = tx * tx
     t3 = t2 * tx
     x3 = t3 * _SIXTH
@@ -69,8 +72,10 @@ def _spline(coefficients, first, width, i, tx, ty):
 
 @helper(forceinline=True)
 def _steady(fraction, drift, most):
-    """How many of `most` pixels from one on lie between the same two rows (or move on by one column each), its
-    `fraction` changing by `drift` from pixel to pixel."""
+    """Return how many of the next `most` pixels lie between the same two rows, or move on by one column each.
+
+    The `fraction` changes by `drift` from pixel to pixel.
+    """
     if drift > _LEVEL:
         return np.int64(min((_ONE - fraction) / drift, most)) + 1
     if drift < -_LEVEL:
@@ -248,11 +253,11 @@ def warp(
     start, stop, coefficients, deformed_weight, partial, reference, reference_weight, runs, run_offsets, origin,
     elements, barycentric, displacement, difference, weight, moments,
 ):  # fmt: skip
-    """Deformed image and weights of one light brought back and compared with the reference at the owned pixels.
+    """Warp the deformed image and weights of one light and compare them with the reference at the owned pixels.
 
     `difference` (P,) float32 receives ``f - g(x + u)``, 0 outside the image; `weight` (P,) float32 the
     `reference_weight` (P,) times the `deformed_weight` (H, W) at the displaced position (bilinear), 0 outside and
-    beside excluded pixels. `partial` (h + 1, w + 1) int32 tells where that is other than 1: how many such blocks of
+    beside excluded pixels. `partial` (h + 1, w + 1) int32 counts where that is other than 1: how many such blocks of
     `BLOCK` px lie above and to the left. `moments` (E, 6) receives the sums of w, w f, w g, w f f, w f g, w g g.
     """
     height, width = deformed_weight.shape
@@ -350,8 +355,10 @@ def _beside(weight, base_x, base_y, px, py):
 @over_ranges("offsets")
 @compiled(fastmath=_FAST)
 def element_squares(start, stop, difference, weight, offsets, out):
-    """Sums over an element's pixels of ``w r^2``, of w and of the pixels with weight: ``out`` (k, E, 3) for a
-    `difference` and `weight` (k, P)."""
+    """Sum ``w r^2``, w and the pixels with weight over every element.
+
+    ``out`` (k, E, 3) receives the sums for a `difference` and a `weight` (k, P).
+    """
     for light in range(len(weight)):
         r, w = difference[light], weight[light]
         for e in range(start, min(stop, offsets.size - 1)):
@@ -366,7 +373,7 @@ def element_squares(start, stop, difference, weight, offsets, out):
 @over_ranges("offsets")
 @compiled(fastmath=_FAST)
 def element_sums(start, stop, values, factor, offsets, out):
-    """Sums of fields (n, P) over an element's pixels, and of their products with one factor (P,): ``out`` (n, E, 2)."""
+    """Sum fields (n, P) over every element's pixels, and their products with one factor (P,): ``out`` (n, E, 2)."""
     for n in range(len(values)):
         v = values[n]
         for e in range(start, min(stop, offsets.size - 1)):
@@ -380,8 +387,11 @@ def element_sums(start, stop, values, factor, offsets, out):
 @over_ranges("out")
 @compiled(fastmath=_FAST)
 def element_vector(start, stop, weight, values, first, second, local_x, local_y, offsets, barycentric, out):
-    """Projection of two fields on the shape functions: ``out`` (E, 3, 2) receives the sums of ``weight values first
-    phi`` and ``weight values second phi``, all (P,) float32."""
+    """Project two fields on the shape functions.
+
+    ``out`` (E, 3, 2) receives the sums of ``weight values first phi`` and ``weight values second phi``; all fields are
+    (P,) float32.
+    """
     for e in range(start, stop):
         b00 = np.float32(barycentric[e, 0, 0])
         b01 = np.float32(barycentric[e, 0, 1])
@@ -427,10 +437,10 @@ def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, 
 def subtract_quadratic(
     start, stop, difference, gradient_x, gradient_y, polynomials, local_x, local_y, offsets, out,
 ):  # fmt: skip
-    """Residual less a displacement d quadratic in every element: ``out`` (k, P) receives ``difference - grad f . d``,
-    all (k, P) float32.
+    """Take the effect of a displacement d, quadratic in every element, out of a residual.
 
-    `polynomials` (E, 2, 6) float32 holds the coefficients of 1, x, y, x^2, x y, y^2 of the local position, in px.
+    ``out`` (k, P) receives ``difference - grad f . d``, all (k, P) float32. `polynomials` (E, 2, 6) float32 holds the
+    coefficients of 1, x, y, x^2, x y, y^2 of the local position, in px.
     """
     for light in range(len(difference)):
         given, gx, gy, less = difference[light], gradient_x[light], gradient_y[light], out[light]

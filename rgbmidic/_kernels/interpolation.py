@@ -1,13 +1,13 @@
-"""Cubic B-spline interpolation: prefilter and evaluation (Unser, IEEE Signal Process. Mag. 16(6), 1999).
+"""Interpolation: cubic B-splines, coarse grids of blocks, and fields on a triangle mesh.
 
-Compiled loops between the owned pixels and images, or coarse grids of square blocks, of the rectangle around them.
+The prefilter of the splines and their evaluation follow Unser (IEEE Signal Process. Mag. 16(6), 1999).
 
-`lines` (R, 4) int32 are the rows of pixels of the elements in the order of the image's rows: first slot, number of
-pixels, row and column in the rectangle; row r has ``line_offsets[r]:line_offsets[r + 1]``. Pixels are counted without
-sign: an index that may be negative would be looked at each time. What is summed is first added up along the columns of
-a block's rows, side by side in memory.
-
-A field on a triangle mesh as the coloured pixels of a screen.
+Other loops move values between the owned pixels and images, or coarse grids of square blocks, of the rectangle around
+them. `lines` (R, 4) int32 are the rows of pixels of the elements in the order of the image's rows: first slot, number
+of pixels, row and column in the rectangle; row r has ``line_offsets[r]:line_offsets[r + 1]``. Pixels are counted
+without sign: an index that may be negative would be looked at each time. What is summed is first added up along the
+columns of a block's rows, side by side in memory. The last one paints a field on a triangle mesh as the pixels of a
+screen.
 """
 
 from __future__ import annotations
@@ -93,8 +93,10 @@ def _filter_columns(start, stop, image, taps, out):
 @over_ranges("image")
 @compiled(fastmath=_FAST)
 def _filter_rows(start, stop, image, taps, out):
-    """Filter along each row, the recursions as products: ``1 / (1 - z B)`` is that of ``1 + z**s B**s`` over s = 1, 2,
-    4, ... with the delay B."""
+    """Filter along each row, with the recursions as products.
+
+    ``1 / (1 - z B)`` is the product of ``1 + z**s B**s`` over s = 1, 2, 4, ... with the delay B.
+    """
     n = image.shape[1]
     edge = PAD + _REACH + taps.size - 1
     line, other = np.empty(n + 2 * edge, dtype=np.float32), np.empty(n + 2 * edge, dtype=np.float32)
@@ -136,8 +138,11 @@ def _mirrored(i, n):
 @over_ranges("lines")
 @compiled(fastmath=_FAST)
 def pixel_gradient(start, stop, lines, coefficients, top, left, gradient_x, gradient_y):
-    """Gradient of the spline at whole pixels, those of `lines` (R, 4) int32: first slot, number, row and column counted
-    from `top` and `left` of the image. `gradient_x`, `gradient_y` (P,) float32 receive grey levels per px."""
+    """Evaluate the gradient of the spline at the whole pixels of `lines` (R, 4) int32.
+
+    A line is first slot, number, row and column, counted from `top` and `left` of the image. `gradient_x` and
+    `gradient_y` (P,) float32 receive grey levels per px.
+    """
     four, twelfth = np.float32(4), np.float32(1 / 12)
     for q in range(start, stop):
         slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
@@ -185,7 +190,7 @@ def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gra
 
 @helper(fastmath=_FAST)
 def _weights(t):
-    """The four cubic B-spline weights at the fraction t behind the second sample, and their slopes."""
+    """Return the four cubic B-spline weights at the fraction t behind the second sample, and their slopes."""
     t2, rest = t * t, 1.0 - t
     t3 = t2 * t
     return (
@@ -209,7 +214,7 @@ _LANES = 8
 @over_ranges("out", axis=1)
 @compiled(fastmath=_FAST)
 def block_sums(start, stop, values, lines, line_offsets, side, out):
-    """Sums of fields (n, P) over blocks of `side` px: ``out`` (n, h, w)."""
+    """Sum fields (n, P) over blocks of `side` px: ``out`` (n, h, w)."""
     columns = np.empty(out.shape[2] * side, dtype=np.float32)
     for n in range(len(values)):
         for block in range(start, stop):
@@ -225,8 +230,10 @@ def block_sums(start, stop, values, lines, line_offsets, side, out):
 @over_ranges("out", axis=3)
 @compiled(fastmath=_FAST)
 def product_sums(start, stop, values, weights, lines, line_offsets, side, out):
-    """Sums over blocks of ``s a b`` and of ``s = sqrt(w_a w_b)`` for each two fields a, b of `values` (k, P) and their
-    `weights` (k, P), the second not after the first: ``out`` (k, k, 2, h, w)."""
+    """Sum ``s a b`` and ``s = sqrt(w_a w_b)`` over blocks for each two fields a, b of `values` (k, P).
+
+    ``out`` (k, k, 2, h, w) receives the sums with the fields' `weights` (k, P), the second field not after the first.
+    """
     lights, width = len(values), out.shape[4] * side
     field, root = np.empty((2, lights, width + _LANES), dtype=np.float32)
     sums = np.empty((lights, lights, 2, width), dtype=np.float32)
@@ -256,7 +263,7 @@ def product_sums(start, stop, values, weights, lines, line_offsets, side, out):
 
 @helper(fastmath=_FAST)
 def _to_row(row, values, lines, line_offsets, out):
-    """A row of the image of `values` (P,), 0 where no pixel is owned; `out` is longer by a vector.
+    """Write a row of the image of `values` (P,), 0 where no pixel is owned; `out` is longer by a vector.
 
     Whole vectors are copied, where memory goes on so far: the next line overwrites what is too much, or a gap does.
     """
@@ -278,7 +285,7 @@ def _to_row(row, values, lines, line_offsets, out):
 
 @helper(fastmath=_FAST)
 def _gather(columns, side, out):
-    """Sums of each `side` of the columns into `out` (w,)."""
+    """Sum each `side` of the columns into `out` (w,)."""
     for block in range(out.size):
         total = _ZERO
         for i in range(np.uint64(block * side), np.uint64((block + 1) * side)):
@@ -289,8 +296,10 @@ def _gather(columns, side, out):
 @over_ranges("lines")
 @compiled()
 def to_image(start, stop, lines, values, top, left, out):
-    """Fields (n, P) float32 of the owned pixels as images ``out`` (n, H, W), in which the rectangle begins at row `top`
-    and column `left`."""
+    """Write fields (n, P) float32 of the owned pixels into images ``out`` (n, H, W).
+
+    The rectangle around the pixels begins at row `top` and column `left` of the images.
+    """
     for n in range(len(values)):
         for q in range(start, stop):
             slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
@@ -302,7 +311,7 @@ def to_image(start, stop, lines, values, top, left, out):
 @over_ranges("lines")
 @compiled()
 def from_image(start, stop, lines, image, top, left, out):
-    """The way back: ``out`` (n, P) from such images (n, H, W)."""
+    """Read fields ``out`` (n, P) at the owned pixels from such images (n, H, W)."""
     for n in range(len(image)):
         for q in range(start, stop):
             slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
@@ -314,8 +323,10 @@ def from_image(start, stop, lines, image, top, left, out):
 @over_ranges("line_offsets")
 @compiled(fastmath=_FAST)
 def from_grid(start, stop, lines, line_offsets, grid, side, out):
-    """Grids (n, h, w) float32 of blocks of `side` px interpolated linearly between their centres, constant beyond the
-    outermost, at the owned pixels: ``out`` (n, P)."""
+    """Interpolate grids (n, h, w) float32 of blocks of `side` px at the owned pixels: ``out`` (n, P).
+
+    The interpolation is linear between the centres of the blocks and constant beyond the outermost.
+    """
     row = np.empty(grid.shape[2] * side, dtype=np.float32)
     between = np.empty(grid.shape[2], dtype=np.float32)
     for r in range(start, min(stop, line_offsets.size - 1)):
@@ -328,8 +339,9 @@ def from_grid(start, stop, lines, line_offsets, grid, side, out):
 
 
 _EDGE = 1e-6
-_EACH = np.uint32(0x010101)
-_OPAQUE = np.uint32(0xFF000000)
+"""Distance (px) within which a pixel on an edge is painted by both elements: no gap through rounding in float64."""
+_EACH, _OPAQUE = np.uint32(0x010101), np.uint32(0xFF000000)
+"""A grey level in the three colours of a pixel, and its opacity, as the bytes of a number."""
 
 
 @over_ranges("out", grain=16)
@@ -339,12 +351,16 @@ def paint_field(start, stop, out, grey, x, y, elements, values, low, high, colou
 
     Parameters
     ----------
+    start, stop
+        Range of rows that this call does.
     out : (H, W) uint32
         Receives red, green, blue and an opacity of 255, the lowest byte first.
     grey : (H, W) uint8
+        The picture.
     x, y : (N,)
         Where each node is on the screen, in its pixels; the centre of the first is (0, 0).
-    elements : (E, 3)
+    elements, values : (E, 3), (N,)
+        Nodes of the triangles, and what is painted.
     low, high
         Values of the first and the last of the colours; beyond them these stay.
     colours : (C,) uint32

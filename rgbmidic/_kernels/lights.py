@@ -111,29 +111,27 @@ def malvar(start, stop, padded, red_row, red_column, out):
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
-_CHUNK = 4096
-"""Pixels at a time: what a core's fastest cache holds."""
 
 
-@over_ranges("share", axis=1, grain=_CHUNK)
+@over_ranges("fraction", axis=1, grain=BLOCK)
 @compiled(fastmath=_FAST)
-def best_mean(start, stop, share, weights, difference, mean, used):
-    """Turn `share` (k, P) into the shares of the lights in a mean: none below 0 or without weight, their sum 1.
+def best_mean(start, stop, fraction, weights, difference, mean, used):
+    """Turn `fraction` (k, P) into the fractions of the lights in a mean: none below 0 or without weight, their sum 1.
 
-    `mean` (P,) receives that of `difference` (k, P), `used` (P,) 1 where a light has a share and else 0.
+    `mean` (P,) receives that of `difference` (k, P), `used` (P,) 1 where a light has a fraction and else 0.
     """
-    for first in range(start, stop, _CHUNK):
-        chunk = slice(first, min(first + _CHUNK, stop))
+    for first in range(start, stop, BLOCK):
+        chunk = slice(first, min(first + BLOCK, stop))
         total, result = used[chunk], mean[chunk]
         total[:] = 0
         result[:] = 0
-        for light in range(len(share)):
-            own, weight = share[light, chunk], weights[light, chunk]
+        for light in range(len(fraction)):
+            own, weight = fraction[light, chunk], weights[light, chunk]
             for i in range(np.uint64(total.size)):
                 own[i] = max(own[i], _ZERO) if weight[i] > _ZERO else _ZERO
                 total[i] += own[i]
-        for light in range(len(share)):
-            own, value = share[light, chunk], difference[light, chunk]
+        for light in range(len(fraction)):
+            own, value = fraction[light, chunk], difference[light, chunk]
             for i in range(np.uint64(total.size)):
                 own[i] = own[i] / total[i] if total[i] > _ZERO else _ZERO
                 result[i] += own[i] * value[i]
@@ -141,36 +139,38 @@ def best_mean(start, stop, share, weights, difference, mean, used):
             total[i] = _ONE if total[i] > _ZERO else _ZERO
 
 
-@over_ranges("share", axis=1, grain=_CHUNK)
+@over_ranges("fraction", axis=1, grain=BLOCK)
 @compiled(fastmath=_FAST)
-def robust_weights(start, stop, mean, variance, trusted, unit, freedom, share, bend):
-    """Multiply `share` (k, P) by the robust weight of the lights' `mean` residual (P,); the loss's `bend` (P,).
+def robust_weights(start, stop, mean, variance, trusted, unit, freedom, fraction, bend):
+    """Multiply `fraction` (k, P) by the robust weight of the lights' `mean` residual (P,); the loss's `bend` (P,).
 
     Its `variance` (P,) is that around the pixel, `trusted` (P,) the part of it that counts, in units of `unit`; the
     weight is its inverse to the power .75 times that of a Student distribution of so many degrees of `freedom`.
     """
-    factor = np.empty(_CHUNK, dtype=np.float32)
-    for first in range(start, stop, _CHUNK):
-        chunk = slice(first, min(first + _CHUNK, stop))
+    factor = np.empty(BLOCK, dtype=np.float32)
+    for first in range(start, stop, BLOCK):
+        chunk = slice(first, min(first + BLOCK, stop))
         value, around, reliable, curved = mean[chunk], variance[chunk], trusted[chunk], bend[chunk]
         for i in range(np.uint64(value.size)):
             ratio = value[i] * value[i] / around[i]
             precision = unit / reliable[i]
             curved[i] = (freedom - ratio) / (freedom + ratio)
             factor[i] = np.sqrt(precision * np.sqrt(precision)) * (freedom + _ONE) / (freedom + ratio)
-        for light in range(len(share)):
-            own = share[light, chunk]
+        for light in range(len(fraction)):
+            own = fraction[light, chunk]
             for i in range(np.uint64(own.size)):
                 own[i] *= factor[i]
 
 
-@over_ranges("out", axis=1, grain=_CHUNK)
+@over_ranges("out", axis=1, grain=BLOCK)
 @compiled(fastmath=_FAST)
 def scores(start, stop, residual, weights, gradient_x, gradient_y, out):
-    """Sums over the lights of ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)``, and 1 where one of them has weight,
-    else 0: ``out`` (4, P) from fields (k, P)."""
-    for first in range(start, stop, _CHUNK):
-        chunk = slice(first, min(first + _CHUNK, stop))
+    """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` over the lights.
+
+    ``out`` (4, P) receives the sums of fields (k, P), and 1 where a light has weight, else 0.
+    """
+    for first in range(start, stop, BLOCK):
+        chunk = slice(first, min(first + BLOCK, stop))
         x, y, information, used = out[0, chunk], out[1, chunk], out[2, chunk], out[3, chunk]
         out[:, chunk] = 0
         for light in range(len(weights)):

@@ -1,10 +1,7 @@
-"""Which element owns which pixel, and which nodes are far apart.
+"""Triangle meshes and tiles: owners of pixels, interpolation at points, colouring, sparse factors, tiled filters.
 
-Values given at the nodes of a triangle mesh, interpolated linearly at any points.
-
-Compiled loops of the reconstruction by local linear prediction: fixed filters per tile, chosen from a table.
-
-Sparse factorisation; solves with it, and quadratic forms, of many vectors at once, side by side in memory.
+The factorisation, the solves with it and the quadratic forms take many vectors at once, side by side in memory. The
+filters are those of the reconstruction by local linear prediction: fixed in a tile, chosen from a table.
 """
 
 from __future__ import annotations
@@ -79,6 +76,7 @@ def colour_nodes(starts, near, taken, colour):
 
 
 _EDGE = -1e-9
+"""Shape function from which a point on an edge is inside: rounding of float64 on images of 1e5 px is 1e-11."""
 
 
 @over_ranges("out", grain=4096)
@@ -88,9 +86,14 @@ def interpolate_nodal(start, stop, out, x, y, nodes, elements, values, box, firs
 
     Parameters
     ----------
+    start, stop
+        Range of points that this call does.
     out : (M, 2)
+        Written: the interpolation.
     x, y : (M,)
+        Points, px.
     nodes, elements, values : (N, 2), (E, 3), (N, 2)
+        The mesh (px) and what is interpolated.
     box : (5,)
         Bins that list the elements: x0, y0, side, columns, rows.
     first, members
@@ -133,11 +136,11 @@ def _channel(i, j, red_row, red_column):
 
 @over_ranges("out")
 @compiled()
-def fill_unknown(start, stop, padded, share, red_row, red_column, pad, out, unknown):
-    """Replace samples that are NaN by what the known ones around tell of the common texture.
+def fill_unknown(start, stop, padded, fraction, red_row, red_column, pad, out, unknown):
+    """Replace samples that are NaN by the common texture predicted from the known ones around.
 
-    `padded` as written by `scaled_contrast`; `share` (3, h, w) is the share of the common texture in each tile. `out`,
-    a copy of `padded`, receives ``sqrt(share) * texture``; where too little is known within one pixel it receives 0
+    `padded` as written by `scaled_contrast`; `fraction` (3, h, w) is that of the common texture in each tile. `out`,
+    a copy of `padded`, receives ``sqrt(fraction) * texture``; where too little is known within one pixel it receives 0
     and `unknown` (like `padded`) is set.
     """
     height, width = padded.shape
@@ -145,19 +148,19 @@ def fill_unknown(start, stop, padded, share, red_row, red_column, pad, out, unkn
         for j in range(width):
             if np.isfinite(padded[i, j]):
                 continue
-            ti = min(max(i - pad, 0) // TILE, share.shape[1] - 1)
-            tj = min(max(j - pad, 0) // TILE, share.shape[2] - 1)
+            ti = min(max(i - pad, 0) // TILE, fraction.shape[1] - 1)
+            tj = min(max(j - pad, 0) // TILE, fraction.shape[2] - 1)
             total = weight = near = 0.0
             for a in range(max(i - 2, 0), min(i + 3, height)):
                 for b in range(max(j - 2, 0), min(j + 3, width)):
                     if np.isfinite(padded[a, b]):
-                        s = share[_channel(a - pad, b - pad, red_row, red_column), ti, tj]
+                        s = fraction[_channel(a - pad, b - pad, red_row, red_column), ti, tj]
                         distance = (a - i) ** 2 + (b - j) ** 2
                         w = np.exp(-0.8 * distance)
                         total += w * np.sqrt(s) * padded[a, b]
                         weight += w * s
                         near += s if distance <= 2 else 0.0
-            own = share[_channel(i - pad, j - pad, red_row, red_column), ti, tj]
+            own = fraction[_channel(i - pad, j - pad, red_row, red_column), ti, tj]
             out[i, j] = np.sqrt(own) * total / weight if near > 0.5 else 0.0
             unknown[i, j] = near <= 0.5
 
@@ -183,7 +186,7 @@ def _add_tap(row, line, out):
 
 @helper()
 def _spread(taps, parity, channel, index, first, lines):
-    """Filters of tiles, tap by tap, written out along the pixels from the tile `first` on."""
+    """Write the filters of tiles, tap by tap, along the pixels from the tile `first` on."""
     for tile in range(first, min(first + _STRIP // TILE, index.size)):
         chosen = taps[index[tile], parity, channel]
         for k in range(lines.shape[0]):
@@ -199,6 +202,10 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
 
     Parameters
     ----------
+    start, stop
+        Range of rows of tiles that this call does.
+    size
+        Side of the square of samples, px.
     padded : (H + 2 pad, 16 w + 2 pad) float32
         Scaled contrast, finite, with pad = size // 2.
     index : (h, w) int32
@@ -207,9 +214,13 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
         By row parity, channel and tap; the last axis runs over the columns of the tile, which alternate between two
         phases.
     scale, mean : (3, h, W) float32
-        Rows of grids of `scale_block` and `mean_block` px, widened to the pixels.
+        Rows of grids, widened to the pixels.
+    scale_block, mean_block
+        Sides of their blocks, px.
     mixing : (n, 3) float32
+        Factors of the channels in each output.
     out : (n, H, W) float32
+        Written: the mixtures.
     """
     rows, columns = out.shape[1:]
     lines, channels = np.empty((size * size, _STRIP), np.float32), np.empty((3, TILE, _STRIP), np.float32)
@@ -258,12 +269,12 @@ _BLOCK = 32
 
 @compiled(fastmath=_FAST)
 def factorise(data, given_starts, given_nodes, given, before_starts, before, starts, rows, lower, inverse):
-    """Factorise a symmetric positive definite matrix as ``L D L^T``, with a block of 2 x 2 for each two nodes (Davis,
-    Direct Methods for Sparse Linear Systems, 2006, section 4.8).
+    """Factorise a symmetric positive definite matrix, with a block of 2 x 2 for each two nodes, as ``L D L^T``.
 
-    Row k of the matrix has the blocks ``data[given[p]]``, (n, 2, 2) places, at the nodes ``given_nodes[p]`` up to k, p
-    from ``given_starts[k]`` to ``given_starts[k + 1]``; row k of L, whose own block is 1, has blocks at the nodes
-    `before` it, and column k at `rows` after it, in their order. `lower` (R, 4) receives the latter, `inverse` (N, 3)
+    The algorithm is that of Davis (Direct Methods for Sparse Linear Systems, 2006, section 4.8). Row k of the matrix
+    has the blocks ``data[given[p]]``, (n, 2, 2) places, at the nodes ``given_nodes[p]`` up to k, p from
+    ``given_starts[k]`` to ``given_starts[k + 1]``; row k of L, whose own block is 1, has blocks at the nodes `before`
+    it, and column k at `rows` after it, in their order. `lower` (R, 4) receives the latter, `inverse` (N, 3)
     entries xx, xy and yy of the inverse of each block of D.
     """
     work, filled = np.zeros((len(inverse), 4)), starts[:-1].copy()
@@ -325,7 +336,7 @@ def solve_factors(start, stop, starts, rows, lower, inverse, x):
 @over_ranges("x", axis=1, grain=_BLOCK)
 @compiled(fastmath=_FAST)
 def node_energies(start, stop, values, columns, starts, x, out):
-    """What each node adds to ``x^T S x`` of every column of x (2 N, R): ``out`` (N, R), for S given by its rows."""
+    """Write what each node adds to ``x^T S x`` of every column of x (2 N, R): ``out`` (N, R), S given by its rows."""
     product = np.empty(_BLOCK)
     for first in range(start, stop, _BLOCK):
         base, width = np.uint64(first), np.uint64(min(_BLOCK, stop - first))

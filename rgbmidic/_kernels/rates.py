@@ -264,7 +264,7 @@ def _conclude(w, frames, reference, base, sums, lines, out):
     """Means and their variances (2, 7, T) from what `_add_window` added up.
 
     The variance of the mean in noise, and the spread of what it is taken over; for one side, where `lines` does not
-    tell the former, the mean of the variances. Of the value, the part that the reference adds to all is left out.
+    give the former, the mean of the variances. Of the value, the part that the reference adds to all is left out.
     """
     for i in range(base.size):
         for o in range(3):

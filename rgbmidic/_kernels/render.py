@@ -61,7 +61,7 @@ def _mix(h):
 
 @helper()
 def _unit(h):
-    """A hash as a number in [0, 1)."""
+    """Return a hash as a number in [0, 1)."""
     return h * (1.0 / 4294967296.0)
 
 
@@ -70,7 +70,7 @@ _MIDDLE, _PER_GRADIENT = np.float32(511.5), np.float32(2.0 / 1023.0)
 
 @helper()
 def _corner(h, u, v, w, wu, wv, ww, du, dv, dw):
-    """One lattice corner's share of the noise and of its gradient."""
+    """One lattice corner's part of the noise and of its gradient."""
     h = _mix(h)
     p = np.float32(np.int32(h & 1023)) - _MIDDLE
     q = np.float32(np.int32(h >> 10 & 1023)) - _MIDDLE
@@ -164,7 +164,7 @@ def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
 
 @helper()
 def _curve(body):
-    """The unit normal at a point (x, y, z) is (a x, b y, a z + c)."""
+    """Return a, b and c, with which the unit normal at a point (x, y, z) is (a x, b y, a z + c)."""
     if body[0] == PLATE:
         return _ZERO, _ZERO, -_ONE
     a = np.float32(1.0 / body[1])
@@ -210,7 +210,7 @@ def _dome(work, count, x, y, z, radius, dome, body):
 
 @helper()
 def _enter_lattice(x, y, z, lattice):
-    """The point's cell of the wrinkle lattice as a number for hashing, and its place in that cell."""
+    """Return the point's cell of the wrinkle lattice as a number for hashing, and its place in that cell."""
     x, y, z = x / lattice, y / lattice, z / lattice
     u, v, w = _A * x + _B * y + _C * z, _C * x + _A * y + _B * z, _B * x + _C * y + _A * z
     i, j, k = math.floor(u), math.floor(v), math.floor(w)
@@ -219,7 +219,7 @@ def _enter_lattice(x, y, z, lattice):
 
 @helper()
 def _floor(x):
-    """The whole number below x (as no function that the compiler calls: the loops that use it are vectorised)."""
+    """Return the whole number below x (not by a call of the compiler's: the loops that use it are vectorised)."""
     i = np.int32(x)
     return np.int32(i - (np.float32(i) > x))
 
@@ -383,6 +383,14 @@ def trace_rows(
 
     Parameters
     ----------
+    start, stop
+        Range of rows of pixels that this call does.
+    lens, frame, body, affine, paint
+        Parameter vectors, see the module.
+    counts : (n,)
+        Probabilities up to which a cell's number of droplets is 0, 1 and so on.
+    seed
+        Of the paint.
     out : (k, n, samples, W) float32
         Written: light j on the sub-pixel rows of n rows of pixels.
     first_row : int

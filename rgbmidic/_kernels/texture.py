@@ -31,7 +31,7 @@ _CELLS = 128
 @over_ranges("sums", axis=1)
 @compiled()
 def block_sums(start, stop, values, block, sums):
-    """Sums of the finite samples of the four planes in each block, then their numbers: `sums` (8, h, w) float32."""
+    """Sum the finite samples of the four planes in each block, then count them: `sums` (8, h, w) float32."""
     total = np.empty((4, sums.shape[2] * block), np.float32)
     for bi in range(start, stop):
         for n in range(4):
@@ -54,7 +54,7 @@ def block_sums(start, stop, values, block, sums):
 
 @helper()
 def between(row, block, rows):
-    """The two rows of a grid that a row of pixels lies between, and how far it is from the first to the second."""
+    """Return the two rows of a grid that a row of pixels lies between, and how far on from the first it is."""
     position = min(max((row + 0.5) / block - 0.5, 0.0), rows - 1.0)
     low = int(position)
     return low, min(low + 1, rows - 1), np.float32(position - low)
@@ -83,8 +83,11 @@ def expand_row(grid, row, block, line, out):
 @over_ranges("out")
 @compiled()
 def subtract_mean(start, stop, values, mean, block, out):
-    """``out = values - local mean``; `mean` (2, h, W) float32: the rows of a grid, for the even and for the odd rows of
-    pixels, widened to their columns."""
+    """Write ``out = values - local mean``.
+
+    `mean` (2, h, W) float32 has the rows of a grid, for the even and for the odd rows of pixels, widened to their
+    columns.
+    """
     for i in range(start, stop):
         low, high, part = between(i, block, mean.shape[1])
         above, below, line, target = mean[i % 2, low], mean[i % 2, high], values[i], out[i]

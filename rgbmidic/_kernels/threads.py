@@ -1,9 +1,7 @@
-"""The threads that share the items of a kernel: each does a range of elements, rows or pixels.
+"""How kernels are compiled, and the threads that share their items: ranges of elements, rows or pixels.
 
-A kernel holds no lock of the interpreter (``nogil=True``) and writes only what belongs to its items, so that the result
-is the same bits on any number of threads.
-
-How the kernels are compiled: once for the processor, kept in a cache, free of the interpreter's lock.
+A kernel is compiled once for the processor and kept in a cache. It holds no lock of the interpreter (``nogil=True``)
+and writes only what belongs to its items, so that the result is the same bits on any number of threads.
 """
 
 from __future__ import annotations
@@ -32,8 +30,10 @@ _lock = threading.Lock()
 
 
 def threads() -> int:
-    """Threads that share a kernel: what `set_threads` was given, else the environment's RGBMIDIC_THREADS, else the
-    processors this process may use.
+    """Return the number of threads that share a kernel.
+
+    It is what `set_threads` was given, else the environment's RGBMIDIC_THREADS, else the number of processors that this
+    process may use.
 
     Raises
     ------
@@ -113,16 +113,17 @@ def _share(kernel: Callable[..., None], arguments: tuple[Any, ...], items: int, 
 
 @cache
 def _pool(process: int, workers: int) -> ThreadPoolExecutor:
-    """The pool of a process: a forked one inherits no threads and makes its own."""
+    """Return the pool of a process: a forked one inherits no threads and makes its own."""
     return ThreadPoolExecutor(workers, thread_name_prefix="rgbmidic")
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Keep the linear algebra of scipy and numpy from sharing small work: the triangular solves of a frame, some 50
-    right-hand sides at a time, take two to three times as long on two threads (measured), and their sums may differ.
+    """Keep the linear algebra of scipy and numpy on one thread.
 
-    The limit is the process's: the first thread that comes sets it, and the last that goes lifts it.
+    The triangular solves of a frame, some 50 right-hand sides at a time, take two to three times as long on two threads
+    (measured), and their sums may differ. The limit is the process's: the first thread that comes
+    sets it, and the last that goes lifts it.
     """
     with _lock:
         _limits.append(_limits[-1] if _limits else _blas().limit(limits=1, user_api="blas"))

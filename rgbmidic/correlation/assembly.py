@@ -1,16 +1,13 @@
-"""Elimination of the unknowns of a mesh, two a node: its order and structure once, the numbers for every matrix.
+"""Sparse normal equations of a mesh: assembly, factorisation, rigid motions of the lights, and what a fit leaves over.
 
-From sums per element to the sparse normal equations of the whole mesh, ready to be factorised.
-
-Rigid motions of the lights after the first: their functions, their equations, and whether the images show them.
+Sums per element are assembled into matrices and vectors with two unknowns a node. Order and structure of the
+factorisation are found once for a mesh, the numbers for every matrix.
 
 With the nodal displacement u, the rigid coefficients beta and the Hessian M_j of light j, the equations are bordered:
 ``[[M + H, B], [B^T, C]]`` with ``M = sum M_j``, ``B = [M_2 R, M_3 R, ...]``, ``C = diag(R^T M_j R)`` and the hold H,
 the weak smoothness that carries unseen nodes along. To a unit of beta the displacement answers by ``-X``,
 ``X = (M + H)^-1 B``, so that light j moves by ``D_j = E_j - X``, with E_j the light's own functions R. The Schur
-complement ``C - B^T X = sum D_j^T M_j D_j + X^T H X`` is what the images say of beta and what the hold says.
-
-Blocks over which scores are summed, and how much of such a sum the fit of the displacement leaves over.
+complement ``C - B^T X = sum D_j^T M_j D_j + X^T H X`` is the information on beta of the images and of the hold.
 """
 
 from __future__ import annotations
@@ -66,8 +63,17 @@ class Elimination:
 
     @classmethod
     def of_pairs(cls, row: Index, column: Index, slots: Index) -> Elimination:
-        """For matrices with blocks at the nodes `row` (n,) and `column` (n,), column after column, diagonal included,
-        whose data have them at `slots` (n, 2, 2). Who has fewest neighbours left goes first."""
+        """Find order and structure for matrices with blocks at the nodes `row` (n,) and `column` (n,).
+
+        The node with fewest neighbours left is eliminated first.
+
+        Parameters
+        ----------
+        row, column : ndarray, shape (n,)
+            Column after column, diagonal included.
+        slots : ndarray, shape (n, 2, 2)
+            Places of the blocks in the matrix' data.
+        """
         edges = np.bincount(column)
         # negative beside the diagonal: nothing that is filled in cancels
         values = np.where(row == column, edges[column] + 1.0, -1.0)
@@ -88,8 +94,12 @@ class Elimination:
         return cls(place=place, own=own, given=given, lower=lower, before=sp.csr_matrix(lower))
 
     def factorise(self, data: FloatArray) -> Callable[[FloatArray], FloatArray]:
-        """Factorise a positive definite matrix given by its data; the function that solves for right-hand sides (2 N,)
-        or (2 N, R).
+        """Factorise a positive definite matrix given by its data.
+
+        Returns
+        -------
+        callable
+            Solves for right-hand sides (2 N,) or (2 N, R).
 
         Raises
         ------
@@ -161,8 +171,10 @@ class Assembly:
             :, None
         ]
         diagonal[slots[row == column][:, component, component]] = 1
+        # each entry of the element blocks counts in one, two (xy and yx) and one entry of the matrix
+        rows, starts = slots[pair].ravel(), np.append(0, np.cumsum(np.tile([1, 2, 1], 9 * len(corners))))
         return cls(
-            entries=_sums(slots[pair], np.tile([1, 2, 1], 9 * len(corners)), slots.size),
+            entries=sp.csc_matrix((np.ones(rows.size), rows, starts), shape=(slots.size, starts.size - 1)),
             unknowns=(2 * corners[..., None] + component).ravel(),
             own=(3 * corners[..., None] + np.arange(3)).ravel(),
             smoothness=sp.csc_matrix((smooth, indices, indptr), shape=(2 * count, 2 * count)),
@@ -177,8 +189,10 @@ class Assembly:
         return self.smoothness.shape[0]
 
     def matrix(self, blocks: FloatArray, more: FloatArray | float = 0.0) -> sp.csc_matrix:
-        """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N); `more` is
-        added to its data."""
+        """Assemble element blocks (E, 3, 3, 3), last axis (xx, xy, yy), into a symmetric matrix (2 N, 2 N).
+
+        `more` is added to its data.
+        """
         return with_data(self.smoothness, self.entries @ blocks.ravel() + more)
 
     def factorise(self, matrix: sp.csc_matrix) -> Callable[[FloatArray], FloatArray]:
@@ -190,7 +204,7 @@ class Assembly:
         return np.ascontiguousarray(self.at_nodes(np.einsum("eaad->ead", blocks)).T)
 
     def at_nodes(self, parts: FloatArray) -> FloatArray:
-        """Sums (N, 3) at the nodes of three values at the corners of the elements (E, 3, 3)."""
+        """Sum three values at the corners of the elements (E, 3, 3) at the nodes, (N, 3)."""
         sums = np.bincount(self.own, weights=parts.ravel(), minlength=self.size // 2 * 3)
         return np.asarray(sums, dtype=np.float64).reshape(-1, 3)
 
@@ -199,23 +213,18 @@ class Assembly:
         return np.asarray(np.bincount(self.unknowns, weights=parts.ravel(), minlength=self.size), dtype=np.float64)
 
 
-def _sums(rows: npt.NDArray[np.int64], number: npt.NDArray[np.int64], count: int) -> sp.csc_matrix:
-    """The matrix that adds up entries: each of its columns counts in the next `number` of the `rows`."""
-    indptr = np.concatenate([[0], np.cumsum(number)])
-    return sp.csc_matrix((np.ones(rows.size), rows.ravel(), indptr), shape=(count, number.size))
-
-
 _RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
 """Number of rigid functions of a light."""
 _SHOWN = 0.5
 """Fraction of its Schur complement that the images have of a rigid motion that is measured. The rest is the hold's,
-which knows nothing of it. Lights that see within one element of one another leave .998 or more to the images, lights
+which holds no data. Lights that see within one element of one another leave .998 or more to the images, lights
 an element further apart .02 or less (measured)."""
 _ROUNDING = 1e-9
 """Fraction of ``R^T M_j R`` under which a Schur complement is rounding (1e-13), or the hold of a constant where there
 is nothing else between two bodies (1e-9)."""
 _NAMED = 0.1
-"""Least part of a light in a motion that the images do not show, by which the light is named."""
+"""Least part of a light in a motion that the images do not show, by which the light is named: the parts of the lights
+add up to 1 (derived), so that one of up to ten is named at least."""
 
 
 def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
@@ -262,7 +271,7 @@ class RigidMotions:
         solve: Callable[[FloatArray], FloatArray],
         textured: BoolArray,
     ) -> RigidMotions:
-        """The rigid unknowns left when the displacement is eliminated.
+        """Find the equations of the rigid unknowns that are left when the displacement is eliminated.
 
         Parameters
         ----------
@@ -311,7 +320,7 @@ class RigidMotions:
         )
 
     def increment(self, free: FloatArray, held_side: FloatArray, rigid_side: FloatArray) -> FloatArray:
-        """Increment (K,) of the coefficients, which the smoothness of unseen nodes has no part in.
+        """Increment (K,) of the coefficients, which the smoothness of nodes without data has no part in.
 
         The smoothness would pull the lights together where none sees both sides: what it does to the displacement,
         `held_side` (2 N,) and H times the increment, is taken out of the coefficients' own equations.
@@ -336,12 +345,15 @@ _OF_ELEMENT = 0.75
 _ACROSS = 4
 """Blocks across a region from which they grow with the element: two of 19 px stated 1.8 times too much."""
 _MANY = 700
-"""Blocks, every other one in both directions, whose projections are told from one another by their random signs to half
-a per cent of the share; where a region has fewer, those further apart are projected together, every fourth at most."""
+"""Blocks, every other one in both directions, whose projections the random signs keep apart to half
+a per cent of the fraction; where a region has fewer, those further apart are projected together, every fourth at
+most."""
 _ANCHOR = 1e-6
-"""Multiple of the identity, over the texture of an unknown, that holds nodes without."""
+"""Multiple of the identity, over the texture of an unknown, that holds nodes without: it takes 1e-6 of the projection
+of the others (derived)."""
 _LEAST = 0.05
-"""Share under which the residual tells nothing of the noise: a region of one block (elements of 4 px leave 0.1)."""
+"""Fraction below which the residual holds no information on the noise: a region of one block (elements of 4 px leave
+0.1)."""
 
 
 def block_side(pixels: PixelMap, element: float) -> int:
@@ -356,7 +368,7 @@ def unfitted_fraction(
     weights: FloatImage,
     side: int,
 ) -> float:
-    """Share of the variance of a block's score that is left after the displacement has been fitted to white noise.
+    """Return the fraction of the variance of a block's score that a fit of the displacement to white noise leaves.
 
     The residual is the noise less its projection P on the columns ``J = grad f phi`` of the least-squares problem. The
     score of block b is the product with ``c = grad f 1_b``, so ``1 - |P c|^2 / |c|^2`` of its variance is left, with
@@ -376,7 +388,7 @@ def unfitted_fraction(
 
     def summed(signs: FloatImage | np.float32) -> FloatArray:
         out = np.zeros((len(pixels.origin), 3, 3, 3))
-        own, geometry = np.empty_like(out), (pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric)
+        own, geometry = np.empty_like(out), pixels.positions
         for gx, gy, weight in zip(*gradient, weights, strict=True):
             element_hessian(gx, gy, weight * signs, *geometry, own)
             out += own
@@ -398,5 +410,5 @@ def unfitted_fraction(
         projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
     sides, anchor = np.stack(projected, axis=1), _ANCHOR * total / assembly.size
     solve = assembly.factorise(assembly.matrix(hessian, anchor * assembly.diagonal))
-    share = 1 - float((sides * solve(sides)).sum()) / total
-    return share if share > _LEAST else float("nan")
+    fraction = 1 - float((sides * solve(sides)).sum()) / total
+    return fraction if fraction > _LEAST else float("nan")

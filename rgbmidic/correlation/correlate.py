@@ -52,7 +52,7 @@ def correlate(
     weights : array_like, shape (H, W) or (k, H, W), optional
         Weight of each light at each pixel of the reference, finite and not negative; 0 excludes.
     initial : array_like, shape (2,) or (N, 2), optional
-        Displacement (u, v) in px to start from; None looks for it.
+        Initial guess of the displacement (u, v) in px; None searches for it.
     deformed_weights
         Like `weights`, on the deformed images.
     normalise
@@ -72,7 +72,7 @@ def correlate(
     Raises
     ------
     InputError
-        Images of different shapes, a weight or start that does not fit, an unknown setting.
+        Images of different shapes, a weight or initial guess that does not fit, an unknown setting.
     RegionError
         The region is empty, too small or outside the image.
     """
@@ -83,7 +83,11 @@ def correlate(
     if not isinstance(region, Region):
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
-    solver = _solver_settings(options)
+    try:
+        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
+        solver = SolverSettings(**options)
+    except ConfigurationError as error:
+        raise InputError(str(error)) from None
     if normalise is not None:
         f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
     first = Reference.prepare(f, region, as_weights(weights, f.shape, "weights"), mesh=mesh, prefilter=solver.prefilter)
@@ -96,16 +100,21 @@ def correlate(
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 
-def _solver_settings(options: dict[str, Any]) -> SolverSettings:
-    try:
-        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
-        return SolverSettings(**options)
-    except ConfigurationError as error:
-        raise InputError(str(error)) from None
-
-
 def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str) -> FloatImage | None:
-    """Weights (H, W) or (k, H, W) as a float32 stack of `shape` (k, H, W).
+    """Return weights as a float32 stack, or None where none are given.
+
+    Parameters
+    ----------
+    weights : array_like, shape (H, W) or (k, H, W), optional
+        Finite and not negative.
+    shape : tuple of int
+        Shape (k, H, W) of the stack.
+    name
+        Of the argument, for error messages.
+
+    Returns
+    -------
+    ndarray, shape (k, H, W), float32, or None
 
     Raises
     ------
@@ -123,7 +132,18 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
 
 
 def initial_displacement(initial: npt.ArrayLike | None, nodes: int) -> FloatArray | None:
-    """A start as an array (N, 2), or None where none is given.
+    """Return an initial guess as an array, or None where none is given.
+
+    Parameters
+    ----------
+    initial : array_like, shape (2,) or (N, 2), optional
+        Displacement (u, v) in px.
+    nodes
+        Number N of nodes of the mesh.
+
+    Returns
+    -------
+    ndarray, shape (N, 2), or None
 
     Raises
     ------

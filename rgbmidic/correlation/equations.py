@@ -1,6 +1,7 @@
-"""The linear algebra of one pass: Hessian, smoothness for what nobody sees, rigid motions of the lights (`rigid`).
+"""One pass of the solve: its normal equations, and the Gauss-Newton iterations with them (paper, eq. 3).
 
-Gauss-Newton iterations with one Hessian: from one estimate of the motion to the next.
+The normal equations hold the weighted Hessian of all lights, a weak smoothness for nodes without data, and the rigid
+motions of the lights. They are factorised once a pass; each iteration solves for the increment of the displacement.
 """
 
 from __future__ import annotations
@@ -21,13 +22,29 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 __all__ = ["SEEN", "Equations", "Estimate", "Problem", "UnsolvableError", "compare", "iterate"]
 
 _SMOOTHNESS = 1e-4
-"""Weight of the smoothness that carries unseen nodes along, relative to the texture's median Hessian."""
+"""Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian. Chosen;
+with a tenth or ten times of it three lights under a moving reflection differ by 4e-5 and 4e-4 px at most, beside a gap
+by 7e-4 and 6e-3 (benchmarks/constants.py)."""
+_CONSTANT = 1e-9
+"""Multiple of the identity, relative to the same, that fixes the constant which the smoothness leaves free where
+nothing is seen: 1e5 times less than the smoothness, 1e7 times more than rounding (derived)."""
 _ROUNDING = 1e-4
-"""Share of a node's texture under which what it sees in its worse direction may be rounding."""
+"""Fraction of a node's texture below which that in its worse direction may be rounding: sums of some 1000 products in
+single precision are uncertain by 1000 * 6e-8 at most (derived)."""
 SEEN = 0.05
-"""A node is measured if it has this share of the median texture around a node of its area..."""
+"""A node counts as measured if it has this fraction of the median texture around a node of its area..."""
 _INFORMED = 0.01
-"""...and this share of the median information, its texture over the variance of the residual: 10 times the noise."""
+"""...and this fraction of the median information, its texture over the variance of the residual: its noise is then 10
+times the median node's (derived)."""
+_SILENT = 1e-3
+"""Fraction of the largest texture below which a node has no part in that median: it is seen by no light, or blank."""
+_LONGEST_STEP = 4.0
+"""Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's."""
+_PASS_ITERATIONS = 12
+"""Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests)."""
+_PATIENCE = 5
+"""Iterations after which a tenth of the nodes may still move: they wander where nothing matches, for from within half a
+speckle 4 to 5 iterations do (measured on the truth tests)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +74,7 @@ class Equations:
     textured : ndarray, shape (N,), bool
         Nodes that see enough texture.
     light_fraction : ndarray, shape (N, k), float64
-        Share of each light in what determines a node; 0 where nothing does.
+        Fraction of each light in what determines a node; 0 where nothing does.
     """
 
     weights: FloatImage
@@ -80,12 +97,32 @@ class Equations:
         displacement: FloatArray,
         given: FloatImage | None = None,
     ) -> Equations:
-        """Assemble and factorise for pixel weights (k, P), rigid functions (2 N, m), around a displacement (N, 2).
+        """Assemble and factorise the equations for given weights.
 
-        `given` are the weights without the precision of the lights, where it is part of `weights`.
+        Parameters
+        ----------
+        reference
+            The reference state, with P owned pixels under k lights.
+        weights : ndarray, shape (k, P), float32
+            Pixel weights.
+        functions : ndarray, shape (2 N, m)
+            Rigid functions.
+        displacement : ndarray, shape (N, 2)
+            Around which the equations are linearised, px.
+        given : ndarray, shape (k, P), float32, optional
+            The weights without the precision of the lights, where it is part of `weights`.
+
+        Raises
+        ------
+        LinAlgError
+            The matrix is singular in double precision.
         """
         assembly = reference.assembly
-        rotation = _rotation(reference.mesh.nodal_gradient(displacement))
+        gradient = reference.mesh.nodal_gradient(displacement)
+        # the rotation is the polar factor of I + grad u in the plane
+        angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
+        cos, sin = np.cos(angle), np.sin(angle)
+        rotation = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
         functions = _turned_back(rotation, functions)
         per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
         blocks = np.sum(per_light, axis=0)
@@ -94,9 +131,10 @@ class Equations:
         if given is not None:
             texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
             textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
-        # the tiny multiple of the identity fixes the constant that smoothness leaves free where nothing is seen
-        held = scale * (_SMOOTHNESS * assembly.smoothness.data + 1e-9 * assembly.diagonal)
+        held = scale * (_SMOOTHNESS * assembly.smoothness.data + _CONSTANT * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
+        light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
+        total = light.sum(axis=1, keepdims=True)
         rigid = None
         if functions.shape[1] and len(per_light) > 1:
             shown = np.asarray(textured[reference.mesh.elements].all(axis=1))
@@ -112,18 +150,32 @@ class Equations:
             solve=solve,
             rigid=rigid,
             textured=textured,
-            light_fraction=_light_share(reference, per_light),
+            light_fraction=np.asarray(light / np.where(total > 0, total, 1.0)),
         )
 
     def information(self, reference: Reference) -> FloatArray:
-        """Texture times weight around each node, over its area, (N,): what the inverse variance of a node goes with."""
+        """Return texture times weight around each node, over its area, (N,): proportional to the inverse variance."""
         return np.asarray((self.node_blocks[0] + self.node_blocks[2]) / reference.assembly.nodal_area)
 
     def increment(
         self, right_side: FloatArray, held_side: FloatArray, rigid_side: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Solve for the motion of the nodes (N, 2) and of the rigid functions ((k - 1) m,); `held_side` (2 N,) is the
-        smoothness' part of the `right_side`."""
+        """Solve for one increment.
+
+        Parameters
+        ----------
+        right_side : ndarray, shape (2 N,)
+            Of the nodes.
+        held_side : ndarray, shape (2 N,)
+            The smoothness' part of it.
+        rigid_side : ndarray, shape ((k - 1) m,)
+            Of the rigid functions.
+
+        Returns
+        -------
+        tuple
+            Motion of the nodes (N, 2) in px, and of the rigid functions ((k - 1) m,).
+        """
         motion, rigid = self.solve(right_side), np.zeros(0)
         if self.rigid is not None:
             rigid = self.rigid.increment(motion, held_side, rigid_side)
@@ -131,7 +183,7 @@ class Equations:
         return np.einsum("nij,nj->ni", self.rotation, motion.reshape(-1, 2)), rigid
 
     def turned_back(self, columns: FloatArray) -> FloatArray:
-        """Nodal vectors (2 N, m) in the axes of the reference."""
+        """Turn nodal vectors (2 N, m) into the axes of the reference."""
         return _turned_back(self.rotation, columns)
 
 
@@ -140,22 +192,8 @@ def _turned_back(rotation: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(turned.reshape(columns.shape))
 
 
-def _rotation(gradient: FloatArray) -> FloatArray:
-    """Rotation (N, 2, 2): the polar factor of ``I + grad u`` in the plane, for a gradient (N, 2, 2)."""
-    angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
-
-
-def _light_share(reference: Reference, per_light: list[FloatArray]) -> FloatArray:
-    own = [reference.assembly.node_blocks(blocks) for blocks in per_light]
-    light = np.stack([xx + yy for xx, _, yy in own], axis=1)
-    total = light.sum(axis=1, keepdims=True)
-    return np.asarray(light / np.where(total > 0, total, 1.0))
-
-
 def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[BoolArray, float]:
-    """Which nodes see at least that share of the median texture, and the typical diagonal entry of the Hessian.
+    """Find the nodes that see at least a fraction of the median texture, and the typical diagonal entry of the Hessian.
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
     """
@@ -164,17 +202,9 @@ def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[Boo
     smallest = half - np.hypot((xx - yy) / 2, xy)
     smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only
     density = smallest / area
-    typical = np.median(density[density > 1e-3 * density.max()]) if density.max() > 0 else 0.0
+    typical = np.median(density[density > _SILENT * density.max()]) if density.max() > 0 else 0.0
     seen = density > least * typical if typical > 0 else np.zeros(len(density), dtype=bool)
     return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
-
-
-_LONGEST_STEP = 4.0
-"""Longest motion of a node in one iteration, px."""
-_PASS_ITERATIONS = 12
-"""Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests)."""
-_PATIENCE = 5
-"""Iterations after which a tenth of the nodes may still move: they wander where nothing matches."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,7 +259,7 @@ class UnsolvableError(Exception):
 
 
 def compare(problem: Problem, values: FloatImage, estimate: Estimate) -> Residual:
-    """Both states at an estimate, for reference grey levels `values` (k, P)."""
+    """Return the residual at an estimate, for reference grey levels `values` (k, P)."""
     return Residual.at(problem.reference, problem.deformed, values, _light_displacements(problem, estimate))
 
 
@@ -242,8 +272,26 @@ def iterate(
     estimate: Estimate,
     tolerance: float,
 ) -> Estimate:
-    """Gauss-Newton iterations with one Hessian until no textured node moves by more than `tolerance` px, from an
-    estimate whose `residual` is known, for reference grey levels `values` (k, P)."""
+    """Iterate with one Hessian until no textured node moves by more than `tolerance`.
+
+    Parameters
+    ----------
+    problem, equations
+        What is solved, and the equations of the pass.
+    values : ndarray, shape (k, P), float32
+        Reference grey levels.
+    residual
+        At the `estimate`.
+    estimate
+        From which the pass begins.
+    tolerance
+        px.
+
+    Raises
+    ------
+    UnsolvableError
+        The iteration diverged.
+    """
     known: FloatImage | None = residual.difference_from(values)
     for turn in range(min(_PASS_ITERATIONS, problem.options.max_iterations - len(estimate.increments))):
         estimate = _stepped(problem, equations, values, estimate, known)
@@ -281,7 +329,7 @@ def _stepped(
 def _right_sides(
     problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Right-hand sides of the nodes (2 N,), the smoothness' part of it, and of the rigid functions ((k - 1) m,)."""
+    """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     bend = problem.reference.assembly.smoothness @ estimate.displacement.ravel()
     held = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
     total, rigid = held.copy(), []

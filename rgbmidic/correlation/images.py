@@ -1,7 +1,4 @@
-"""Images made ready for correlation: holes filled, prefiltered, usable pixels marked.
-
-Means in a Gaussian window around each pixel, taken on a coarser grid.
-"""
+"""Images prepared for correlation (holes, prefilter, spline, usable pixels), and means in a window around pixels."""
 
 from __future__ import annotations
 
@@ -59,6 +56,15 @@ def fill_holes(image: FloatImage, valid: BoolArray, sigma: float = 3.0) -> Float
     """Replace invalid pixels by the Gaussian mean of the valid ones around, and by the overall mean farther away.
 
     The values carry no weight in the solve; they only keep the spline's recursion finite and quiet.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W), float32
+        Grey levels.
+    valid : ndarray, shape (H, W), bool
+        Pixels to keep.
+    sigma
+        Standard deviation of the mean's window, px.
     """
     if valid.all():
         return image
@@ -117,15 +123,17 @@ def spline_coefficients(images: FloatImage, prefilter: str = "none") -> FloatIma
 
 
 def spline_values(coefficients: FloatImage) -> FloatImage:
-    """The images (k, H, W) at the pixels, from the coefficients of their splines."""
+    """Evaluate the images (k, H, W) at the pixels from the coefficients of their splines."""
     mean = np.array([1, 4, 1], dtype=np.float32) / 6
     return np.stack([cv2.sepFilter2D(one, -1, mean, mean)[PAD:-PAD, PAD:-PAD] for one in coefficients])
 
 
 _RANGE = 8.0
-"""Standard deviation (px) of the window: wide enough to tell a variance, narrow beside a reflection."""
+"""Standard deviation (px) of the window: its 800 px, 4 pi times the square, give a variance to 5 % (derived), and it is
+narrow beside a reflection. Chosen; with half or twice of it lights under one differ by 4e-3 px at most, beside a gap by
+.1 px, their uncertainty by 7 % (benchmarks/constants.py)."""
 _COARSE = 4
-"""Reduction of the grid on which that window is applied."""
+"""Reduction of the grid on which that window is applied: half its standard deviation, to which it adds 1 %."""
 
 
 def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
@@ -134,8 +142,10 @@ def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> F
 
 
 def window_covariance(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-    """Means (k, k, h, w) of the products of each two fields (k, P) around each block of the grid, weighted by the
-    geometric mean of their weights (k, P)."""
+    """Average the products of each two fields (k, P) around each block of the grid, (k, k, h, w).
+
+    Their weight is the geometric mean of the fields' weights (k, P).
+    """
     count = len(fields)
     sums = np.empty((count, count, 2, *pixels.grid(_COARSE)), dtype=np.float32)
     product_sums(fields, weights, pixels.lines, pixels.line_offsets, _COARSE, sums)
@@ -145,14 +155,14 @@ def window_covariance(pixels: PixelMap, fields: FloatImage, weights: FloatImage)
     return means
 
 
-def _means(totals: FloatImage, shares: FloatImage) -> FloatImage:
-    """Sums (n, h, w) over those of their weights, both blurred."""
-    both = zip(totals, shares, strict=True)
-    return np.stack([_blur(total) / np.maximum(_blur(share), np.float32(1e-6)) for total, share in both])
+def _means(totals: FloatImage, weights: FloatImage) -> FloatImage:
+    """Divide sums (n, h, w) by those of their weights, both blurred."""
+    both = zip(totals, weights, strict=True)
+    return np.stack([_blur(total) / np.maximum(_blur(weight), np.float32(1e-6)) for total, weight in both])
 
 
 def spread(pixels: PixelMap, grids: FloatImage) -> FloatImage:
-    """Such means (n, h, w) at the pixels (n, P)."""
+    """Interpolate such means (n, h, w) at the pixels (n, P)."""
     return pixels.from_blocks(grids, _COARSE)
 
 

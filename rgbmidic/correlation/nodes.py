@@ -1,6 +1,7 @@
-"""Whether a node counts as measured: one ordered table of rules, each with what it rests on.
+"""What is known of each node after a solve: whether it counts as measured, and its standard uncertainty.
 
-Standard uncertainty of displacement and strain at the nodes, from the residual of a solve.
+A node counts as measured unless one of an ordered table of rules applies to it. The uncertainty of displacement and
+strain follows from the residual of the solve.
 """
 
 from __future__ import annotations
@@ -24,20 +25,23 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 __all__ = ["LOST", "RULES", "Evidence", "Rule", "judge", "lost_elements", "nodal_std", "one_sided_texture"]
 
 LOST = 0.5
-"""Uncertainty (px) from which a node is lost: a position uncertain by half a pixel is not within reach of a match."""
+"""Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match."""
 _MISFIT = 4.0
-"""Residual around a node, over the median, from which it is lost where elements near it do not match."""
+"""Residual around a node, over the median, from which it is decorrelated where elements near it do not match. Chosen;
+with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
 _WANDERING = 0.1
-"""Motion (px) in the last iteration of a pass from which a node is lost."""
+"""Motion (px) in the last iteration of a pass from which a node is decorrelated: ten times what ends the first
+pass. Chosen; with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
 _ONE_SIDED = 0.3
-"""Texture in the worse direction over that in the better one under which the former may be noise..."""
+"""Texture in the worse direction over that in the better one under which the former may be noise...
+Chosen; with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
 _NOISY = 0.3
-"""...and is, if noise alone would give this share of it."""
+"""...and is, if noise alone would give this fraction of it: displacements along it are 30 % too small (derived)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """What is known of the N nodes at the end of a solve.
+    """State of knowledge on the N nodes at the end of a solve.
 
     Attributes
     ----------
@@ -63,7 +67,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
-    """A node to which it applies gets the status, unless an earlier rule applied."""
+    """A rule: a node to which it applies gets the status, unless an earlier rule applied."""
 
     status: NodeStatus
     because: str
@@ -73,7 +77,7 @@ class Rule:
 RULES = (
     Rule(
         status=NodeStatus.DECORRELATED,
-        because="the elements around it do not match, and the others show too little",
+        because="the elements around it do not match, and the others have too little texture",
         applies=lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured),
     ),
     Rule(
@@ -107,10 +111,10 @@ def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
 
 
 def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray, one_sided: BoolArray) -> BoolArray:
-    """Elements (E,) to leave out of the next pass for a node that its own pixels do not hold.
+    """Find the elements to leave out of the next pass for a node that its own pixels do not hold.
 
     A node whose own pixels match nothing wanders, though its elements match as a whole; so does one whose texture is
-    `one_sided` (N,), but that is no mismatch.
+    one-sided, but that is no mismatch.
 
     Parameters
     ----------
@@ -120,6 +124,12 @@ def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray, one_sided
         Standard uncertainty of u and v, px.
     motion : ndarray, shape (N,)
         Motion in the last iteration, px.
+    one_sided : ndarray, shape (N,), bool
+        See `one_sided_texture`.
+
+    Returns
+    -------
+    ndarray, shape (E,), bool
     """
     lost = ~one_sided & ((std.max(axis=1) > LOST) | (motion > _WANDERING))
     return np.asarray(lost[mesh.elements].any(axis=1))
@@ -141,8 +151,10 @@ def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:
 
 
 def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> FloatArray:
-    """Entries xx, xy, yy (3, N) of the own blocks of the chosen `nodes` (N,) in the Hessian that noise alone has: what
-    the residual, which holds the noise of both images, differs by from pixel to pixel."""
+    """Return entries xx, xy, yy (3, N) of the chosen nodes' own blocks in the Hessian that noise alone has.
+
+    The noise is what the residual, which holds that of both images, differs by from pixel to pixel; `nodes` is (N,).
+    """
     reference, pixels = residual.reference, residual.reference.pixels
     mesh = reference.mesh
     elements = np.asarray(nodes[mesh.elements].any(axis=1))
@@ -162,12 +174,23 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
 
 
 def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | None = None) -> FloatArray:
-    """Standard uncertainty of u and v (px) of the linear fit, (N, 2); with a `recovery`, of what it gives: u, v, exx,
-    eyy, exy, (N, 5).
+    """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
 
     The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs/uncertainty.md), and what the
-    rigid motions of the lights add. Displacement is told at the textured nodes, strain where all nodes around are
+    rigid motions of the lights add. Displacement is stated at the textured nodes, strain where all nodes around are
     textured, too.
+
+    Parameters
+    ----------
+    residual, equations
+        Of the last pass.
+    recovery
+        Of the field from the linear fit; None for the fit itself.
+
+    Returns
+    -------
+    ndarray, shape (N, 2) or (N, 5)
+        Of u and v (px); with a `recovery` of u, v, exx, eyy, exy.
     """
     reference, textured = residual.reference, equations.textured
     covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
@@ -177,7 +200,7 @@ def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | Non
         inner = textured & ~reference.mesh.beside(~textured)
         asked = [(one, textured) for one in recovery.displacement_functionals]
         asked += [(one, inner) for one in recovery.strain_functionals]
-    std = functional_std(equations.solve, covariance, reference.colouring, asked)
+    std = functional_std(equations.solve, covariance, reference.geometry.colouring, asked)
     if equations.rigid is None:
         return std
     rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
@@ -187,7 +210,7 @@ def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | Non
 def _rigid_variance(
     residual: Residual, equations: Equations, rigid: RigidMotions, asked: Sequence[Functional]
 ) -> FloatArray:
-    """What the error of the rigid coefficients adds to the variance (N, F) of quantities linear in the displacement.
+    """Variance (N, F) that the error of the rigid coefficients adds to quantities linear in the displacement.
 
     The displacement's error is ``M^-1 q - X e``, where q is the sum over the lights of their scores q_j and
     ``e = sum G_j^T q_j``, ``G_j = D_j T``, is that of the coefficients, with T the inverse Schur complement. With S_jl

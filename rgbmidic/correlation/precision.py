@@ -1,11 +1,9 @@
-"""Covariance of the right-hand side from the residual itself: the block estimator of the long-run variance.
+"""Statistics of the residual: covariance of the scores, precision of the lights, and matching criterion of elements.
 
 The score ``q = sum_j w_j r_j grad f_j`` of a pixel is correlated over the reach of filters, demosaicing and speckle and
-between the lights; the variance of its sum over blocks wider than that reach holds all of it.
-
-How precise the lights are together around each pixel, learnt from their residuals: the weights by statistics.
-
-Which elements' images match at the displacement found, and how well the residual around each node fits in.
+between the lights; the variance of its sum over blocks wider than that reach holds all of it (the block estimator of
+the long-run variance). The weights by statistics are the lights' precision together around each pixel. The matching
+criterion of an element is the zero-mean correlation coefficient of all lights at the displacement found.
 """
 
 from __future__ import annotations
@@ -39,47 +37,81 @@ __all__ = [
 ]
 
 _LEAST_RATIO = 1e-2
-"""Least share of a residual's variance that is taken to displace."""
-_LEAST_SHARE = 0.05
-"""Least share of a direction in the texture: less is not measured."""
+"""Least fraction of a residual's variance that is taken to displace. Chosen; with half or twice of it nothing changes
+(benchmarks/constants.py)."""
+_LEAST_FRACTION = 0.05
+"""Least fraction of a direction in the texture: nodes with less of the median are not measured (`SEEN`)."""
 _EVEN = 0.6
-"""Standard deviation (blocks) of the window in which the information of a block is taken."""
+"""Standard deviation (blocks) of the window in which the information of a block is taken. Chosen; with half or twice of
+it lights differ by 1e-4 px at most, beside a gap by 4e-3, their uncertainty by 4 % (benchmarks/constants.py)."""
 _SCORE_RANGE = 30.0
-"""Standard deviation (px) of the window over which block sums are averaged."""
+"""Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to 12 %
+(derived). With half or twice of it lights differ by 2e-3 px at most, beside a gap by 1e-2, their uncertainty by 10 %
+(benchmarks/constants.py)."""
 _LEAST_FREEDOM = 0.25
-"""Least number of blocks, less one, that is taken: in a region of one block the uncertainty is hardly known."""
+"""Least number of blocks, less one, that is taken, where a region has one block: the variance is stated 4 times larger
+then, for it is hardly known (derived)."""
 _PRIOR = 0.1
-"""Blocks for which the region's typical score counts in that window: beside a hole few blocks speak."""
+"""Blocks for which the region's typical score counts in that window: beside a hole there are few."""
 
 
 def displacing_fraction(reference: Reference, difference: FloatImage, weight: FloatImage) -> FloatImage:
-    """Variance of the scores of a residual `difference` (P,) over what white noise would give of which `weight` (P,) is
-    the inverse variance, with the gradient of the lights' common texture; (P,)."""
+    """Return the variance of a residual's scores over what white noise of the same variance would give, (P,).
+
+    Parameters
+    ----------
+    reference
+        The gradient is that of the lights' common texture.
+    difference : ndarray, shape (P,), float32
+        The residual.
+    weight : ndarray, shape (P,), float32
+        Its inverse variance.
+    """
     xx, _, yy = _score_ratios(reference, difference[None], weight[None], reference.texture[:, None], BLOCK)
-    share = np.maximum(xx + yy, _LEAST_RATIO)
-    return np.asarray(reference.pixels.from_blocks(share[None], BLOCK)[0])
+    fraction = np.maximum(xx + yy, _LEAST_RATIO)
+    return np.asarray(reference.pixels.from_blocks(fraction[None], BLOCK)[0])
 
 
 def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArray) -> FloatArray:
-    """Element blocks (E, 3, 3, 3) of the covariance of the right-hand side with the solve's `weights` (k, P), and with
-    its Hessian's element blocks `texture` (E, 3, 3, 3)."""
+    """Covariance of the right-hand side, as element blocks (E, 3, 3, 3).
+
+    Parameters
+    ----------
+    residual
+        At the solution.
+    weights : ndarray, shape (k, P), float32
+        Of the solve.
+    texture : ndarray, shape (E, 3, 3, 3)
+        Element blocks of its Hessian.
+    """
     reference = residual.reference
     side, gradient = block_side(reference.pixels, reference.mesh.size), (reference.gradient_x, reference.gradient_y)
     ratios = _score_ratios(reference, residual.difference, weights, gradient, side)
     along_x, _, along_y = _per_element(reference, ratios, side) / reference.unfitted
-    share = _share_along_x(reference, texture)
-    along_x, along_y = along_x / share, along_y / (1 - share)
+    fraction = _fraction_along_x(reference, texture)
+    along_x, along_y = along_x / fraction, along_y / (1 - fraction)
     scale = np.stack([along_x, np.sqrt(along_x * along_y), along_y], axis=-1)
     return np.asarray(texture * scale[:, None, None])
 
 
 def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple[int, int, FloatArray]]:
-    """Covariance of the right-hand sides of each two lights a and b >= a with the solve's `weights` (k, P): their
-    numbers, and its element blocks (E, 3, 3, 3).
+    """Covariance of the right-hand sides of each two lights a and b >= a.
 
     A light's own is as in `score_covariance`; that of two is the root of both, times the correlation of their scores
     where both see. Of what the lights have in common the fit leaves the fraction `unfitted`, which is put back before
     the scores are summed; it takes nothing of what they differ by.
+
+    Parameters
+    ----------
+    residual
+        At the solution.
+    weights : ndarray, shape (k, P), float32
+        Of the solve.
+
+    Yields
+    ------
+    tuple
+        Numbers of the two lights, and the element blocks (E, 3, 3, 3).
     """
     reference = residual.reference
     side, slopes = block_side(reference.pixels, reference.mesh.size), (reference.gradient_x, reference.gradient_y)
@@ -92,8 +124,8 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         whole = difference + lost * (gx * common[0] + gy * common[1])
         own.append(_unit_scores(reference, whole[None], weight[None], (gx[None], gy[None]), side))
         along_x, _, along_y = _per_element(reference, _averaged_ratios(*own[light], side), side)
-        share = _share_along_x(reference, reference.hessian_blocks(light, weight))
-        roots.append(np.sqrt([along_x / share, along_y / (1 - share)]))
+        fraction = _fraction_along_x(reference, reference.hessian_blocks(light, weight))
+        roots.append(np.sqrt([along_x / fraction, along_y / (1 - fraction)]))
     for a, b in combinations_with_replacement(range(len(weights)), 2):
         # the gradients of two lights are parallel
         slope = (np.copysign(np.sqrt(np.maximum(axis[a] * axis[b], 0)), axis[a]) for axis in slopes)
@@ -105,13 +137,13 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         yield a, b, texture * scale[:, None, None]
 
 
-def _share_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
-    """Share (E,) of the gradients along x in the `texture` (E, 3, 3, 3) around each element."""
+def _fraction_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
+    """Return the fraction (E,) of the gradients along x in the `texture` (E, 3, 3, 3) around each element."""
     mesh = reference.mesh
     own = texture.sum(axis=(1, 2))
     x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (own[:, 0], own[:, 2]))
-    share = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
-    return np.asarray(np.clip(share, _LEAST_SHARE, 1 - _LEAST_SHARE))
+    fraction = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
+    return np.asarray(np.clip(fraction, _LEAST_FRACTION, 1 - _LEAST_FRACTION))
 
 
 def _score_ratios(
@@ -123,10 +155,9 @@ def _score_ratios(
 ) -> FloatArray:
     """Covariance (xx, xy, yy) of the scores of blocks over their information; shape (3, rows, columns).
 
-    The scores are those of all lights together, for fields (k, P) and their `gradient` in x and y.
-
-    A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
-    smooth, and averaged, is its ratio to the information; xx + yy is 1 for white noise and ideal weights.
+    The scores are those of all lights together, for fields (k, P) and their `gradient` in x and y. A light's precision
+    changes a hundredfold at the edge of a reflection, the scores' variance with it: what is smooth, and averaged, is
+    its ratio to the information; xx + yy is 1 for white noise and ideal weights.
     """
     return _averaged_ratios(*_unit_scores(reference, difference, weights, gradient, side), side)
 
@@ -148,15 +179,20 @@ def _unit_scores(
 
 
 def _averaged_ratios(x: FloatArray, y: FloatArray, count: FloatArray, side: int) -> FloatArray:
-    """Products xx, xy, yy of such scores per pixel, averaged; shape (3, rows, columns)."""
+    """Products xx, xy, yy of such scores per pixel, averaged; shape (3, rows, columns).
+
+    They are raised where blocks are few, so that an error over its stated uncertainty has the variance 1.
+    """
     typical = _typical_square(x, y, count)
     around = _blur(count, _SCORE_RANGE / side)
     prior = _PRIOR * side**2
+    # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large
+    number = np.minimum(4 * np.pi * (_SCORE_RANGE / side) ** 2 * around, count.sum()) / side**2
     ratios = [
         (_blur(product, _SCORE_RANGE / side) + prior * expected) / (around + prior)
         for product, expected in ((x * x, typical), (x * y, 0.0), (y * y, typical))
     ]
-    return np.asarray(np.stack(ratios) * _few_blocks(around, count, side))
+    return np.asarray(np.stack(ratios) * (number / np.maximum(number - 1, _LEAST_FREEDOM)))
 
 
 def _correlation(first: tuple[FloatArray, ...], second: tuple[FloatArray, ...], side: int) -> FloatArray:
@@ -171,16 +207,6 @@ def _correlation(first: tuple[FloatArray, ...], second: tuple[FloatArray, ...], 
     )
     scale = np.sqrt(first_square * second_square)
     return np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
-
-
-def _few_blocks(around: FloatArray, count: FloatArray, side: int) -> FloatArray:
-    """Factor on a variance that few blocks tell, so that an error over its stated uncertainty has the variance 1.
-
-    An estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large.
-    """
-    window = 4 * np.pi * (_SCORE_RANGE / side) ** 2
-    number = np.minimum(window * around, count.sum()) / side**2
-    return np.asarray(number / np.maximum(number - 1, _LEAST_FREEDOM))
 
 
 def _typical_square(x: FloatArray, y: FloatArray, count: FloatArray) -> float:
@@ -210,16 +236,19 @@ def _blur(image: AnyArray, sigma: float) -> AnyArray:
 
 
 _FREEDOM = 4.0
-"""Degrees of freedom of the Student distribution taken for the residual."""
+"""Degrees of freedom of the Student distribution taken for the residual (Lange et al., J. Am. Stat. Assoc. 84, 1989,
+who found 4 to work well). With 2 or 8 lights under a reflection differ by 2e-3 px at most, beside a gap by 4e-2, their
+uncertainty by 11 % (benchmarks/constants.py)."""
 _OWN = 0.1
-"""Share of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same."""
+"""Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same."""
 _LEAST_BEND = 0.1
-"""Least bend of the loss around a node, over that of its weights."""
+"""Least bend of the loss around a node, over that of its weights. Chosen; with half or twice of it nothing changes
+(benchmarks/constants.py)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precision:
-    """What the residual says about the lights.
+    """Precision of the lights, from their residuals.
 
     Attributes
     ----------
@@ -234,7 +263,7 @@ class Precision:
     bend: FloatImage
 
     def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
-        """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less than they say."""
+        """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less."""
         total, bent = (reference.mesh.to_nodes(part) for part in reference.sums(weights, self.bend).sum(axis=0).T)
         return np.divide(total, np.maximum(bent, _LEAST_BEND * total), out=np.ones_like(total), where=total > 0)
 
@@ -243,13 +272,13 @@ def learn_precision(residual: Residual) -> Precision:
     """Weights of the lights' best mean around each pixel, from their residuals.
 
     Lights separated from one mosaic err together, for each is predicted from all the samples around; what one misses of
-    a reflection's sparkle the others have too much. So the lights share a weight as ``C^-1 1`` of the residuals'
+    a reflection's sparkle the others have too much. So the lights divide a weight as ``C^-1 1`` of the residuals'
     covariance C between them (generalised least squares), none below 0. The weight is the inverse variance of that
     mean's residual to the power .75, for it is itself uncertain, times the part of it that displaces: brightness and
     contrast that change slowly leave a residual which the gradient of the speckle averages out, blurred noise one that
-    it does not. It holds whatever spoils the mean there: camera noise, demosaicing, the erratic part of a reflection.
+    it does not. It holds whatever corrupts the mean there: camera noise, demosaicing, the erratic part of a reflection.
     Its unit is the median over the region. The pixel's own factor is that of a Student distribution, so that dust or a
-    fragment does not spoil a node.
+    fragment does not corrupt a node.
     """
     pixels, weights = residual.reference.pixels, residual.weights
     covariance = window_covariance(pixels, residual.difference, weights)
@@ -258,40 +287,31 @@ def learn_precision(residual: Residual) -> Precision:
     if typical <= 0:
         return Precision(factor=np.ones_like(weights), bend=np.ones_like(weights[0]))
     floor = np.float32(max(0.1 * typical, 1e-6 * float(np.var(_some(residual.values, weights), dtype=np.float64))))
-    share = spread(pixels, _best_shares(covariance, floor))
-    mean, used, bend = np.empty((3, share.shape[1]), dtype=np.float32)
-    best_mean(share, weights, residual.difference, mean, used)
+    factor = spread(pixels, _best_fractions(covariance, floor))
+    mean, used, bend = np.empty((3, factor.shape[1]), dtype=np.float32)
+    best_mean(factor, weights, residual.difference, mean, used)
     around = spread(pixels, window_means(pixels, (mean**2)[None], used[None]))[0]
-    np.maximum(around, floor / len(share), out=around)
+    np.maximum(around, floor / len(factor), out=around)
     trusted = displacing_fraction(residual.reference, mean, used / around)
     trusted *= around
     unit = np.float32(np.median(_some(trusted, used))) if used.any() else np.float32(0)
-    robust_weights(mean, around, trusted, np.float32(unit), np.float32(_FREEDOM), share, bend)
-    return Precision(factor=share, bend=bend)
+    robust_weights(mean, around, trusted, np.float32(unit), np.float32(_FREEDOM), factor, bend)
+    return Precision(factor=factor, bend=bend)
 
 
-def _best_shares(covariance: FloatImage, least: np.float32) -> FloatImage:
-    """Share (k, h, w) of each light in the mean of least variance, but for a factor common to the lights, from the
-    residuals' `covariance` (k, k, h, w), whose variances are `least` or more."""
+def _best_fractions(covariance: FloatImage, least: np.float32) -> FloatImage:
+    """Solve ``C x = 1`` for the lights' fractions (k, h, w) of the mean of least variance, up to a factor.
+
+    C is the residuals' `covariance` (k, k, h, w), with variances of `least` or more.
+    """
     lights = range(len(covariance))
     matrices = covariance.astype(np.float64)
     matrices[lights, lights] = np.maximum(matrices[lights, lights], least)
     for a, b in combinations(lights, 2):
         most = (1 - _OWN) * np.sqrt(matrices[a, a] * matrices[b, b])
         matrices[a, b] = matrices[b, a] = np.clip((1 - _OWN) * matrices[a, b], -most, most)
-    return _solved_for_ones(matrices)
-
-
-def _solved_for_ones(matrices: FloatArray) -> FloatImage:
-    """The x (k, h, w) of ``C x = 1`` for symmetric positive definite matrices (k, k, h, w), by elimination."""
-    left, right = matrices.copy(), np.ones_like(matrices[0])
-    for pivot in range(len(right)):
-        for row in range(len(right)):
-            if row != pivot:
-                factor = left[row, pivot] / left[pivot, pivot]
-                left[row, pivot:] -= factor * left[pivot, pivot:]
-                right[row] -= factor * right[pivot]
-    return np.asarray(right / left[range(len(right)), range(len(right))], dtype=np.float32)
+    solved = np.linalg.solve(np.moveaxis(matrices, (0, 1), (2, 3)), np.ones((len(matrices), 1)))
+    return np.asarray(np.moveaxis(solved[..., 0], 2, 0), dtype=np.float32)
 
 
 def _some(values: FloatImage, weights: FloatImage) -> FloatImage:
@@ -306,7 +326,8 @@ _MATCHED = (0.4, 0.6)
 _MATCHED_PRECISE = (0.4, 0.9)
 """The same where the lights count by their precision, so that a reflection in one of them is no mismatch."""
 _WORSE = 8.0
-"""In between: how many times farther from 1 than the median of the elements around."""
+"""In between: how many times farther from 1 than the median of the elements around. Chosen; with half or twice of it
+lights do not change (benchmarks/constants.py)."""
 _AROUND = 61
 """Elements around: a square of some 5.5 elements a side, of which a crack takes a third."""
 
@@ -314,11 +335,22 @@ _AROUND = 61
 def matching_elements(
     residual: Residual, precision: Precision | None = None, *, least: float | None = None
 ) -> BoolArray:
-    """Elements (E,) whose images match: zero-mean correlation coefficient of all lights together.
+    """Find the elements whose images match: zero-mean correlation coefficient of all lights together.
 
-    Elements without weight or texture in the reference say nothing and count as matched. Lights count by their
-    `precision` in the element, where it is known. `least` is the coefficient from which an element matches; None judges
-    it by what the elements around reach.
+    Elements without weight or texture in the reference count as matched.
+
+    Parameters
+    ----------
+    residual
+        At the displacement found.
+    precision
+        Of the lights, by which they count in an element; None: all alike.
+    least
+        Coefficient from which an element matches; None judges it by what the elements around reach.
+
+    Returns
+    -------
+    ndarray, shape (E,), bool
     """
     mesh = residual.reference.mesh
     fg, ff, gg = _centred_products(residual, _light_precision(residual, precision))
@@ -331,28 +363,24 @@ def matching_elements(
     poor, good = _MATCHED if precision is None else _MATCHED_PRECISE
     matched = np.asarray(coefficient >= good)
     between = ~matched & (coefficient >= poor)
-    typical = _median_around(mesh, coefficient, ff > 0, between)
+    typical, textured = 1.0, ff > 0
+    if textured.any() and between.any():
+        centre = mesh.nodes[mesh.elements].mean(axis=1)
+        ranks = [*range(1, min(_AROUND, int(textured.sum())) + 1)]
+        nearest = cKDTree(centre[textured]).query(centre[between], k=ranks)[1]
+        typical = np.median(coefficient[textured][nearest], axis=1)
     matched[between] = coefficient[between] >= 1 - _WORSE * (1 - typical)
     return matched
 
 
 def correlation_around(residual: Residual) -> FloatArray:
-    """Zero-mean correlation coefficient (N,) of all lights together in the elements around each node; NaN where the
-    states show no texture together."""
+    """Zero-mean correlation coefficient (N,) of all lights together in the elements around each node.
+
+    It is NaN where the states show no texture together.
+    """
     to_nodes = residual.reference.mesh.to_nodes
     fg, ff, gg = (to_nodes(part) for part in _centred_products(residual, _light_precision(residual, None)))
     return np.where(ff > 1e-9 * ff.max(initial=0.0), correlation(fg, ff, gg), np.nan)
-
-
-def _median_around(mesh: Tri3Mesh, values: FloatArray, textured: BoolArray, chosen: BoolArray) -> FloatArray:
-    """Median of the values of the nearest textured elements around each of the `chosen` elements (E,); 1 where there is
-    none."""
-    if not textured.any() or not chosen.any():
-        return np.ones(int(chosen.sum()))
-    centre = mesh.nodes[mesh.elements].mean(axis=1)
-    count = min(_AROUND, int(textured.sum()))
-    nearest = cKDTree(centre[textured]).query(centre[chosen], k=[*range(1, count + 1)])[1]
-    return np.asarray(np.median(values[textured][nearest], axis=1))
 
 
 def _light_precision(residual: Residual, precision: Precision | None) -> FloatArray:
@@ -365,10 +393,20 @@ def _light_precision(residual: Residual, precision: Precision | None) -> FloatAr
 
 
 def misfit(mesh: Tri3Mesh, squares: FloatArray, measured: BoolArray) -> FloatArray:
-    """Weighted rms residual around each node (N,), over its median: 1 is ordinary, 3 is suspicious.
+    """Weighted rms residual around each node, over its median: 1 is ordinary, 3 is suspicious.
 
-    `squares` (k, E, 3) are those of `Residual` with the weights of the solve, in units of the inverse variance of the
-    residual.
+    Parameters
+    ----------
+    mesh
+        N nodes, E elements.
+    squares : ndarray, shape (k, E, 3)
+        Those of `Residual` with the weights of the solve, in units of the inverse variance of the residual.
+    measured : ndarray, shape (N,), bool
+        Nodes over which the median is taken.
+
+    Returns
+    -------
+    ndarray, shape (N,)
     """
     square, _, count = (mesh.to_nodes(part) for part in squares.sum(axis=0).T)
     around = square / np.maximum(count, 1.0)
@@ -377,13 +415,15 @@ def misfit(mesh: Tri3Mesh, squares: FloatArray, measured: BoolArray) -> FloatArr
 
 
 def _centred_products(residual: Residual, precision: FloatArray) -> FloatArray:
-    """Sums (3, E) over the lights, each with its `precision` (k, E), of the centred products f g, f f and g g."""
+    """Sum the centred products f g, f f and g g over the lights, each with its `precision` (k, E); (3, E)."""
     return np.asarray([(precision * part).sum(axis=0) for part in residual.centred_products()])
 
 
 def correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
-    """Correlation coefficient from centred products; 1 where the reference has nothing to compare, 0 where only the
-    deformed image has nothing."""
+    """Correlation coefficient from the centred products f g, f f and g g.
+
+    It is 1 where the reference has nothing to compare, and 0 where only the deformed image has nothing.
+    """
     empty = ff <= 1e-9 * ff.max(initial=0.0)
     blank = gg <= 1e-9 * ff
     scale = np.sqrt(np.maximum(ff, 0) * np.maximum(gg, 0))

@@ -1,16 +1,14 @@
-"""Standard uncertainty of every node without inverting the Hessian.
-
-The covariance is the sandwich ``M^-1 S M^-1`` with S the covariance of the right-hand side. Columns of M^-1 decay
-within a few elements, so many of them are found with one solve: unit vectors of nodes far apart are summed (probing),
-and each node of the result belongs to the nearest of them.
-
-From the best linear fit to the field itself: displacement and strain at the nodes by a quadratic through them.
+"""Displacement and strain at the nodes, recovered from the best linear fit, and the uncertainty of what is recovered.
 
 A least-squares fit of linear elements passes above the crest of a wave and below its trough: its nodes are off by about
 ``h^2/12`` times the second derivative, and the mean slope of the elements at an edge is that of a point half an element
 inside. A quadratic polynomial is fitted to the nodes around each node, every second-order term with what the linear fit
 makes of it: the polynomial's value and slopes at the node are right to third order, at edges too, and carry a third
 less noise.
+
+The covariance is the sandwich ``M^-1 S M^-1`` with S the covariance of the right-hand side. Columns of M^-1 decay
+within a few elements, so many of them are found with one solve: unit vectors of nodes far apart are summed (probing),
+and each node of the result belongs to the nearest of them.
 """
 
 from __future__ import annotations
@@ -84,7 +82,7 @@ def functional_std(
     colouring: NodeColouring,
     asked: Sequence[tuple[Functional, BoolArray]],
 ) -> FloatArray:
-    """Standard uncertainty (N, F) of quantities that are linear in the displacements around each node.
+    """Evaluate the standard uncertainty of quantities that are linear in the displacements around each node.
 
     Parameters
     ----------
@@ -97,7 +95,11 @@ def functional_std(
     asked
         F quantities, row n of whose matrices is zero but for n and its neighbours; and of each the nodes (N,) whose
         uncertainty is asked for. It must not touch a node that is hardly seen: such a column reaches far and would
-        spoil those of its colour.
+        corrupt those of its colour.
+
+    Returns
+    -------
+    ndarray, shape (N, F)
     """
     count, colours = len(colouring.colour), len(colouring.nearest)
     columns = np.zeros((count, 2, len(asked), colours))
@@ -118,7 +120,7 @@ def functional_std(
 
 
 def displacement_functionals(nodes: int) -> list[Functional]:
-    """The displacements u and v themselves, as `functional_std` takes them."""
+    """Return the displacements u and v themselves, as `functional_std` takes them."""
     itself = sp.eye(nodes, format="csr")
     return [(itself, None), (None, itself)]
 
@@ -147,7 +149,7 @@ class Recovery:
 
     @property
     def displacement_functionals(self) -> list[Functional]:
-        """u and v at the nodes, as `functional_std` takes them."""
+        """Displacements u and v at the nodes, as `functional_std` takes them."""
         return [(self.value, None), (None, self.value)]
 
     @property
@@ -166,18 +168,23 @@ class Recovery:
         return np.stack([x[:, 0], y[:, 1], (y[:, 0] + x[:, 1]) / 2], axis=1)
 
     def bend(self, fitted: FloatArray, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What the linear fit has at the nodes beyond the field (N, 2), and its second derivatives (N, 2, 3)."""
+        """Return what the linear fit has at the nodes beyond the field (N, 2), and its second derivatives (N, 2, 3)."""
         second = np.stack([operator @ fitted for operator in self.curvature], axis=-1)
         return np.einsum("nt,nct->nc", offset, second), second
 
 
 def linear_fit_offset(mesh: Tri3Mesh) -> FloatArray:
-    """What the best linear fit has at the nodes beyond a field whose second derivative xx, xy or yy is 1: (N, 3), px^2.
+    """Solve for what the best linear fit has at the nodes beyond a field with second derivative xx, xy or yy of 1.
 
     The texture counts alike in all places and directions on average, so the fit is that of the mass matrix M. A field
     with the second derivative H has ``-1/2 sum phi_a phi_b d^T H d`` over its linear interpolant, d being the edges of
     an element of area A. The offset solves ``M x = b``, where b sums over the elements around a node
     ``-A/120 (2 sum d^T H d - d^T H d of the opposite edge)``.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        For xx, xy and yy, square px.
     """
     corners = mesh.nodes[mesh.elements]
     edge = np.roll(corners, -1, axis=1) - corners

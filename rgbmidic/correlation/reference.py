@@ -35,9 +35,8 @@ __all__ = ["Deformed", "Reference", "drawn"]
 
 _SHARED = 0.85
 """Correlation of a light's gradient with the mean of the others', median over the region, from which theirs takes its
-place. Lights of one paint reach .95 to 1. At .85 the error of two lights with
-noise grows by an eighth so (derived), that of three whose paint is their own by 18 % of the variance by a tenth
-(measured); below it they would lose more."""
+place. Lights of one paint reach .95 to 1. At .85 the error of two lights with noise grows by an eighth so (derived),
+that of three whose paint is their own by 18 % of the variance by a tenth (measured); below it they would lose more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,6 +61,7 @@ class Deformed:
     partial: npt.NDArray[np.int32] = field(init=False)
 
     def __post_init__(self) -> None:
+        """Count the blocks with a weight other than 1."""
         object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
 
     @property
@@ -78,8 +78,28 @@ class Deformed:
         prefilter: str = "none",
         origin: tuple[int, int] = (0, 0),
     ) -> Deformed:
-        """Fill, filter and prefilter images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]; they begin
-        at column and row `origin` of the frame."""
+        """Fill holes of images, filter them and prepare their splines.
+
+        Parameters
+        ----------
+        images : ndarray, shape (k, H, W), float32
+            Grey levels, NaN where invalid.
+        weights : ndarray, shape (k, H, W), float32, optional
+            In [0, 1]; 1 without.
+        prefilter
+            One of `PREFILTERS`.
+        origin
+            Column and row of the frame at which the images begin.
+
+        Returns
+        -------
+        Deformed
+
+        Raises
+        ------
+        InputError
+            Unknown prefilter.
+        """
         return cls(
             coefficients=spline_coefficients(images, prefilter),
             weights=_usable_weights(images, weights, prefilter),
@@ -88,28 +108,20 @@ class Deformed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reference:
-    """The reference state with its mesh; everything a frame needs and no frame changes.
+class ReferenceGeometry:
+    """The mesh of a reference and what follows from it; the grey levels of the images have no part in it.
 
     Attributes
     ----------
-    mesh, pixels, assembly, colouring
-        TRI3 mesh, pixel map, sparse structure of the normal equations, colouring for the uncertainty.
+    mesh, pixels, assembly
+        TRI3 mesh, pixel map, sparse structure of the normal equations.
     material : Tri3Mesh
-        The mesh on the first frame, where fields are recovered and strains count: `mesh` itself before any renewal.
+        The mesh on the first frame, where fields are recovered and strains count: `mesh` itself before any reference
+        update.
+    colouring : NodeColouring
+        Of `material`, for the uncertainty: its distances are those where the sides of a crack meet.
     linear_offset : ndarray, shape (N, 3)
         What a linear fit makes of fields curved on `material` (`linear_fit_offset`).
-    images, weights : ndarray, shape (k, H, W), float32
-        Holes filled and prefiltered; 0 where excluded.
-    unfitted : float
-        Share of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
-    values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
-        The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
-    texture : ndarray, shape (2, P), float32
-        Gradient of the lights' common texture: the sum of theirs.
-    channel_specific : ndarray, shape (2, k, P), float32
-        What each light's own gradient has beyond that of the common texture; of no light where there is but one.
-    prefilter : str
     origin : tuple of int
         Column and row of the frame at which the images begin; mesh and pixels count from there.
     """
@@ -117,9 +129,50 @@ class Reference:
     mesh: Tri3Mesh
     pixels: PixelMap
     assembly: Assembly
-    colouring: NodeColouring
     material: Tri3Mesh
+    colouring: NodeColouring
     linear_offset: FloatArray
+    origin: tuple[int, int]
+
+    @classmethod
+    def of(
+        cls, mesh: Tri3Mesh, region: Region, origin: tuple[int, int], first: ReferenceGeometry | None
+    ) -> ReferenceGeometry:
+        """Prepare the geometry of a mesh and its region; `first` is that of the first frame, None for itself."""
+        return cls(
+            mesh=mesh,
+            pixels=PixelMap.from_mesh(mesh, region),
+            assembly=Assembly.from_mesh(mesh),
+            material=mesh if first is None else first.material,
+            colouring=NodeColouring.from_mesh(mesh) if first is None else first.colouring,
+            linear_offset=linear_fit_offset(mesh) if first is None else first.linear_offset,
+            origin=origin,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reference:
+    """The reference state: its geometry and its images; everything a frame needs and no frame changes.
+
+    Attributes
+    ----------
+    geometry : ReferenceGeometry
+        Mesh, pixels and what follows from them.
+    images, weights : ndarray, shape (k, H, W), float32
+        Holes filled and prefiltered; 0 where excluded.
+    unfitted : float
+        Fraction of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
+    values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
+        The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
+    texture : ndarray, shape (2, P), float32
+        Gradient of the lights' common texture: the sum of theirs.
+    channel_specific : ndarray, shape (2, k, P), float32
+        What each light's own gradient has beyond that of the common texture; of no light where there is but one.
+    prefilter : str
+        One of `PREFILTERS`.
+    """
+
+    geometry: ReferenceGeometry
     unfitted: float
     images: FloatImage
     weights: FloatImage
@@ -130,7 +183,6 @@ class Reference:
     texture: FloatImage
     channel_specific: FloatImage
     prefilter: str
-    origin: tuple[int, int] = (0, 0)
 
     @classmethod
     def prepare(
@@ -142,14 +194,35 @@ class Reference:
         mesh: Tri3Mesh,
         prefilter: str = "none",
         origin: tuple[int, int] = (0, 0),
+        first: ReferenceGeometry | None = None,
     ) -> Reference:
-        """Prepare reference images (k, H, W), NaN where invalid, with weights (k, H, W) in [0, 1]; they begin at column
-        and row `origin` of the frame, region and mesh count from there.
+        """Prepare the reference state.
+
+        Parameters
+        ----------
+        images : ndarray, shape (k, H, W), float32
+            Grey levels, NaN where invalid.
+        region
+            Pixels to measure; region and mesh count from the first pixel of the images.
+        weights : ndarray, shape (k, H, W), float32, optional
+            In [0, 1]; 1 without.
+        mesh
+            Of the region.
+        prefilter
+            One of `PREFILTERS`.
+        origin
+            Column and row of the frame at which the images begin.
+        first
+            Geometry of the first frame, where this is a later one; its nodes are those of `mesh`.
+
+        Returns
+        -------
+        Reference
 
         Raises
         ------
         InputError
-            The region belongs to images of another size.
+            The region belongs to images of another size; unknown prefilter.
         """
         if region.mask.shape != images.shape[1:]:
             raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
@@ -158,19 +231,15 @@ class Reference:
             usable = usable * usable_pixels(region.mask, prefilter)
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
             usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
-        pixels, assembly = PixelMap.from_mesh(mesh, region), Assembly.from_mesh(mesh)
+        geometry = ReferenceGeometry.of(mesh, region, origin, first)
+        pixels = geometry.pixels
         ready = spline_values(coefficients)
         weighted = pixels.gather(usable)
         own = _gradient(coefficients, pixels)
         gradient = _common_gradient(own, weighted, pixels)
         return cls(
-            mesh=mesh,
-            pixels=pixels,
-            assembly=assembly,
-            colouring=NodeColouring.from_mesh(mesh),
-            material=mesh,
-            linear_offset=linear_fit_offset(mesh),
-            unfitted=unfitted_fraction(pixels, assembly, gradient, weighted, block_side(pixels, mesh.size)),
+            geometry=geometry,
+            unfitted=unfitted_fraction(pixels, geometry.assembly, gradient, weighted, block_side(pixels, mesh.size)),
             images=ready,
             weights=usable,
             values=pixels.gather(ready),
@@ -180,8 +249,27 @@ class Reference:
             texture=gradient.sum(axis=1),
             channel_specific=(own - gradient)[:, : len(images) if len(images) > 1 else 0],
             prefilter=prefilter,
-            origin=origin,
         )
+
+    @property
+    def mesh(self) -> Tri3Mesh:
+        """TRI3 mesh, counted from the first pixel of the images."""
+        return self.geometry.mesh
+
+    @property
+    def pixels(self) -> PixelMap:
+        """Pixel map of the mesh."""
+        return self.geometry.pixels
+
+    @property
+    def assembly(self) -> Assembly:
+        """Sparse structure of the normal equations."""
+        return self.geometry.assembly
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Column and row of the frame at which the images begin."""
+        return self.geometry.origin
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin."""
@@ -191,9 +279,7 @@ class Reference:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""
         pixels = self.pixels
         out = np.zeros((len(self.mesh.elements), 3, 3, 3))
-        element_hessian(
-            gradient_x, gradient_y, weight, pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric, out
-        )
+        element_hessian(gradient_x, gradient_y, weight, *pixels.positions, out)
         return out
 
     def hessian_blocks(self, light: int, weight: FloatImage) -> FloatArray:
@@ -206,13 +292,22 @@ class Reference:
         light: int,
         values: FloatImage,
         displacement: FloatArray,
-        difference: FloatImage,
-        weight: FloatImage,
-        moments: FloatArray,
+        out: tuple[FloatImage, FloatImage, FloatArray],
     ) -> None:
-        """A light's deformed image brought back by a nodal displacement (N, 2) and compared with reference grey levels
-        `values` (P,): `difference` (P,), `weight` (P,), the reference's times the deformed image's there, and the
-        `moments` (E, 6), as in `Residual`."""
+        """Warp a light's deformed image by a nodal displacement (N, 2) and compare it with reference grey levels.
+
+        Parameters
+        ----------
+        deformed, light
+            The deformed state and the number of the light.
+        values : ndarray, shape (P,), float32
+            Reference grey levels.
+        displacement : ndarray, shape (N, 2)
+            px.
+        out : tuple of ndarray, shape (P,), (P,), (E, 6)
+            Receive the light's difference, weight and moments as in `Residual`; the weight is the reference's times the
+            deformed image's.
+        """
         images = (
             deformed.coefficients[light],
             deformed.weights[light],
@@ -221,29 +316,31 @@ class Reference:
             self.pixel_weights[light],
         )
         motion = displacement - self.offset(deformed)
-        warp(*images, *self._geometry(), motion, difference, weight, moments)
+        warp(*images, *self._geometry(), motion, *out)
 
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
     ) -> FloatArray:
-        """A light's right-hand side (2 N,) for reference grey levels `values` (P,)."""
+        """Sum a light's right-hand side (2 N,) for reference grey levels `values` (P,)."""
         parts = np.empty((len(self.mesh.elements), 3, 2))
         gradient, motion = (self.gradient_x[light], self.gradient_y[light]), displacement - self.offset(deformed)
         element_right_side(deformed.coefficients[light], values, *gradient, weight, *self._geometry(), motion, parts)
         return self.assembly.vector(parts)
 
     def projected(self, light: int, weight: FloatImage, difference: FloatImage) -> FloatArray:
-        """The same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
+        """Sum the same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
         parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
-        geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+        geometry = pixels.positions
         element_vector(weight, difference, self.gradient_x[light], self.gradient_y[light], *geometry, parts)
         return self.assembly.vector(parts)
 
     def channel_specific_pulls(self, weights: FloatImage, difference: FloatImage) -> FloatArray:
-        """The same of every light, (k, 2 N), with its channel-specific gradient, for `weights` and `difference` (k, P);
-        of no light where there is but one."""
+        """Sum the same of every light, (k, 2 N), with its channel-specific gradient.
+
+        `weights` and `difference` are (k, P); the result is empty where there is but one light.
+        """
         parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
-        geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+        geometry = pixels.positions
         pulls = np.empty((self.channel_specific.shape[1], self.assembly.size))
         for light, pull in enumerate(pulls):
             element_vector(weights[light], difference[light], *self.channel_specific[:, light], *geometry, parts)
@@ -251,7 +348,7 @@ class Reference:
         return pulls
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:
-        """Sums over each element of fields (n, P), and of them times a `factor` (P,); shape (n, E, 2)."""
+        """Sum fields (n, P) over each element, and their products with a `factor` (P,); shape (n, E, 2)."""
         out = np.empty((len(values), len(self.mesh.elements), 2))
         element_sums(values, factor, self.pixels.offsets, out)
         return out
@@ -268,7 +365,7 @@ class Reference:
 
 
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
-    """The weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
+    """Return the weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
     given = np.ones_like(images) if weights is None else weights
     usable, reach = np.zeros_like(images), usable_reach(prefilter)
     for image, weight, out in zip(images, given, usable, strict=True):
@@ -335,8 +432,13 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
 
 
 def _regression(own: FloatImage, mean: FloatImage, used: FloatImage, pixels: PixelMap) -> tuple[FloatImage, float]:
-    """Local regression coefficient (P,) of a light's `own` gradient (2, P) on the `mean` (2, P), at least 0, and the
-    median of their correlation coefficient."""
+    """Regress a light's `own` gradient (2, P) on the `mean` (2, P), locally.
+
+    Returns
+    -------
+    tuple
+        The coefficient (P,), at least 0, and the median of the correlation coefficient.
+    """
     products = np.stack([(mean * own).sum(axis=0), (mean**2).sum(axis=0), (own**2).sum(axis=0)])
     along, square, power = window_means(pixels, products, np.broadcast_to(used, products.shape))
     known = (square > 0) & (power > 0)

@@ -1,4 +1,4 @@
-"""A later frame as the reference, where the first one no longer matches: when, how, and what the total is worth.
+"""Reference update (incremental correlation): a later frame becomes the reference where the first no longer matches.
 
 Nodes are material points: in frame r, measured at ``u_r``, they lie at ``nodes + u_r``. With r's images there as the
 reference a later frame n gives ``w`` at the same points, and ``u = u_r + w`` is its displacement on the first one.
@@ -30,10 +30,10 @@ __all__ = ["ReferenceUpdate"]
 _POOR = 0.95
 """Correlation coefficient, over the best median, under which an element calls for another reference. Paint of speckles
 of 4 px that changes by 5 % leaves a node of 25 px elements uncertain by 0.3 px, by 10 % nearly by the 0.5 px from which
-it is lost. Measured on paint that changes by 2 % a frame, nodes left after 24 frames: 78 % with 0.95, 47 with 0.9, 39
-with 0.8; without renewal all are lost from frame 12 on."""
-_POOR_SHARE = 0.1
-"""Share of the measured elements that must call for it."""
+it is decorrelated. Measured on paint that changes by 2 % a frame, nodes left after 24 frames: 78 % with 0.95, 47 with
+0.9, 39 with 0.8; without an update none from frame 12 on."""
+_POOR_FRACTION = 0.1
+"""Fraction of the measured elements that must call for it. Chosen: fewer are a glare or a crack that passes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class ReferenceUpdate:
     first : Reference
         Of the first frame; results are at its nodes.
     reference : Reference
-        Of frame r, with the mesh where the nodes are there; `first` itself before any renewal.
+        Of frame r, with the mesh where the nodes are there; `first` itself before any update.
     displacement, strain : ndarray, shape (N, 2), (N, 3)
         Of frame r on the first one, px; gaps in the displacement carried over from the nearest node. What frame r did
         not measure is not seen on it either, and comes back with an older reference only.
@@ -55,7 +55,7 @@ class ReferenceUpdate:
         Of frame r on the first one.
     scores : ndarray, shape (E, 2), or None
         Sums over the elements of the residual times the gradient in the step to frame r, turned as the elements are;
-        None before any renewal.
+        None before any update.
     """
 
     first: Reference
@@ -69,7 +69,7 @@ class ReferenceUpdate:
 
     @classmethod
     def none(cls, first: Reference) -> ReferenceUpdate:
-        """The first frame as its own reference."""
+        """Return the first frame as its own reference."""
         count = len(first.mesh.nodes)
         return cls(
             first=first,
@@ -83,25 +83,29 @@ class ReferenceUpdate:
         )
 
     def track(self, deformed: Deformed, start: Start, options: SolverSettings, *, statistics: bool = True) -> Solution:
-        """Displacement of a later frame on the first one, from a start on the first one; see `track`."""
+        """Solve for the displacement of a later frame on the first one, from a start on the first one; see `track`."""
         last = start.displacement
         own = replace(start, displacement=None if last is None else last - self.displacement)
         return self.accumulated(track(self.reference, deformed, own, options, statistics=statistics), deformed)
 
     def accumulated(self, step: Solution, deformed: Deformed) -> Solution:
-        """The solution on the first frame from that on this reference.
+        """Return the solution on the first frame from that on this reference.
 
         The errors of both steps hold frame r's noise with opposite signs: ``Var(u) = Var(u_r) + Var(w) +
         2 Cov(u_r, w)``. The covariance is ``-g Var(w)`` with g the regression of the scores of the first step on those
         of the second, over the elements: 1/2 for noise alone, so that frame r's cancels, 0 where the paint has changed,
         which adds up, and negative where both are off alike, as by a curvature that linear elements cannot follow.
-        Measured on draws of noise, of changing paint and of noise under rotation, after 1 to 4 renewals: rms of error
+        Measured on draws of noise, of changing paint and of noise under rotation, after 1 to 4 updates: rms of error
         over stated uncertainty .92 to 1.07, g .43 to .50 and, for paint, .02 to .03. Strains, linear in the
         displacement, add up likewise.
         """
         if self.scores is None:
             return step
-        own = 1 - 2 * _shared(self.scores, _scores(self.reference, deformed, step.displacement, step.rigid))
+        before, after = self.scores, _scores(self.reference, deformed, step.displacement, step.rigid)
+        both = np.isfinite(before + after)
+        square = float((after[both] ** 2).sum())
+        regression = float(np.clip(-(before[both] * after[both]).sum() / square, -1, 0.5)) if square > 0 else 0.0
+        own = 1 - 2 * regression
         return replace(
             step,
             nodes=self.first.mesh.nodes,
@@ -129,8 +133,7 @@ class ReferenceUpdate:
     def is_due(match: FloatArray, best: float) -> bool:
         """Whether a frame should become the next reference: a tenth of its measured elements match poorly.
 
-        What is lost calls for none: it would be lost for good, where a glare passes and a
-        crack closes.
+        Nodes without data call for none: they would be lost for good, where a glare passes and a crack closes.
 
         Parameters
         ----------
@@ -140,7 +143,7 @@ class ReferenceUpdate:
             Largest median of `match` of the frames on this reference: camera noise alone keeps it below 1.
         """
         known = np.isfinite(match)
-        return bool(known.any() and (match[known] < _POOR * best).mean() > _POOR_SHARE)
+        return bool(known.any() and (match[known] < _POOR * best).mean() > _POOR_FRACTION)
 
     def updated(
         self,
@@ -149,11 +152,24 @@ class ReferenceUpdate:
         weights: FloatImage | None = None,
         origin: tuple[int, int] | None = None,
     ) -> ReferenceUpdate:
-        """The reference of a frame with a `solution` on the first one and images and weights (k, H, W) as
-        `Reference.prepare` takes them; they begin at column and row `origin`, by default where those of the first do.
+        """Make a frame the reference.
 
-        All that it holds follows from these and `self`, uncertainty and strain in single precision: a solution read
-        back from a result gives the same bits.
+        All that the update holds follows from the arguments and `self`, uncertainty and strain in single precision: a
+        solution read back from a result gives the same bits.
+
+        Parameters
+        ----------
+        solution
+            Of the frame, on the first one.
+        images, weights : ndarray, shape (k, H, W), float32
+            Of the frame, as `Reference.prepare` takes them.
+        origin
+            Column and row of the frame at which they begin; by default where those of the first do.
+
+        Returns
+        -------
+        ReferenceUpdate
+            With the frame as its reference.
 
         Raises
         ------
@@ -168,7 +184,9 @@ class ReferenceUpdate:
         motion = displacement - np.subtract(origin, self.first.origin)
         moved = Tri3Mesh(nodes=mesh.nodes + motion, elements=mesh.elements)
         region = _region(self.first, moved, measured, images.shape[1:])
-        reference = Reference.prepare(images, region, weights, mesh=moved, prefilter=prefilter, origin=origin)
+        reference = Reference.prepare(
+            images, region, weights, mesh=moved, first=self.first.geometry, prefilter=prefilter, origin=origin
+        )
         step = displacement - self.displacement
         gaps = np.where(measured[:, None], step, np.nan)
         deformed = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
@@ -176,13 +194,7 @@ class ReferenceUpdate:
         turn = np.eye(2) + self.reference.mesh.element_gradient(step)
         return ReferenceUpdate(
             first=self.first,
-            # distances on the first frame, where the sides of a crack meet; strains against it
-            reference=replace(
-                reference,
-                colouring=self.first.colouring,
-                material=self.first.mesh,
-                linear_offset=self.first.linear_offset,
-            ),
+            reference=reference,
             displacement=displacement,
             variance=_single(solution.displacement_std) ** 2,
             strain=_single(solution.strain),
@@ -196,15 +208,8 @@ def _single(values: FloatArray) -> FloatArray:
     return values.astype(np.float32).astype(np.float64)
 
 
-def _shared(before: FloatArray, after: FloatArray) -> float:
-    """The regression g, between -1 and 1/2, of the scores (E, 2) of one step on those of the next."""
-    both = np.isfinite(before + after)
-    square = float((after[both] ** 2).sum())
-    return float(np.clip(-(before[both] * after[both]).sum() / square, -1, 0.5)) if square > 0 else 0.0
-
-
 def _region(first: Reference, mesh: Tri3Mesh, measured: BoolArray, shape: tuple[int, ...]) -> Region:
-    """The pixels of the elements whose nodes are all measured, but for those under the edges of cracks.
+    """Return the pixels of the elements whose nodes are all measured, but for those under the edges of cracks.
 
     Where the first region is a rectangle without cracks, the paint goes on beyond it: as many pixels are added there as
     `Reference.prepare` takes off.
@@ -226,12 +231,14 @@ def _covered(mesh: Tri3Mesh, chosen: BoolArray, shape: tuple[int, ...]) -> BoolA
 
 
 def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, rigid: FloatArray) -> FloatArray:
-    """Sums (E, 2) over each element of the weighted residual at a displacement times the gradient; NaN where a node has
-    no displacement."""
+    """Sum the weighted residual at a displacement times the gradient over each element, (E, 2).
+
+    The sums are NaN where a node has no displacement.
+    """
     residual, known = _residual(reference, deformed, displacement, rigid)
     pixels = reference.pixels
     total, parts = np.zeros((len(pixels.origin), 2)), np.zeros((len(pixels.origin), 3, 2))
-    geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
+    geometry = pixels.positions
     fields = residual.weights, residual.difference, reference.gradient_x, reference.gradient_y
     for light in zip(*fields, strict=True):
         element_vector(*light, *geometry, parts)
@@ -243,8 +250,10 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, 
 def _residual(
     reference: Reference, deformed: Deformed, displacement: FloatArray, rigid: FloatArray
 ) -> tuple[Residual, BoolArray]:
-    """The residual at a displacement (N, 2) with gaps and the lights' rigid coefficients (k, m), NaN for one that sees
-    nothing; and the elements (E,) all of whose nodes have a displacement."""
+    """Return the residual at a displacement (N, 2) with gaps, and the elements (E,) all of whose nodes have one.
+
+    The lights' rigid coefficients are (k, m), NaN for a light that sees nothing.
+    """
     found = np.asarray(np.isfinite(displacement).all(axis=1))
     functions = rigid_functions(reference.mesh.nodes, "translation+rotation")[:, : rigid.shape[1]]
     own = (np.nan_to_num(rigid) @ functions.T).reshape(len(rigid), *displacement.shape)

@@ -1,11 +1,9 @@
-"""What the solve gives: a displacement field with its uncertainty, and how it was reached.
+"""The solution: a displacement field with its uncertainty and status, and the filling of nodes without data.
 
-Nodes that no light sees, filled from those around by a smooth field, for users who ask for it.
-
-The field minimises the squared graph Laplacian over the unmeasured nodes after a quadratic trend of the measured ones
-is taken off (a thin plate that bends as little as it can). The uncertainty is that of the nearest measured node plus
-what neighbouring nodes differ from that trend by, growing with the square root of the number of elements crossed, like
-a random walk.
+Nodes are filled from those around by a smooth field, for users who ask for it. The field minimises the squared graph
+Laplacian over the nodes without data after a quadratic trend of the measured ones is taken off (a thin plate that bends
+as little as it can). The uncertainty is that of the nearest measured node plus what neighbouring nodes differ from that
+trend by, growing with the square root of the number of elements crossed, like a random walk.
 """
 
 from __future__ import annotations
@@ -66,7 +64,7 @@ class Solution:
     node_status : ndarray, shape (N,), uint8
         See `NodeStatus`.
     light_fraction : ndarray, shape (N, k), float64
-        Share of each light in what determines the node.
+        Fraction of each light in what determines the node.
     misfit : ndarray, shape (N,), float64
         Weighted rms residual around the node over its median: 1 is ordinary; well above it the result is suspicious.
     status : Status
@@ -79,8 +77,8 @@ class Solution:
         Weighted rms of ``f - g(x + u)`` of each light, in grey levels of the filtered images; NaN where a light has
         no weight.
     weight_fraction : ndarray, shape (k,), float64
-        Mean over the pixels of the region of each light's share in the sum of the weights; adds up to the part of the
-        region that any light sees.
+        Mean over the pixels of the region of each light's fraction of the sum of the weights; adds up to the part of
+        the region that any light sees.
     history : ndarray, shape (iterations,), float64
         Largest motion of a measured node in each iteration, px.
     """
@@ -103,7 +101,7 @@ class Solution:
 
     @classmethod
     def failed(cls, mesh: Tri3Mesh, lights: int, reason: str, history: FloatArray) -> Solution:
-        """What is left where nothing can be measured: NaN everywhere, and the reason."""
+        """Return a solution where nothing can be measured: NaN everywhere, and the reason."""
         count = len(mesh.nodes)
         return cls(
             nodes=mesh.nodes,
@@ -135,14 +133,27 @@ class Solution:
 
     @property
     def unmeasured_fraction(self) -> float:
-        """Share of the nodes that are not measured."""
+        """Fraction of the nodes that are not measured."""
         return float((self.node_status != NodeStatus.MEASURED).mean())
 
 
 def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
-    """Fill the displacement of unmeasured nodes within `longest` px of a measured one.
+    """Fill the displacement of nodes without data near measured ones.
 
     Filled nodes get `NodeStatus.FILLED` and a larger `displacement_std`; strains are left as they are.
+
+    Parameters
+    ----------
+    mesh
+        Of the solution.
+    solution
+        To fill.
+    longest
+        Distance in px along the mesh up to which a node is filled from a measured one.
+
+    Returns
+    -------
+    Solution
     """
     measured = solution.measured
     if measured.all() or measured.sum() < 6:
@@ -152,7 +163,8 @@ def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
     if not filled.any():
         return solution
     trend, rest = _quadratic_trend(mesh.nodes, solution.displacement, measured)
-    step = _step_between_neighbours(mesh, rest, measured)
+    i, j = mesh.neighbours[measured[mesh.neighbours].all(axis=1)].T
+    step = np.sqrt(np.mean((rest[i] - rest[j]) ** 2, axis=0)) if len(i) else np.zeros(2)
     size = float(np.sqrt(2 * mesh.areas.mean()))
     std = np.hypot(solution.displacement_std[nearest], step * np.sqrt(np.minimum(distance, longest) / size)[:, None])
     displacement = trend + _smooth(mesh, rest, measured)
@@ -171,13 +183,6 @@ def _quadratic_trend(nodes: FloatArray, displacement: FloatArray, measured: Bool
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     trend = basis @ np.linalg.lstsq(basis[measured], displacement[measured], rcond=1e-9)[0]
     return trend, np.where(measured[:, None], displacement - trend, 0.0)
-
-
-def _step_between_neighbours(mesh: Tri3Mesh, rest: FloatArray, measured: BoolArray) -> FloatArray:
-    """Rms difference (2,) of neighbouring measured nodes."""
-    i, j = mesh.neighbours.T
-    both = measured[i] & measured[j]
-    return np.asarray(np.sqrt(np.mean((rest[i[both]] - rest[j[both]]) ** 2, axis=0)) if both.any() else np.zeros(2))
 
 
 def _smooth(mesh: Tri3Mesh, rest: FloatArray, measured: BoolArray) -> FloatArray:

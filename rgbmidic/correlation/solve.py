@@ -1,6 +1,4 @@
-"""Weights of a pass: what matches, how precise each light is, which grey levels the reference should have.
-
-The MIDIC solve: Gauss-Newton on the weighted sum over the lights (paper, eq. 3).
+"""The MIDIC solve: Gauss-Newton on the weighted sum over the lights (paper, eq. 3), in passes with new weights.
 
 Minimised over the nodal displacement u and, where asked for, the rigid motions beta_j of the lights after the first:
 ``sum_j integral (g_j(x + u + R beta_j) - f_j(x))^2 p_j dx``. A rigid motion is linear in x, so it lies in the TRI3
@@ -9,7 +7,8 @@ The gradient of the reference image stands for that of the deformed one, turned 
 Hessian is constant within a pass.
 
 One pass after the other: compare the states -> match -> weigh -> equations -> iterate; then conclude. Every step is a
-function from frozen states to a frozen state.
+function from frozen states to a frozen state. A `Weighting` holds what a pass begins with: which elements match, how
+precise each light is, and which grey levels the reference has.
 """
 
 from __future__ import annotations
@@ -45,29 +44,34 @@ __all__ = [
 ]
 
 FIRST_PASS = 0.01
-"""Increment (px) at which the first pass hands over to the pass with the weights brought back anew. At .05 an iteration
+"""Increment (px) at which the first pass hands over to the pass with weights warped anew. At .05 an iteration
 less is needed, but from another start the result differs by up to 2.3e-4 px."""
 _REFINED = {"none": 1, "global": 1, "local": 4}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _STARTED = 0.25
-"""Correlation coefficient at the start under which an element waits until its neighbours have brought it nearer."""
+"""Correlation coefficient at the initial guess under which an element waits until its neighbours have brought it
+nearer. Chosen; with half or twice of it results do not change (benchmarks/constants.py)."""
 _RETURNS = 4
-"""Passes that may bring elements back. At a fragment's edge some come and go with every pass: without a limit frames
-took 40 to 50 iterations over the most passes, and a third of them did not converge (benchmarks/fast_event.py)."""
+"""Passes in which elements may take part again. At a fragment's edge some come and go with every pass: without a limit
+frames took 40 to 50 iterations over the most passes, a third of them did not converge (benchmarks/fast_event.py)."""
 _SETTLED = 1e-3
-"""Share of the weight that may still change for the passes to end."""
+"""Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
+change (benchmarks/constants.py)."""
 _LOOKED_AT = 16
-"""One weight in so many tells it."""
+"""That change is the sum over one weight in so many. Chosen; with half or twice of it nothing changes
+(benchmarks/constants.py)."""
+_PASSES = 8
+"""Most passes: each warps the weights with the latest displacement; `_RETURNS`, and the `_REFINED` ones after."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weighting:
-    """What the residual at an estimate says about elements, lights and grey levels.
+    """Elements, lights and grey levels of a pass, as the residual at an estimate determines them.
 
     Attributes
     ----------
     residual
-        At the estimate, with the weights brought back.
+        At the estimate, with the weights warped.
     values : ndarray, shape (k, P), float32
         Reference grey levels, corrected for brightness.
     matched : ndarray, shape (E,), bool
@@ -75,7 +79,7 @@ class Weighting:
     precision
         Of the lights; None: not learnt.
     returned : int
-        Number of the pass after the last one that brought elements back.
+        Number of the pass after the last one in which elements took part again.
     """
 
     residual: Residual
@@ -113,6 +117,7 @@ class Weighting:
 
 @stage("weights")
 def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
+    """Return the weighting of the first pass, at the initial guess."""
     residual = compare(problem, problem.reference.values, estimate)
     return Weighting(
         residual=residual,
@@ -125,7 +130,7 @@ def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
 def next_weighting(
     problem: Problem, last: Weighting, equations: Equations, estimate: Estimate, number: int
 ) -> Weighting:
-    """What the displacement found by pass `number` says about matching, grey levels and precision."""
+    """Find matching, grey levels and precision anew at the displacement found by pass `number`."""
     residual = compare(problem, last.values, estimate)
     matched = matching_elements(residual, last.precision)
     if not matched.all() or estimate.longest > FIRST_PASS:
@@ -136,8 +141,8 @@ def next_weighting(
         matched &= ~lost_elements(problem.reference.mesh, std, motion, one_sided)
     if number >= _RETURNS:
         matched &= last.matched
-    # where elements have come back, what was learnt from their wrong match must be learnt anew, and once more: in
-    # the pass that brings them back the residual is still that of a wrong match
+    # where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in
+    # the pass in which they do the residual is still that of a wrong match
     returned = number + 1 if (matched & ~last.matched).any() else last.returned
     weighting = replace(last, residual=residual, matched=matched, returned=returned)
     if not refining(problem, weighting, number + 1):
@@ -166,7 +171,7 @@ def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
 def standard_uncertainty(
     residual: Residual, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
 ) -> FloatArray:
-    """Standard uncertainty of the linear fit's u and v, (N, 2), or of what the `recovery` gives, (N, 5).
+    """Evaluate the standard uncertainty of the linear fit, (N, 2), or of what a `recovery` gives, (N, 5).
 
     The latter holds the step, too, that the lights' channel-specific gradients would make from the solution: two
     gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978). Where a reflection
@@ -185,10 +190,6 @@ def standard_uncertainty(
     return np.asarray(np.hypot(std, disagreement))
 
 
-_PASSES = 8
-"""Most passes: each brings the weights back with the latest displacement."""
-
-
 def solve(
     reference: Reference,
     deformed: Deformed,
@@ -197,14 +198,14 @@ def solve(
     *,
     statistics: bool = True,
 ) -> Solution:
-    """Find the displacement of the reference mesh that brings the deformed images onto the reference ones.
+    """Find the displacement of the reference mesh with which the warped deformed images match the reference ones.
 
     Parameters
     ----------
     reference, deformed
         The two states, prepared with the same prefilter.
     initial : ndarray, shape (N, 2)
-        Displacement (u, v) in px to start from, within about half a speckle of the solution.
+        Initial guess of the displacement (u, v) in px, within about half a speckle of the solution.
     options
         Rigid functions, grey-level correction, tolerance and iterations.
     statistics
@@ -242,7 +243,7 @@ def solve(
 
 
 def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, Weighting]:
-    """Passes until the weights have settled."""
+    """Run passes until the weights have settled."""
     tolerance = problem.options.tolerance
     weighting = first_weighting(problem, estimate)
     equations: Equations | None = None
@@ -262,7 +263,7 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
 
 @stage("equations")
 def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Equations:
-    """The equations of the next pass.
+    """Build the equations of the next pass.
 
     Raises
     ------
@@ -298,32 +299,29 @@ def _nothing_left(weighting: Weighting) -> str:
     return "the images have no texture in the region"
 
 
-def _hidden(lights: BoolArray) -> str:
-    numbers = [str(number) for number in np.flatnonzero(lights)]
-    named = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
-    return (
-        f"{named} too little seen texture with light 0 (the first), directly or through others, to tell a rigid motion "
-        "from displacement: widen what is seen (region, weights), measure the bodies apart, or set "
-        'solver.rigid = "none"'
-    )
-
-
 @stage("conclusion")
 def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
-    """The solution: what counts, how certain it is, in which unit."""
-    reference, options, mesh = problem.reference, problem.options, problem.reference.mesh
+    """Conclude the solve: which nodes count as measured, their values and uncertainty."""
+    options, geometry, mesh = problem.options, problem.reference.geometry, problem.reference.mesh
     mismatched = np.zeros(len(mesh.nodes), dtype=bool)
     mismatched[mesh.elements[~weighting.matched]] = True
     used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(reference.material, used, equations.information(reference), reference.linear_offset)
+    recovery = Recovery.over(geometry.material, used, equations.information(problem.reference), geometry.linear_offset)
     fitted = estimate.displacement
-    residual = weighting.residual.without(*recovery.bend(fitted, reference.linear_offset))
+    residual = weighting.residual.without(*recovery.bend(fitted, geometry.linear_offset))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
     squares = weighting.residual.squares(equations.weights)
     misfits = misfit(mesh, squares, equations.textured)
     node_status = _judged(estimate, equations, weighting, mismatched, std, misfits)
     if equations.rigid is not None and equations.rigid.hidden.any():
-        raise UnsolvableError(_hidden(equations.rigid.hidden), estimate)
+        numbers = [str(number) for number in np.flatnonzero(equations.rigid.hidden)]
+        named = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
+        raise UnsolvableError(
+            f"{named} too little seen texture with light 0 (the first), directly or through others, to tell a rigid "
+            "motion from displacement: widen what is seen (region, weights), measure the bodies apart, or set "
+            'solver.rigid = "none"',
+            estimate,
+        )
     measured = node_status == NodeStatus.MEASURED
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
     square, total, _ = squares.sum(axis=1).T
@@ -343,7 +341,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         reason="" if converged else _unsettled(problem, estimate, measured),
         rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
-        weight_fraction=_shares(equations.weights),
+        weight_fraction=_weight_fractions(equations.weights),
         history=history,
     )
 
@@ -382,7 +380,7 @@ def _judged(
 
 
 def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str:
-    """Where the last iteration still moved which of the `measured` nodes (N,)."""
+    """Report which of the `measured` nodes (N,) the last iteration still moved, and where."""
     motion, tolerance = np.where(measured, estimate.increments[-1], 0.0), problem.options.tolerance
     x, y = problem.reference.mesh.nodes[motion.argmax()] + problem.reference.origin
     return (
@@ -392,8 +390,8 @@ def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str
     )
 
 
-def _shares(weights: FloatImage) -> FloatArray:
-    """Mean share (k,) of each light in the sum of the weights (k, P), over about 100 000 pixels."""
+def _weight_fractions(weights: FloatImage) -> FloatArray:
+    """Mean fraction (k,) of each light in the sum of the weights (k, P), over about 100 000 pixels."""
     some = weights[:, :: max(1, weights.shape[1] // 100_000)]
     total = some.sum(axis=0)
     return np.asarray((some / np.where(total > 0, total, np.float32(1))).mean(axis=1, dtype=np.float64))

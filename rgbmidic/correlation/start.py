@@ -1,17 +1,12 @@
-"""Keypoints of a state's picture, and the pairs of them that two states share, whatever their turn and size.
+"""Initial guesses of the displacement, however large the motion, and the tracking of one frame after another.
 
-The lights' images are locally normalised (so that reflections and shading weigh little) and averaged into one picture
-per state. Its keypoints (SIFT: Lowe, Int. J. Comput. Vision 60, 2004) are paired by their descriptors, which change
-little under shift, rotation and moderate strain. A pair tells how its surroundings turn and stretch; it counts if the
-pairs around it have moved accordingly.
-
-Starts for the Gauss-Newton iteration, however large the motion, and how sure they are; coarse pictures first.
-
-Keypoints that both states share (`keypoints`) are found in pictures reduced 8 times, then 4, 2 and 1 times. The nodes
-follow the pairs around them by a robust local affine fit. How sure such a start is says the correlation of the images
-around the nodes.
-
-One frame after the other: each starts from the last one's displacement, and from a search where that fails.
+A frame starts from the last one's displacement, and from a search where that fails. The search compares pictures of
+both states, reduced 8 times, then 4, 2 and 1 times. The lights' images are locally normalised (so that reflections and
+shading weigh little) and averaged into one picture per state. Its keypoints (SIFT: Lowe, Int. J. Comput. Vision 60,
+2004) are paired by their descriptors, which change little under shift, rotation and moderate strain. Angle and size of
+a pair give the turn and stretch of its surroundings; it counts if the pairs around it have moved accordingly. The nodes
+follow the pairs around them by a robust local affine fit. The confidence of such an initial guess is the fraction of
+the nodes around which the images then agree.
 """
 
 from __future__ import annotations
@@ -22,7 +17,6 @@ from itertools import chain
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from rgbmidic.correlation.precision import correlation_around
@@ -50,15 +44,17 @@ __all__ = [
 ]
 
 _NORMALISE = 6.0
-"""Standard deviation of the local mean and contrast, px of the reduced picture."""
+"""Standard deviation of the local mean and contrast, px of the reduced picture. Chosen; with half or twice of it
+results differ by 4e-5 px at most (benchmarks/constants.py)."""
 _FLAT = 0.1
-"""Contrast that is not amplified further, over that of the most contrasted tenth of the picture."""
+"""Contrast that is not amplified further, over that of the most contrasted tenth of the picture. Chosen; with half
+or twice of it results differ by 4e-6 px at most (benchmarks/constants.py)."""
 _GREY = 40
 """Grey levels of the picture's local standard deviation: three of them fit into 8 bits."""
 _CONTRAST = 0.06
 """SIFT's threshold: lower ones add keypoints that noise makes, at .12 a jittered lattice loses most (measured)."""
 _VOTERS = 30
-"""Pairs around a pair that are asked..."""
+"""Pairs around a pair that vote on it..."""
 _VOTES = 4
 """...and how many must agree: with wrong pairs in a picture of 1 Mpx it happens to one in 1000 by chance."""
 _TOLERANCE = 0.3
@@ -76,7 +72,7 @@ class Box:
 
     @classmethod
     def around(cls, points: FloatArray, margin: float, shape: tuple[int, ...]) -> Box:
-        """The part of an image of `shape` (H, W) within `margin` px of points (N, 2) in x and y."""
+        """Return the part of an image of `shape` (H, W) within `margin` px of points (N, 2) in x and y."""
         left, top = np.floor(points.min(axis=0) - margin).astype(int)
         right, bottom = np.ceil(points.max(axis=0) + margin).astype(int) + 1
         height, width = shape
@@ -93,7 +89,7 @@ class Box:
         return max(self.bottom - self.top, 0) * max(self.right - self.left, 0)
 
     def cut(self, image: FloatImage, step: int) -> FloatImage:
-        """The box's part of an image (H, W), its sides whole multiples of `step`."""
+        """Cut the box's part out of an image (H, W), its sides whole multiples of `step`."""
         height, width = (size // step * step for size in (self.bottom - self.top, self.right - self.left))
         return image[self.top : self.top + height, self.left : self.left + width]
 
@@ -119,11 +115,24 @@ class Keypoints:
 
     @classmethod
     def find(cls, images: FloatImage, weights: FloatImage, box: Box, reduction: int, most: int) -> Keypoints:
-        """The `most` strongest in a part of images (k, H, W), reduced `reduction` times, where weights (k, H, W)
-        are not 0."""
+        """Find the strongest keypoints in a part of a state's picture.
+
+        Parameters
+        ----------
+        images, weights : ndarray, shape (k, H, W), float32
+            Of the state; a keypoint lies where a weight is not 0.
+        box
+            The part.
+        reduction
+            How many times the picture is reduced.
+        most
+            Number of keypoints.
+        """
+        none = np.zeros(0)
+        empty = cls(points=np.zeros((0, 2)), size=none, angle=none, descriptors=np.zeros((0, 128), dtype=np.float32))
         picture, seen = _picture(images, weights, box, reduction)
         if min(picture.shape) < 2 * _NORMALISE:
-            return cls._empty()
+            return empty
         grey = np.clip(128 + _GREY * picture, 0, 255).astype(np.uint8)
         # the precise upscale keeps positions free of a bias of a quarter of a pixel
         sift = cv2.SIFT.create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
@@ -132,7 +141,7 @@ class Keypoints:
         strength = np.where(seen[rows, columns] > 0, [key.response for key in found], 0.0)
         strongest = np.argsort(-strength, kind="stable")[: min(most, np.count_nonzero(strength))]
         if not len(strongest):
-            return cls._empty()
+            return empty
         chosen, descriptors = sift.compute(grey, [found[number] for number in strongest])
         return cls(
             points=np.asarray(cv2.KeyPoint.convert(chosen), dtype=np.float64) * reduction
@@ -143,18 +152,28 @@ class Keypoints:
             descriptors=np.asarray(descriptors, dtype=np.float32),
         )
 
-    @classmethod
-    def _empty(cls) -> Keypoints:
-        none = np.zeros(0)
-        return cls(points=np.zeros((0, 2)), size=none, angle=none, descriptors=np.zeros((0, 128), dtype=np.float32))
-
 
 def pairs(first: Keypoints, second: Keypoints, tolerance: float) -> tuple[FloatArray, FloatArray]:
-    """Points (P, 2) of `first` and their motion (P, 2) in px to `second`: mutually nearest descriptors whose angle and
-    size tell, within `tolerance` px and a share of the distance, where some of the pairs around them have gone."""
-    here, there = _nearest(first, second)
+    """Pair the keypoints of two states.
+
+    Pairs are mutually nearest descriptors whose angle and size predict, within `tolerance` px and a fraction of the
+    distance, where some of the pairs around them have gone.
+
+    Returns
+    -------
+    tuple of ndarray, shape (P, 2)
+        Points of `first` and their motion to `second`, px.
+    """
+    none = np.zeros((0, 2)), np.zeros((0, 2))
+    if not len(first.points) or not len(second.points):
+        return none
+    # sums of products of whole numbers under 2^24: exact in float32, hence the same in any order and on any threads
+    likeness = first.descriptors @ second.descriptors.T
+    nearest, back = likeness.argmax(axis=1), np.asarray(likeness.argmax(axis=0))
+    here = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+    there = nearest[here]
     if len(here) <= _VOTES:
-        return np.zeros((0, 2)), np.zeros((0, 2))
+        return none
     points, motion = first.points[here], second.points[there] - first.points[here]
     around = np.asarray(cKDTree(points).query(points, k=min(_VOTERS + 1, len(points)))[1])[:, 1:]
     step = points[around] - points[:, None]
@@ -166,18 +185,6 @@ def pairs(first: Keypoints, second: Keypoints, tolerance: float) -> tuple[FloatA
     return points[votes >= _VOTES], motion[votes >= _VOTES]
 
 
-def _nearest(first: Keypoints, second: Keypoints) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Numbers of the mutually nearest descriptors."""
-    if not len(first.points) or not len(second.points):
-        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    # sums of products of whole numbers under 2^24: exact in float32, hence the same in any order and on any threads
-    likeness = first.descriptors @ second.descriptors.T
-    there = likeness.argmax(axis=1)
-    back = np.asarray(likeness.argmax(axis=0))
-    here = np.flatnonzero(back[there] == np.arange(len(there)))
-    return here, there[here]
-
-
 def _picture(images: FloatImage, weights: FloatImage, box: Box, reduction: int) -> tuple[FloatImage, FloatImage]:
     """Mean over the lights of the locally normalised images of a box, reduced in size, and the sum of the weights."""
     height, width = box.cut(images[0], reduction).shape
@@ -187,15 +194,15 @@ def _picture(images: FloatImage, weights: FloatImage, box: Box, reduction: int) 
         return total, seen
     for image, weight in zip(images, weights, strict=True):
         used = box.cut(weight, reduction)
-        share = cv2.resize(used, size, interpolation=cv2.INTER_AREA)
+        part = np.asarray(cv2.resize(used, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
         values = cv2.resize(box.cut(image, reduction) * used, size, interpolation=cv2.INTER_AREA)
-        total += share * _normalised(np.asarray(values / np.maximum(share, np.float32(1e-6))), np.asarray(share))
-        seen += share
+        total += part * _normalised(np.asarray(values / np.maximum(part, np.float32(1e-6))), part)
+        seen += part
     return np.asarray(total / np.maximum(seen, np.float32(1e-6))), seen
 
 
 def _normalised(image: FloatImage, weight: FloatImage) -> FloatImage:
-    """An image (H, W) less its local mean, over its local standard deviation."""
+    """Return an image (H, W) less its local mean, over its local standard deviation."""
     norm = _blur(weight) + np.float32(1e-6)
     centred = image - _blur(image * weight) / norm
     contrast = np.sqrt(_blur(centred * centred * weight) / norm)
@@ -209,7 +216,7 @@ def _blur(image: FloatImage) -> FloatImage:
 _SURE = 0.95
 """Confidence from which finer pictures are not looked at: at .9, speckles of 3 px may be off by 1.2 px (measured)."""
 _AGREES = 0.5
-"""Correlation coefficient from which the images around a node agree."""
+"""Correlation coefficient from which the images around a node agree: noise is half of their variance then (derived)."""
 _STILL = 0.8
 """The same at rest, which is not asked of a search: at 0.5, speckles of 7 px were off by 2.6 px."""
 _REDUCTIONS = (8, 4, 2, 1)
@@ -220,18 +227,20 @@ _KEYPOINTS = 1000
 _MOST = 5000
 """Most keypoints of the deformed image, where there are as many per area."""
 _CONTEXT = 24.0
-"""Surroundings (px) of the region in which keypoints are looked for too."""
+"""Surroundings (px) of the region in which keypoints are looked for too. Chosen; with half or twice of it results
+differ by 2e-5 px at most (benchmarks/constants.py)."""
 _REACH = 128.0
-"""Motion (px) that is looked for at least; the longer side of the region where that is more."""
+"""Motion (px) that is looked for at least; the longer side of the region where that is more. Chosen: 30 speckles."""
 _FITTED = 12
-"""Pairs to which the motion around a node is fitted."""
+"""Pairs to which the motion around a node is fitted: four times the three that determine an affine motion. With half or
+twice of it results differ by 5e-6 px at most (benchmarks/constants.py)."""
 _TURNS = 5
-"""Robust fits until the weights have settled."""
+"""Robust fits until the weights have settled: twice as many change results by 1e-11 px (benchmarks/constants.py)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundStart:
-    """A displacement to start from, and how sure it is.
+    """An initial guess of the displacement, and its confidence.
 
     Attributes
     ----------
@@ -246,7 +255,7 @@ class FoundStart:
 
 
 def confidence(reference: Reference, deformed: Deformed, displacement: FloatArray, least: float = _AGREES) -> float:
-    """Share of the nodes around which the images correlate by `least` or more at a displacement (N, 2).
+    """Fraction of the nodes around which the images correlate by `least` or more at a displacement (N, 2).
 
     Nodes count that see something in both states, and at least a tenth of those that do in the reference, so that
     a few speckles alone make no start.
@@ -261,21 +270,43 @@ def confidence(reference: Reference, deformed: Deformed, displacement: FloatArra
 
 
 def search_reach(nodes: FloatArray) -> float:
-    """Distance (px) from where nodes (N, 2) may be up to which a search looks for them: the longer side of the region,
-    at least `_REACH`."""
+    """Distance (px) up to which nodes (N, 2) are looked for: the longer side of the region, at least `_REACH`."""
     return max(float(np.ptp(nodes, axis=0).max()), _REACH)
 
 
 def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
-    """The surest start of `find_starts`; rest where there is none."""
+    """Search for an initial guess.
+
+    Parameters
+    ----------
+    reference, deformed
+        The two states.
+
+    Returns
+    -------
+    FoundStart
+        The surest of `find_starts`; rest, with the confidence 0, where there is none.
+    """
     rest = FoundStart(displacement=np.zeros_like(reference.mesh.nodes), confidence=0.0)
     return max(find_starts(reference, deformed), key=lambda found: found.confidence, default=rest)
 
 
 def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | None = None) -> Iterator[FoundStart]:
-    """Starts from ever finer pictures, each surer than the one before, until one is sure; rest alone, if that is.
+    """Search for initial guesses in ever finer pictures, each surer than the one before, until one is sure.
 
-    They are looked for within the region's longer side, but at least 128 px, of rest and of `last` (N, 2).
+    They are looked for within the region's longer side, but at least 128 px, of rest and of the last displacement.
+
+    Parameters
+    ----------
+    reference, deformed
+        The two states.
+    last : ndarray, shape (N, 2), optional
+        Displacement of the frame before, px.
+
+    Yields
+    ------
+    FoundStart
+        Rest alone, if that is sure.
     """
     nodes, offset = reference.mesh.nodes, reference.offset(deformed)
     rest = np.zeros_like(nodes)
@@ -304,8 +335,10 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
 
 
 def _followed(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
-    """Motion (N, 2) of the nodes: one affine field, and what the pairs around each add to it by a local one; around
-    the nodes at a crack those on their own side."""
+    """Motion (N, 2) of the nodes: one affine field, and what the pairs around each add to it by a local one.
+
+    Around the nodes at a crack the pairs on their own side count.
+    """
     nodes = mesh.nodes
     middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
     basis, at_nodes = (np.c_[np.ones(len(where)), (where - middle) / size] for where in (points, nodes))
@@ -318,8 +351,10 @@ def _followed(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: flo
 
 
 def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: float) -> FloatArray:
-    """Coefficients (T, 3, 2) of T fits of `motion` (T, K, 2) by `basis` (T, K, 3), whose first function is 1, with
-    Cauchy weights of `scale` px; `ridge` holds the slopes back where the points do not tell them."""
+    """Coefficients (T, 3, 2) of T fits of `motion` (T, K, 2) by `basis` (T, K, 3), with Cauchy weights of `scale` px.
+
+    The first function of the basis is 1; `ridge` holds the slopes back where the points do not determine them.
+    """
     weight = np.ones(basis.shape[:2])
     held = np.diag([1e-6, ridge, ridge])
     for _ in range(_TURNS):
@@ -334,14 +369,14 @@ def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: floa
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
-    """From where a frame starts.
+    """Initial guess of a frame, and the references so far.
 
     Attributes
     ----------
     displacement : ndarray, shape (N, 2), or None
         The last frame's displacement in px, gaps filled; None where there is none yet.
     unmeasured : float
-        Share of the nodes that the last frame could not measure.
+        Fraction of the nodes that the last frame could not measure.
     reference_updates : tuple of int
         The frames that have become the reference in turn.
     best_match : float
@@ -354,9 +389,10 @@ class Start:
     best_match: float = 0.0
 
     def after(self, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray) -> Start:
-        """The start of the frame after one that started here: nodes that it lost move as the nearest measured one.
+        """Return the start of the frame after one that started here.
 
-        Where it lost all of them, the next frame starts here too.
+        Nodes without data move as the nearest measured one. Where a frame has none that is measured, the next starts
+        here too.
 
         Parameters
         ----------
@@ -374,12 +410,12 @@ class Start:
 
 
 LARGEST_TURN = 30.0
-"""Turn (degrees) that the search for a start finds, with strains of 20 % or alone (benchmarks/starts.py)."""
+"""Turn (degrees) that the search finds, with strains of 20 % or alone (benchmarks/starts.py)."""
 NEEDED = 0.15
-"""Confidence from which a start is worth a solve: another specimen gives at most .1 (benchmarks/starts.py)."""
+"""Confidence from which an initial guess is worth a solve: another specimen gives at most .1 (benchmarks/starts.py)."""
 _LOSS = 0.04
-"""Share of the nodes whose loss each further start makes acceptable, half of it at the first: a few may really go, as
-the 1 to 2 % at the edge of a turning fragment do."""
+"""Fraction of the nodes whose loss each further guess makes acceptable, half of it at the first: a few may really go,
+as the 1 to 2 % at the edge of a turning fragment do."""
 
 
 def track(
@@ -397,9 +433,14 @@ def track(
     reference, deformed
         The two states.
     start
-        The last frame's end; without a displacement the start is searched.
+        The last frame's end; without a displacement the initial guess is searched for.
     options, statistics
         How to solve, see `solve`.
+
+    Returns
+    -------
+    Solution
+        The best of those from each initial guess.
     """
     best: Solution | None = None
     surest = 0.0

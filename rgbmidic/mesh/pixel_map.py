@@ -1,8 +1,7 @@
-"""The pixel map: each pixel of the region is owned by exactly one element, and stored with its element.
+"""The pixel map, in which each pixel of the region is owned by one element, and quadratic fits to nodal values.
 
-A quadratic polynomial fitted to the nodal values around each node: value, slope and curvature at the node.
-
-The recovery of Zhang and Naga (SIAM J. Sci. Comput. 26, 2005), with weights that fall with the distance.
+The fits give value, slope and curvature at every node (the recovery of Zhang and Naga, SIAM J. Sci. Comput. 26, 2005,
+with weights that fall with the distance), and between the nodes at the owned pixels.
 """
 
 from __future__ import annotations
@@ -26,7 +25,8 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 __all__ = ["TERMS", "PixelMap", "blended", "quadratic_fit"]
 
 _RIM = 3.0
-"""Farthest (px) that a pixel of the region may lie from the element that owns it."""
+"""Farthest (px) that a pixel of the region may lie from the element that owns it: the polygon of an outline is within
+0.06 elements of it (`outline_mesh`), 3 px for elements of 50 px."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,12 +98,19 @@ class PixelMap:
         from_origin = column - origin[element, 0], row - origin[element, 1]
         runs = np.take(np.stack([first, length, *from_origin], axis=1).astype(np.int32), order, axis=0)
         run_offsets = np.searchsorted(element[order], np.arange(len(origin) + 1))
+        # the position along x of every pixel: that of its run's first, and one more from pixel to pixel
+        steps = np.ones(length.sum(), dtype=np.float32)
+        steps[runs[:, 0]] = np.diff(runs[:, 2], prepend=0) - np.concatenate([[0], runs[:-1, 1] - 1])
+        local_x = np.cumsum(steps, out=steps)
+        # the linear shape functions of the triangles: 1 at their own corner, 0 at the others
+        (x1, y1), (x2, y2) = (np.moveaxis(np.roll(corners - origin[:, None], turn, axis=1), 2, 0) for turn in (-1, 1))
+        twice_areas = np.stack([x1 * y2 - x2 * y1, y1 - y2, x2 - x1], axis=2)
         return cls(
             offsets=np.append(runs[:, 0], length.sum())[run_offsets],
             origin=origin,
-            local_x=_counted_up(runs),
+            local_x=local_x,
             local_y=np.repeat(runs[:, 3].astype(np.float32), runs[:, 1]),
-            barycentric=_shape_functions(corners - origin[:, None]),
+            barycentric=twice_areas / twice_areas[..., 0].sum(axis=1)[:, None, None],
             shape=region.mask.shape,
             runs=runs,
             run_offsets=run_offsets,
@@ -111,6 +118,11 @@ class PixelMap:
             lines=lines,
             line_offsets=np.searchsorted(lines[:, 2], np.arange(size[0] + 1)),
         )
+
+    @property
+    def positions(self) -> tuple[FloatImage, FloatImage, npt.NDArray[np.int64], FloatArray]:
+        """Local x and y, offsets and shape functions: where the owned pixels lie, for kernels."""
+        return self.local_x, self.local_y, self.offsets, self.barycentric
 
     @property
     def rows(self) -> npt.NDArray[np.int64]:
@@ -144,19 +156,19 @@ class PixelMap:
         return -(-height // side), -(-width // side)
 
     def block_sums(self, values: FloatImage, side: int) -> FloatImage:
-        """Sums of `values` (n, P) over such blocks, shape (n, rows, columns)."""
+        """Sum `values` (n, P) over such blocks, shape (n, rows, columns)."""
         out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
         block_sums(values, self.lines, self.line_offsets, side, out)
         return out
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
-        """Grids (n, rows, columns) of such blocks interpolated between their centres at the owned pixels (n, P)."""
+        """Interpolate grids (n, rows, columns) of such blocks between their centres at the owned pixels (n, P)."""
         out = np.empty((len(grids), self.local_x.size), dtype=np.float32)
         from_grid(self.lines, self.line_offsets, np.ascontiguousarray(grids, dtype=np.float32), side, out)
         return out
 
     def in_blocks(self, grid: FloatImage, side: int) -> FloatImage:
-        """The value of its block in such a grid (rows, columns) at every owned pixel (P,)."""
+        """Return the value of its block in such a grid (rows, columns) for every owned pixel (P,)."""
         image = np.repeat(np.repeat(grid, side, axis=1), side, axis=0)[None]
         out = np.empty((1, self.local_x.size), dtype=np.float32)
         from_image(self.lines, image, 0, 0, out)
@@ -176,20 +188,13 @@ class PixelMap:
 
 
 def _owned_rows(owner: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], ...]:
-    """Owner, row, first column and length of every row of pixels that one element owns, in the order of the image."""
+    """Return owner, row, first column and length of every row of pixels that one element owns, in image order."""
     begins = np.ones(owner.shape, dtype=bool)
     np.not_equal(owner[:, 1:], owner[:, :-1], out=begins[:, 1:])
     start = np.flatnonzero(begins).astype(np.int32)
     length, element = np.diff(start, append=np.int32(owner.size)), owner.ravel()[start]
     owned = element >= 0
     return element[owned], *np.divmod(start[owned], np.int32(owner.shape[1])), length[owned]
-
-
-def _counted_up(runs: npt.NDArray[np.int32]) -> FloatImage:
-    """Position along x of every pixel (P,): that of its run's first, and one more from pixel to pixel."""
-    steps = np.ones(runs[:, 1].sum(), dtype=np.float32)
-    steps[runs[:, 0]] = np.diff(runs[:, 2], prepend=0) - np.concatenate([[0], runs[:-1, 1] - 1])
-    return np.cumsum(steps, out=steps)
 
 
 def _claim_rim(owner: npt.NDArray[np.int32]) -> None:
@@ -203,13 +208,6 @@ def _claim_rim(owner: npt.NDArray[np.int32]) -> None:
     owner[rim] = element_of_label[label[rim]]
 
 
-def _shape_functions(corners: FloatArray) -> FloatArray:
-    """Coefficients of the linear shape functions of triangles (E, 3, 2): 1 at their own corner, 0 at the others."""
-    (x1, y1), (x2, y2) = (np.moveaxis(np.roll(corners, turn, axis=1), 2, 0) for turn in (-1, 1))
-    areas = np.stack([x1 * y2 - x2 * y1, y1 - y2, x2 - x1], axis=2)
-    return np.asarray(areas / areas[..., 0].sum(axis=1)[:, None, None])
-
-
 Index = npt.NDArray[np.intp]
 
 TERMS = ("value", "x", "y", "xx", "xy", "yy")
@@ -221,9 +219,10 @@ have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third 
 Its square goes with the inverse of the angle that the mesh fills: with .58 everywhere corners scattered 2 times as much
 as the linear fit's, and waves at an edge were seen no better."""
 _TIP = 0.8
-"""Share of the full angle from which a corner of the mesh counts as a crack's tip: an opening of 70 degrees."""
+"""Fraction of the full angle from which a corner of the mesh counts as a crack's tip: an opening of 70 degrees."""
 _RIDGE = np.array([1e-9, 1e-9, 1e-6, 1e-6, 1e-6])
-"""Weight with which slopes and curvatures are held at 0, where too few nodes tell them."""
+"""Weight with which slopes and curvatures are held at 0, where too few nodes determine them: the second derivatives of
+waves of 5 to 6 elements, crack tips among them, change by 2e-5 of the largest at most (measured)."""
 
 
 def quadratic_fit(
@@ -236,17 +235,23 @@ def quadratic_fit(
     """Linear operators (N, N), one for each of `TERMS`, from nodal values to those of the polynomial at each node.
 
     The polynomial is fitted to the nodes within two edges, reached over `used` elements only: not across a crack or a
-    hole. Quadratic fields are reproduced, at edges too; what too few nodes tell is 0.
+    hole. Quadratic fields are reproduced, at edges too; what too few nodes determine is 0.
 
     Parameters
     ----------
     mesh
         N nodes, E elements.
     used : ndarray, shape (E,), bool
+        Elements over which nodes are reached.
     information : ndarray, shape (N,), optional
         How well each node is known (inverse variance, any unit): one that is known badly counts little elsewhere.
     offset : ndarray, shape (N, 3), optional
         What the given values have beyond a field whose second derivative xx, xy or yy is 1, square px; 0 without.
+
+    Returns
+    -------
+    tuple of csr_matrix, shape (N, N)
+        In the order of `TERMS`, per px and square px.
     """
     other, known, weight, structure = _window(mesh, used.tobytes())
     basis = _basis(mesh, used.tobytes(), None if offset is None else offset.tobytes())
@@ -261,9 +266,14 @@ def quadratic_fit(
 
 
 def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray]) -> FloatImage:
-    """The nodes' polynomials at the owned pixels, each counting as its shape function does; continuous, (C, P).
+    """Evaluate the nodes' polynomials at the owned pixels, each weighted by its shape function: (C, P), continuous.
 
-    `polynomials` are the values (N, C) of each of `TERMS`.
+    Parameters
+    ----------
+    mesh, pixels
+        N nodes, P owned pixels.
+    polynomials : sequence of ndarray, shape (N, C)
+        Values of each of `TERMS`.
     """
     value, x, y, xx, xy, yy = polynomials
     element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
@@ -271,44 +281,52 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
     for corner in range(3):
         node = mesh.elements[element, corner]
         constant, slope_x, slope_y = pixels.barycentric[element, corner].T
-        share = constant + slope_x * pixels.local_x + slope_y * pixels.local_y
+        shape_function = constant + slope_x * pixels.local_x + slope_y * pixels.local_y
         dx, dy = pixels.columns - mesh.nodes[node, 0], pixels.rows - mesh.nodes[node, 1]
         for c in range(len(out)):
             bent = xx[node, c] * dx * dx / 2 + xy[node, c] * dx * dy + yy[node, c] * dy * dy / 2
-            out[c] += share * (value[node, c] + x[node, c] * dx + y[node, c] * dy + bent)
+            out[c] += shape_function * (value[node, c] + x[node, c] * dx + y[node, c] * dy + bent)
     return out
 
 
 @lru_cache(maxsize=1)
 def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
-    """The nodes around each, itself where a row has fewer, (N, W); the places of those that are no such filling; their
-    weights (N, W); and the matrix of these nodes. Kept, for most frames use all elements."""
+    """Return the nodes that the polynomial of each node is fitted to.
+
+    The last result is kept, for most frames use all elements.
+
+    Returns
+    -------
+    tuple
+        The nodes around each, itself where a row has fewer, (N, W); the places of those that are no such filling; their
+        weights (N, W); and the matrix of these nodes.
+    """
     elements = np.frombuffer(used, dtype=bool)
-    share = _surrounded(mesh, elements)
-    reach = _reached(mesh, elements, share)
+    surrounded = _surrounded(mesh, elements)
+    reach = _reached(mesh, elements, surrounded)
     number = np.diff(reach.indptr)
     known = np.arange(number.max()) < number[:, None]
     other = np.repeat(np.arange(number.size)[:, None], known.shape[1], axis=1)
     other[known] = reach.indices
     square = sum((axis[other] - axis[:, None]) ** 2 for axis in mesh.nodes.T) / mesh.size**2
     # at an edge the window holds as much of the mesh as inside
-    weight = np.where(known, np.exp(-square * share[:, None] / (2 * _WIDTH**2)), 0.0)
+    weight = np.where(known, np.exp(-square * surrounded[:, None] / (2 * _WIDTH**2)), 0.0)
     return other, np.flatnonzero(known), weight, reach
 
 
 def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
-    """Share (N,) of the full angle around each node that `used` elements fill; 1 where there are none."""
+    """Return the fraction (N,) of the full angle around each node that `used` elements fill; 1 where there are none."""
     corners = mesh.nodes[mesh.elements]
     ahead, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     across = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
     angle = np.arctan2(across, (ahead * back).sum(axis=-1)) * used[:, None]
-    share = np.bincount(mesh.elements.ravel(), weights=angle.ravel(), minlength=len(mesh.nodes)) / (2 * np.pi)
-    return np.asarray(np.where(share > 0, share, 1.0))
+    fraction = np.bincount(mesh.elements.ravel(), weights=angle.ravel(), minlength=len(mesh.nodes)) / (2 * np.pi)
+    return np.asarray(np.where(fraction > 0, fraction, 1.0))
 
 
 @lru_cache(maxsize=1)
 def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
-    """The polynomials 1, x, y, xx/2, xy, yy/2 about each node at those around, in sides of an element: (N, 6, W)."""
+    """Evaluate 1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element: (N, 6, W)."""
     other = _window(mesh, used)[0]
     x, y = ((axis[other] - axis[:, None]) / mesh.size for axis in mesh.nodes.T)
     basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)
@@ -318,15 +336,17 @@ def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
     return basis
 
 
-def _reached(mesh: Tri3Mesh, used: BoolArray, share: FloatArray) -> sp.csr_matrix:
-    """The nodes at most two edges of `used` elements away from each, itself with them, as the entries of its row. No
-    way leads round the tip of a crack to its other side."""
+def _reached(mesh: Tri3Mesh, used: BoolArray, surrounded: FloatArray) -> sp.csr_matrix:
+    """Return the nodes at most two edges of `used` elements away from each, itself included, as the entries of its row.
+
+    No way leads round the tip of a crack to its other side.
+    """
     corners, itself = mesh.elements[used], np.arange(len(mesh.nodes))
     rows = np.concatenate([np.repeat(corners, 3, axis=1).ravel(), itself])
     columns = np.concatenate([np.tile(corners, 3).ravel(), itself])
     beside = sp.csr_matrix((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(itself.size, itself.size))
     row = np.repeat(itself, np.diff(beside.indptr))
-    through = with_data(beside, (~(mesh.on_boundary & (share > _TIP)))[row] | (beside.indices == row))
+    through = with_data(beside, (~(mesh.on_boundary & (surrounded > _TIP)))[row] | (beside.indices == row))
     reached = sp.csr_matrix(beside @ through)
     reached.sort_indices()  # or scipy might, later, in one of the matrices that share them
     return reached

@@ -1,8 +1,6 @@
-"""The region of interest: which pixels of the reference image are measured.
+"""The region of interest, and the Delaunay mesh of a region of any outline with its holes and cracks.
 
-Delaunay mesh of a region of any outline, its holes and its cracks.
-
-Stated cracks: their paths through the region as rows of mesh nodes, and the mesh split along them.
+A stated crack is a path through the region: a row of mesh nodes, along which the mesh is split.
 """
 
 from __future__ import annotations
@@ -54,6 +52,7 @@ class Region:
     origin: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
+        """Check the mask."""
         mask = np.ascontiguousarray(self.mask, dtype=bool)
         if mask.ndim != 2:
             raise RegionError(f"a region mask is one (H, W) image, not an array of shape {mask.shape}")
@@ -91,7 +90,7 @@ class Region:
             raise RegionError(
                 f"the region's rectangle {rectangle!r} does not overlap the image of {width} x {height} px"
             )
-        _tell_clipped("rectangle", corners.reshape(2, 2), shape)
+        _warn_clipped("rectangle", corners.reshape(2, 2), shape)
         mask = np.zeros(shape, dtype=bool)
         left, top = (int(np.ceil(value)) for value in clipped[:2])
         mask[top : int(clipped[3]) + 1, left : int(clipped[2]) + 1] = True
@@ -114,11 +113,16 @@ class Region:
             raise RegionError(
                 f"the region's polygon {points.tolist()} does not overlap the image of {shape[1]} x {shape[0]} px"
             )
-        _tell_clipped("polygon", points, shape)
+        _warn_clipped("polygon", points, shape)
         return cls(mask=mask)
 
     def without(self, holes: Sequence[npt.ArrayLike]) -> Region:
-        """The region without the pixels of some polygons, each of corners (x, y) in px, shape (M, 2).
+        """Return the region without the pixels of some polygons.
+
+        Parameters
+        ----------
+        holes
+            Corners (x, y) of each in px, shape (M, 2).
 
         Raises
         ------
@@ -131,7 +135,7 @@ class Region:
         return Region(mask=self.mask & ~np.logical_or.reduce(inside))
 
     def part(self, rows: slice, columns: slice) -> Region:
-        """The same region on a part of the image that holds it."""
+        """Return the same region on a part of the image that holds it."""
         corners = None
         if self.rectangle is not None:
             (x0, y0, x1, y1), x, y = self.rectangle, columns.start, rows.start
@@ -155,30 +159,38 @@ class Region:
 
 
 def _filled(points: FloatArray, shape: tuple[int, ...]) -> BoolArray:
-    """The pixels (H, W) of a polygon with corners (M, 2)."""
+    """Return the pixels (H, W) of a polygon with corners (M, 2)."""
     mask = np.zeros(shape, dtype=np.uint8)
     shift = 8  # fixed-point bits of OpenCV's coordinates
     cv2.fillPoly(mask, [np.round(points * 2**shift).astype(np.int32)], 1, shift=shift)
     return mask.astype(bool)
 
 
-def _tell_clipped(what: str, points: FloatArray, shape: tuple[int, int]) -> None:
-    """Tell of corners (M, 2) that lie more than a pixel outside an image."""
+def _warn_clipped(what: str, points: FloatArray, shape: tuple[int, int]) -> None:
+    """Warn of corners (M, 2) that lie more than a pixel outside an image."""
     last = np.array(shape[::-1]) - 1
     if (points < -1).any() or (points > last + 1).any():
         logger.warning("the %s %s reaches outside the image of %d x %d px: clipped", what, points.tolist(), *(last + 1))
 
 
 _CROWDED = 0.3
-"""Distance in elements under which a node of the outline is left out beside another one, or beside a crack."""
+"""Distance in elements under which a node of the outline is left out beside another one, or beside a crack: the least
+angle of a triangle with two other sides of an element is then 17 degrees (derived)."""
+_DEEP = 0.6
+"""Depth in elements from which a lattice point is a node: over half the pitch, so that triangles at the outline are no
+flatter than those inside."""
+_SMOOTHED = 0.06
+"""Distance in elements within which the polygon of the outline follows its pixels, but at least a pixel: a chord of an
+element's length is that far from an arc with a radius of two elements (derived)."""
 _CLEAR = 0.55
 """Distance in elements that nodes inside keep from a crack: they see a piece of it, at most an element long, under less
 than 85 degrees, two of them from both sides under less than 180, which makes it an edge of the Delaunay mesh."""
 _HALVINGS = 4
-"""Times that a piece of a crack is halved where another crack or the outline keeps it from being an edge."""
-
+"""Times that a piece of a crack is halved where another crack or the outline keeps it from being an edge: pieces of a
+16th of an element, 1.6 px for 25 px elements, are nearly as fine as a path is followed (`_FINE`)."""
 _SLIVER = 0.04
-"""Twice the area, in squares of an element's side, under which a triangle at the edge is left out."""
+"""Twice the area, in squares of an element's side, under which a triangle at the edge is left out: a regular one has
+.87, and one under .04 has too few pixels (8 for 20 px elements) for its six unknowns to be measured."""
 
 
 def outline_mesh(
@@ -193,12 +205,14 @@ def outline_mesh(
     RegionError
         The region is too small for one element, or a crack misses it.
     """
-    edge, outlines = _outlines(mask, size)
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    polygons = [cv2.approxPolyDP(line, max(1.0, _SMOOTHED * size), True)[:, 0].astype(np.float64) for line in contours]
+    edge, outlines = np.concatenate(contours)[:, 0].astype(np.float64), [line for line in polygons if len(line) >= 3]
     outline = _outline_points(outlines, size)
     padded = np.pad(mask, 1).astype(np.uint8)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     inner = _lattice_points(mask.shape, size, origin)
-    inner = inner[depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > 0.6 * size]
+    inner = inner[depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > _DEEP * size]
     sharp = sharp_corners(outlines)
     paths = crack_paths(cracks, mask, edge, sharp, size)
     if paths:
@@ -219,9 +233,14 @@ def outline_mesh(
 def _triangulated(
     points: FloatArray, paths: list[FloatArray]
 ) -> tuple[FloatArray, npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """Delaunay mesh of the points (N, 2) and of the nodes of the paths: nodes, triangles, and the pieces of the paths
-    as edges (n, 2) of it."""
-    from scipy.spatial import Delaunay, QhullError, cKDTree
+    """Delaunay mesh of points (N, 2) and of the nodes of the paths.
+
+    Returns
+    -------
+    tuple
+        Nodes, triangles, and the pieces of the paths as edges (n, 2) of the mesh.
+    """
+    from scipy.spatial import Delaunay, QhullError
 
     for _ in range(_HALVINGS + 1):
         nodes = np.concatenate([points, *paths])
@@ -253,13 +272,6 @@ def _lattice_points(shape: tuple[int, int], size: float, origin: tuple[int, int]
     return np.concatenate(points) if points else np.empty((0, 2))
 
 
-def _outlines(mask: BoolArray, size: float) -> tuple[FloatArray, list[FloatArray]]:
-    """The pixels (n, 2) at the edge of the region and its holes, and corners (M, 2) of the polygons around them."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    polygons = [cv2.approxPolyDP(contour, max(1.0, 0.06 * size), True)[:, 0].astype(np.float64) for contour in contours]
-    return np.concatenate(contours)[:, 0].astype(np.float64), [corners for corners in polygons if len(corners) >= 3]
-
-
 def _outline_points(outlines: list[FloatArray], size: float) -> FloatArray:
     """Points about `size` px apart along polygons; corners are kept."""
     points = [np.empty((0, 2))]
@@ -272,13 +284,14 @@ def _outline_points(outlines: list[FloatArray], size: float) -> FloatArray:
 
 
 _STEP = 0.5
-"""Distance (px) of the points at which a path is looked at."""
+"""Distance (px) of the points at which a path is looked at: no pixel that it crosses by more than half is missed."""
 _FINE = 1.0
-"""How far (px) the row of nodes may be beside the stated path."""
+"""How far (px) the row of nodes may be beside the stated path: pixels that near its edges are left out."""
 _CRACKS_CROWDED = 0.5
-"""Least distance of nodes along a path, and most by which a branch moves along the path it leaves, in elements."""
+"""Least distance of nodes along a path, and most by which a branch moves along the path it leaves, in elements: the
+nodes of an earlier path are at most an element apart."""
 _AT_EDGE = 0.3
-"""Distance in elements from the region's edge within which a path's end counts as on it."""
+"""Distance in elements from the region's edge within which a path's end counts as on it: that of crowded nodes."""
 _SHARP = np.cos(np.radians(60))
 """Cosine of the turn from which a corner of the outline is not given up for a crack beside it: polygons around round
 holes turn less from a radius of 12 px on."""
@@ -319,7 +332,7 @@ def crack_paths(
 
 
 def _parts_within(corners: FloatArray, mask: BoolArray, size: float, number: int) -> list[FloatArray]:
-    """The parts of a path within the region that are as long as an element, as points `_STEP` px apart."""
+    """Return the parts of a path within the region that are as long as an element, as points `_STEP` px apart."""
     points = _subdivided(corners, _STEP)
     column, row = np.round(points).astype(int).T
     in_image = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
@@ -339,6 +352,7 @@ def _parts_within(corners: FloatArray, mask: BoolArray, size: float, number: int
 
 
 def _path_nodes(part: FloatArray, ends: Sequence[tuple[FloatArray, float]], size: float) -> FloatArray:
+    """Nodes (n, 2) along a part of a path, at most `size` px apart, each end moved as by `_end`."""
     corners = cv2.approxPolyDP(part.astype(np.float32), _FINE, False)[:, 0].astype(np.float64)
     for end in (0, -1):
         corners[end] = _end(corners[end], ends, size)
@@ -350,7 +364,7 @@ def _path_nodes(part: FloatArray, ends: Sequence[tuple[FloatArray, float]], size
 
 
 def _end(end: FloatArray, places: Sequence[tuple[FloatArray, float]], size: float) -> FloatArray:
-    """A path's end: the nearest of the first `places` (points, reach in elements) within reach, or as it is."""
+    """Return the nearest of the first `places` (points, reach in elements) within reach of a path's end, or the end."""
     for points, reach in places:
         distance = np.hypot(*(points - end).T)
         if distance.min(initial=np.inf) <= reach * size:
@@ -369,7 +383,7 @@ def sharp_corners(polygons: Sequence[FloatArray]) -> FloatArray:
 
 
 def _subdivided(corners: FloatArray, longest: float) -> FloatArray:
-    """A path's corners (M, 2) and points between them, at most `longest` px apart."""
+    """Return a path's corners (M, 2) and points between them, at most `longest` px apart."""
     points = [corners[:1]]
     for start, end in pairwise(corners):
         pieces = max(1, int(np.ceil(np.hypot(*(end - start)) / longest - 1e-9)))
@@ -384,7 +398,7 @@ def distance_to(paths: Sequence[FloatArray], points: FloatArray) -> FloatArray:
 
 
 def halved(path: FloatArray, pieces: BoolArray) -> FloatArray:
-    """A path (n, 2) with another node in the middle of the chosen pieces (n - 1,)."""
+    """Return a path (n, 2) with another node in the middle of the chosen pieces (n - 1,)."""
     middles = (path[1:] + path[:-1]) / 2
     return np.insert(path, np.flatnonzero(pieces) + 1, middles[pieces], axis=0)
 
@@ -392,7 +406,7 @@ def halved(path: FloatArray, pieces: BoolArray) -> FloatArray:
 def split_along(
     nodes: FloatArray, elements: npt.NDArray[np.int32], pieces: npt.NDArray[np.int64]
 ) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """The mesh with its edges `pieces` (n, 2) cut: a node gets a copy for each side; unused nodes are left out.
+    """Split a mesh along its edges `pieces` (n, 2): a node gets a copy for each side; unused nodes are left out.
 
     Corners of elements are one node if they meet at a shared edge that is not cut; so both sides share the node at a
     tip, and only that.

@@ -1,7 +1,4 @@
-"""TRI3 mesh: three-node triangles with linear shape functions, over a region of interest.
-
-Sparse matrices of one structure with different entries.
-"""
+"""TRI3 mesh: three-node triangles with linear shape functions, over a region of interest."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ __all__ = ["Tri3Mesh", "with_data"]
 logger = logging.getLogger(__name__)
 
 NARROW = 10
-"""Width (px) under which a region is told to be narrow: speckles are 3 to 5 px wide, and a pixel or two at each border
+"""Width (px) under which a region is reported as narrow: speckles are 3 to 5 px wide, and a pixel or two at each border
 serve the filters only."""
 
 
@@ -51,6 +48,7 @@ class Tri3Mesh:
     size: float = field(init=False)
 
     def __post_init__(self) -> None:
+        """Check nodes and elements, order the corners and derive the areas."""
         nodes = np.array(self.nodes, dtype=np.float64, order="C")
         elements = np.array(self.elements, dtype=np.int32)
         if nodes.ndim != 2 or nodes.shape[1] != 2 or elements.ndim != 2 or elements.shape[1] != 3 or not len(elements):
@@ -59,7 +57,8 @@ class Tri3Mesh:
             )
         if not np.isfinite(nodes).all() or elements.min() < 0 or elements.max() >= len(nodes):
             raise InputError("mesh nodes must be finite and elements must name existing nodes")
-        area = _signed_area(nodes, elements)
+        first, second = _legs(nodes, elements)
+        area = (first[0] * second[1] - first[1] * second[0]) / 2
         if (area == 0).any():
             raise InputError(f"element {int(np.argmin(np.abs(area)))} of the mesh has no area")
         elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
@@ -69,7 +68,7 @@ class Tri3Mesh:
         object.__setattr__(self, "size", float(np.sqrt(2 * np.median(self.areas))))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A copy by pickle is not writable either."""
+        """Pickle nodes and elements only: the arrays of a copy are not writable either."""
         return partial(Tri3Mesh, nodes=self.nodes, elements=self.elements), ()
 
     @classmethod
@@ -77,7 +76,7 @@ class Tri3Mesh:
         """Mesh a region with triangles whose legs are about `element_size` px.
 
         A rectangle gets a regular mesh; other regions, and those with cracks, a Delaunay mesh that follows their
-        outline, holes and cracks. The log tells of a region that is narrow or smaller than an element.
+        outline, holes and cracks. The log warns of a region that is narrow or smaller than an element.
 
         Parameters
         ----------
@@ -89,6 +88,11 @@ class Tri3Mesh:
             Paths, each of corners (x, y) in px, shape (M, 2), along which the mesh is split: elements on both sides
             share the node at a tip within the region, and no other. A path may begin beyond the region; one that ends
             within 0.3 elements of its edge ends on it, one within half an element of an earlier path branches off it.
+
+        Returns
+        -------
+        Tri3Mesh
+            With nodes (N, 2) in px.
 
         Raises
         ------
@@ -120,8 +124,10 @@ class Tri3Mesh:
 
     @property
     def places(self) -> FloatArray:
-        """Where the images show what moves with each node, shape (N, 2): at the node, and for one on a side of a crack
-        in the middle of the elements around it."""
+        """Positions (N, 2) at which the images show what moves with each node.
+
+        They are the nodes; for a node on a side of a crack, the middle of the elements around it.
+        """
         moments = (self.nodes[self.elements].mean(axis=1) * self.areas[:, None]).T
         middle = np.stack([self.to_nodes(part) for part in moments], axis=1) / self.to_nodes(self.areas)[:, None]
         places, split = self.nodes.copy(), self.copies.ravel()
@@ -212,13 +218,8 @@ class Tri3Mesh:
         return self._edges()[0]
 
 
-def _signed_area(nodes: FloatArray, elements: npt.NDArray[np.int32]) -> FloatArray:
-    a, b = _legs(nodes, elements)
-    return np.asarray((a[0] * b[1] - a[1] * b[0]) / 2)
-
-
 def _legs(values: FloatArray, elements: npt.NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
-    """What nodal values (N, C) differ by from the first to the second and third corner of each element, (C, E)."""
+    """Return the differences (C, E) of nodal values (N, C) from the first corner of elements to the others."""
     own = values.T[:, elements]
     return own[..., 1] - own[..., 0], own[..., 2] - own[..., 0]
 
@@ -247,7 +248,7 @@ Matrix = TypeVar("Matrix", sp.csr_matrix, sp.csc_matrix)
 
 
 def with_data(structure: Matrix, data: FloatArray) -> Matrix:
-    """A matrix with the structure of another, shared with it and not looked through again, and its own `data`."""
+    """Return a matrix with the structure of another, shared with it and not checked again, and its own `data`."""
     matrix = copy(structure)
     matrix.data = data
     return matrix

@@ -114,9 +114,9 @@ def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
     inner = equations.textured & ~mesh.beside(~equations.textured)
     assert 0 < inner.sum() < equations.textured.sum() < len(mesh.nodes)
     used = equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(mesh, used, equations.information(reference), reference.linear_offset)
+    recovery = Recovery.over(mesh, used, equations.information(reference), reference.geometry.linear_offset)
     strain, hessian = recovery.strain_functionals, reference.assembly.matrix(equations.blocks)
-    probed = functional_std(equations.solve, hessian, reference.colouring, [(one, inner) for one in strain])
+    probed = functional_std(equations.solve, hessian, reference.geometry.colouring, [(one, inner) for one in strain])
     for number, functional in enumerate(strain):
         whole = np.zeros((len(mesh.nodes), len(mesh.nodes), 2))
         for axis, matrix in enumerate(functional):
