@@ -147,8 +147,11 @@ def finish(
 
 
 def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
-    """Draw a finished result, in as many processes as cores if none are asked for, and tell what became of its frames;
-    a failure where more than `_TOO_MANY` of them failed or did not converge."""
+    """Draw a finished result and print how its frames ended.
+
+    The drawing takes as many processes as cores if none are asked for; the command fails where more than `_TOO_MANY`
+    of the frames failed or did not converge.
+    """
     from rgbmidic._kernels.threads import threads
     from rgbmidic.report import remove_figures, remove_report, write_figures
 

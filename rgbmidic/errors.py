@@ -20,7 +20,7 @@ __all__ = [
 
 
 def legible(name: str | os.PathLike[str]) -> str:
-    """A file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\\xff``."""
+    r"""A file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\xff``."""
     return os.fspath(name).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 

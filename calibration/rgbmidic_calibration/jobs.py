@@ -214,8 +214,10 @@ def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
 
 
 def _camera(files: CaptureFiles, uneven: Sequence[float]) -> dict[str, Any]:
-    """Camera settings of a calibration, from the first of its frames, and how even the grey levels of lit ones are;
-    levels that nobody stated or tells stay open."""
+    """Camera settings of a calibration, from the first of its frames, and how even the grey levels of lit ones are.
+
+    Levels that neither the file nor the user states stay open.
+    """
     told, frame = files.series.lights[0][0].told(0), next(files.frames())
     levels = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
     said = {name for name in levels for source in (told, files.stated) if getattr(source, name) is not None}

@@ -164,7 +164,7 @@ def _cluster_sums(values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variation:
-    """Does a column vary over the field by certain terms?
+    """Result of `variation`: whether a column varies over the field by certain terms.
 
     Attributes
     ----------
