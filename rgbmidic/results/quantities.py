@@ -98,10 +98,10 @@ _RESIDUAL = (
     "weighted rms of `f - g(x + u)`, in the unit of the images that are correlated: none if these are divided by their "
     "local mean (the default), else DN"
 )
-_WEIGHT = "mean share of each light in the weights; adds up to the part of the region that any light sees"
+_WEIGHT = "mean fraction of each light in the weights; adds up to the part of the region that any light sees"
 _BRIGHTNESS = (
     "gain and offset (DN) of each light against the reference, from the speckle's contrast and mean, medians over the "
-    "elements; told, not used"
+    "elements; reported, not used"
 )
 _MATCH = (
     "median correlation coefficient of the elements with their reference, of the light that matches best; NaN unless "
@@ -118,7 +118,7 @@ _RIGID = (
 )
 _UNREAD = "1 where the frame failed because it could not be read, which `--resume` tries again, else 0"
 _TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
-_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not tell it"
+_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not give it"
 _SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
@@ -162,7 +162,7 @@ _TABLE = (
         ("node", "light"),
         "",
         "light_fraction",
-        "share of each light in what determines a node",
+        "fraction of each light in the information that determines a node",
         blank=0,
     ),
     Quantity("residual", _LIGHT, "", "residual", _RESIDUAL),
