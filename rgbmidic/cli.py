@@ -19,7 +19,6 @@ from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
     from rgbmidic.results import Result
-    from rgbmidic.settings import ProbeSettings
 
 __all__ = ["app", "main"]
 
@@ -35,12 +34,6 @@ _messages = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
-Kind = Annotated[str | None, typer.Option("--kind", help="bayer, rgb or monochrome.")]
-Cfa = Annotated[str | None, typer.Option("--cfa", help="Bayer pattern, such as RGGB.")]
-BlackLevel = Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample.")]
-WhiteLevel = Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level.")]
-Shape = Annotated[str, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")]
-Dtype = Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")]
 Told = Annotated[
     Path | None,
     typer.Option("--test", help="TEST.toml whose [scale], [setup] and [probes] count instead of those kept."),
@@ -48,25 +41,27 @@ Told = Annotated[
 Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")]
 
 _PLACES = {
-    "points": ("--point", "X,Y"),
-    "lines": ("--line", "X0,Y0:X1,Y1"),
-    "circles": ("--circle", "X,Y:R"),
-    "regions": ("--region", "X0,Y0:X1,Y1"),
-    "gauges": ("--gauge", "X0,Y0:X1,Y1"),
-    "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1"),
-    "strain_gauges": ("--strain-gauge", "X,Y:LENGTH"),
+    "points": ("--point", "X,Y", "Displacement there."),
+    "lines": ("--line", "X0,Y0:X1,Y1", "Mean displacement along it."),
+    "circles": ("--circle", "X,Y:R", "Mean displacement over it."),
+    "regions": ("--region", "X0,Y0:X1,Y1", "Mean displacement over it."),
+    "gauges": ("--gauge", "X0,Y0:X1,Y1", "Between two points that move."),
+    "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1", "Along the line as it was."),
+    "strain_gauges": ("--strain-gauge", "X,Y:LENGTH", "Virtual strain gauge."),
 }
-"""Keys of ``[probes]`` with the option and the form of a place."""
-_Texts = list[str] | None
-Points = Annotated[_Texts, typer.Option("--point", metavar="X,Y", help="Displacement there.")]
-Lines = Annotated[_Texts, typer.Option("--line", metavar="X0,Y0:X1,Y1", help="Mean displacement along it.")]
-Circles = Annotated[_Texts, typer.Option("--circle", metavar="X,Y:R", help="Mean displacement over it.")]
-Regions = Annotated[_Texts, typer.Option("--region", metavar="X0,Y0:X1,Y1", help="Mean displacement over it.")]
-Gauges = Annotated[_Texts, typer.Option("--gauge", metavar="X0,Y0:X1,Y1", help="Between two points that move.")]
-StraightGauges = Annotated[
-    _Texts, typer.Option("--straight-gauge", metavar="X0,Y0:X1,Y1", help="Along the line as it was.")
-]
-StrainGauges = Annotated[_Texts, typer.Option("--strain-gauge", metavar="X,Y:LENGTH", help="Virtual strain gauge.")]
+"""Keys of ``[probes]`` with the option, the form of a place and the help."""
+_PLACE_OPTIONS: dict[str, Any] = {
+    key: Annotated[list[str] | None, typer.Option(option, metavar=form, help=text)]
+    for key, (option, form, text) in _PLACES.items()
+}
+
+
+def _read_places(options: dict[str, list[str] | None]) -> dict[str, tuple[tuple[float, ...], ...]]:
+    """The places of every kind of probe that the options state."""
+    return {
+        key: tuple(command.read_place(text, option, form) for text in options[key] or ())
+        for key, (option, form, _) in _PLACES.items()
+    }
 
 
 def main() -> None:
@@ -272,16 +267,11 @@ def view(
 
 
 @app.command()
+@command.gather("places", _PLACE_OPTIONS, _read_places)
 def history(
     folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
-    points: Points = None,
-    lines: Lines = None,
-    circles: Circles = None,
-    regions: Regions = None,
-    gauges: Gauges = None,
-    straight_gauges: StraightGauges = None,
-    strain_gauges: StrainGauges = None,
+    places: dict[str, Any],
     measure: Annotated[
         str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")
     ] = None,
@@ -312,11 +302,12 @@ def history(
         check_file(file, overwrite=overwrite)
     result = Result.open(folder, partial=partial)
     settings = None if test is None else read_test(test)
-    given = (points, lines, circles, regions, gauges, straight_gauges, strain_gauges)
-    stated = probes_of(result) if settings is None else settings.probes
+    probes = probes_of(result) if settings is None else settings.probes
+    changes = {key: (*getattr(probes, key), *more) for key, more in places.items()}
+    changes |= {"measure": measure, "window": window, "rigid_motion": rigid}
     histories = read_histories(
         result,
-        _with_probes(stated, given, measure=measure, window=window, rigid_motion=rigid),
+        replace(probes, **{key: value for key, value in changes.items() if value is not None}),
         scale=None if settings is None else settings.scale,
         channels=None if channels is None else Channels.read(channels),
         offset=offset,
@@ -329,13 +320,6 @@ def history(
         _messages.print(f"note: {remark}", soft_wrap=True, markup=False, highlight=False)
     _print_table(f"{len(histories.frames)} frames", *history_rows(histories))
     print(f"table: {out}   picture: {picture}")
-
-
-def _with_probes(stated: ProbeSettings, given: Sequence[list[str] | None], **changes: Any) -> ProbeSettings:
-    """The probes of the settings and, after them, those of the command line, in the order of `_PLACES`."""
-    for (key, (option, form)), texts in zip(_PLACES.items(), given, strict=True):
-        changes[key] = (*getattr(stated, key), *(command.read_place(text, option, form) for text in texts or ()))
-    return replace(stated, **{key: value for key, value in changes.items() if value is not None})
 
 
 @app.command()
@@ -440,26 +424,21 @@ def plan(
 
 
 @app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def frames(
     path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")],
+    statement: dict[str, Any],
     json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
     save: Annotated[
         tuple[int, Path] | None, typer.Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
     ] = None,
-    kind: Kind = None,
-    cfa: Cfa = None,
-    black_level: BlackLevel = None,
-    white_level: WhiteLevel = None,
-    shape: Shape = "",
-    dtype: Dtype = None,
     overwrite: Overwrite = False,
 ) -> None:
     """What a reader sees of raw frames: how many, of what size and levels, when they were taken, how many are lost."""
     from rgbmidic.frames.describe import describe, save_frame
     from rgbmidic.settings import FrameSettings
 
-    stated = _stated(kind, cfa, black_level, white_level, shape, dtype)
-    settings = FrameSettings(path=(path,), **{key: value for key, value in stated.items() if value is not None})
+    settings = FrameSettings(path=(path,), **statement)
     description = describe(settings)
     if save is not None:
         save_frame(settings, *save, overwrite=overwrite)
@@ -469,16 +448,12 @@ def frames(
 
 
 @app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def inspect(
     frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; one per light in succession.")],
+    statement: dict[str, Any],
     test: Annotated[Path | None, typer.Option("--test", help="TEST.toml the frame is meant for.")] = None,
     calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
-    kind: Kind = None,
-    cfa: Cfa = None,
-    black_level: BlackLevel = None,
-    white_level: WhiteLevel = None,
-    shape: Shape = "",
-    dtype: Dtype = None,
     region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or the frame.")] = "",
     element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's or 25.")] = None,
     accept: Annotated[
@@ -496,13 +471,12 @@ def inspect(
         check_folder(out, report.FILES, overwrite=overwrite)
     settings = None if test is None else read_test(test)
     _tell_first_run()
-    stated = _stated(kind, cfa, black_level, white_level, shape, dtype)
     with _progress("inspecting") as progress:
         inspection = inspect_files(
             frames,
             test=settings,
             calibration=calibration,
-            frame=state_frames(settings, count=len(frames), **stated),
+            frame=state_frames(settings, count=len(frames), **statement),
             region=_numbers(region, "--region") if region else None,
             element_size=element_size,
             accept=tuple(accept) if accept else None,
@@ -521,19 +495,6 @@ def inspect(
         print(f"warning: {finding.text}")
     if out is not None:
         print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")
-
-
-def _stated(
-    kind: str | None,
-    cfa: str | None,
-    black_level: float | None,
-    white_level: float | None,
-    shape: str,
-    dtype: str | None,
-) -> dict[str, Any]:
-    """What the options state of frames, as `FrameSettings` names it."""
-    levels = {"black_level": black_level, "white_level": white_level}
-    return {"kind": kind, "cfa": cfa, **levels, "dtype": dtype, "shape": command.read_shape(shape)}
 
 
 def _print_table(

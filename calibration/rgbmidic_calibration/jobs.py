@@ -8,11 +8,10 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from rgbmidic.command import read_shape
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
@@ -28,54 +27,31 @@ __all__ = [
     "calibrate_crosstalk",
     "calibrate_noise",
     "calibrate_registration",
+    "captures_as_stated",
     "field_order",
     "find_groups",
     "merge_files",
     "rectangle",
-    "statement",
 ]
 
-KINDS = ("bayer", "rgb", "monochrome")
 LIT = 0.1
 """Mean above black, relative to the full scale, of a plane whose histogram is looked at: in the dark, noise is too
 little to smooth it. Some cameras apply gains of their own to red and blue, so all planes are."""
-DTYPES = ("uint8", "uint16", ">u2")
 
 
-def statement(
-    kind: str | None,
-    cfa: str | None,
-    black_level: float | None,
-    white_level: float | None,
-    shape: str | None = None,
-    dtype: str | None = None,
-) -> FrameSettings:
-    """What the options say about the files.
+def captures_as_stated(statement: Mapping[str, Any]) -> FrameSettings:
+    """Settings of the captures as options state them (`rgbmidic.command.read_statement`).
 
     Raises
     ------
     ConfigurationError
-        An option has a value that is not allowed.
+        An option has a value that is not allowed; the option is named.
     """
-    for option, value, allowed in (("--kind", kind, KINDS), ("--dtype", dtype, DTYPES)):
-        if value is not None and value not in allowed:
-            raise ConfigurationError(f"{option} is one of {', '.join(allowed)}, not {value!r}")
     try:
-        return FrameSettings(
-            path=("captures",),
-            kind=cast(Any, kind),
-            cfa=cfa,
-            black_level=black_level,
-            white_level=white_level,
-            shape=read_shape(shape),
-            dtype=cast(Any, dtype),
-        )
+        return FrameSettings(path=("captures",), **statement)
     except ConfigurationError as error:
-        raise ConfigurationError(re.sub(r"frames\.(\w+)", _as_option, str(error))) from None
-
-
-def _as_option(key: re.Match[str]) -> str:
-    return "--" + key[1].replace("_", "-")
+        as_options = re.sub(r"frames\.(\w+)", lambda key: "--" + key[1].replace("_", "-"), str(error))
+        raise ConfigurationError(as_options) from None
 
 
 def field_order(text: str) -> int | None:

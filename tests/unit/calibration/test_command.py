@@ -101,7 +101,7 @@ def test_an_existing_file_is_kept_unless_told_otherwise(run, tmp_path):
         (["--light", "red=light_red/*.tif", "--light", "red=light_blue/*.tif"], "--light red is given twice"),
         (["--light", "red=nothing/*.tif"], "light red: no frames: no file matches: nothing/*.tif"),
         (["--light", "red=light_red/*.tif", "--cfa", "RGBG"], "--cfa must be one of RGGB"),
-        (["--light", "red=light_red/*.tif", "--kind", "colour"], "--kind is one of"),
+        (["--light", "red=light_red/*.tif", "--kind", "colour"], "--kind must be one of"),
         (["--light", "red=light_red/*.tif", "--shape", "big"], "--shape is ROWSxCOLUMNS"),
         (["--light", "red=light_green/*.tif", *STATED], "seen best by the green channel"),
     ],
