@@ -34,7 +34,7 @@ _messages = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
-Told = Annotated[
+Reading = Annotated[
     Path | None,
     typer.Option("--test", help="TEST.toml whose [scale], [setup] and [probes] count instead of those kept."),
 ]
@@ -96,7 +96,7 @@ def run(
     ] = "",
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
-    timings: Annotated[bool, typer.Option("--timings", help="Keep and tell the time of each stage.")] = False,
+    timings: Annotated[bool, typer.Option("--timings", help="Keep and print the time of each stage.")] = False,
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
@@ -108,8 +108,8 @@ def run(
     chosen = read_range(frames, "--frames") if frames else None
     if overwrite and (resume or frames):
         raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
-    _tell_first_run()
-    with _progress("measuring") as progress, _telling_how_to_go_on(test, out, frames, resume=resume):
+    _explain_first_run()
+    with _progress("measuring") as progress, _continuation_hint(test, out, frames, resume=resume):
         result = measure(
             settings,
             out,
@@ -164,21 +164,20 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
         raise typer.Exit(command.fail(f"{count}; {first}", command.FAILURE))
 
 
-def _interrupt(*_: object) -> None:
-    """As Ctrl-C does, which a command in the background of a script ignores."""
-    raise KeyboardInterrupt
-
-
 @contextmanager
-def _telling_how_to_go_on(test: Path, out: Path, frames: str, *, resume: bool) -> Iterator[None]:
-    """An interruption, by Ctrl-C or by whoever runs the machine, says how to go on, if there is something."""
+def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> Iterator[None]:
+    """Print how to go on when the run is interrupted, by Ctrl-C or by SIGTERM, if anything was begun."""
     from rgbmidic.results.provenance import PROVENANCE
 
     def begun() -> bytes:
         return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""
 
+    def interrupt(*_: object) -> None:
+        """Act as Ctrl-C, which a command in the background of a script ignores."""
+        raise KeyboardInterrupt
+
     before_it = begun()
-    before = signal.signal(signal.SIGTERM, _interrupt)
+    before = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     except KeyboardInterrupt:
@@ -217,7 +216,7 @@ def export(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="File to write.")],
     to: Annotated[str, typer.Option("--to", help="Format: npz, csv or hdf5.")] = "npz",
-    test: Told = None,
+    test: Reading = None,
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
@@ -233,7 +232,7 @@ def export(
 def report(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path | None, typer.Option("--out", help="HTML file; by default RESULT/report.html.")] = None,
-    test: Told = None,
+    test: Reading = None,
     frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10, of which maps are shown.")] = "",
     overwrite: Overwrite = False,
     partial: Partial = False,
@@ -303,7 +302,7 @@ def history(
     result = Result.open(folder, partial=partial)
     settings = None if test is None else read_test(test)
     probes = probes_of(result) if settings is None else settings.probes
-    changes = {key: (*getattr(probes, key), *more) for key, more in places.items()}
+    changes: dict[str, Any] = {key: (*getattr(probes, key), *more) for key, more in places.items()}
     changes |= {"measure": measure, "window": window, "rigid_motion": rigid}
     histories = read_histories(
         result,
@@ -349,7 +348,7 @@ def demo(
     _messages.print(
         f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}", soft_wrap=True
     )
-    _tell_first_run()
+    _explain_first_run()
     from rgbmidic._kernels.threads import threads
     from rgbmidic.lab.demo import run_demo
     from rgbmidic.report import write_figures
@@ -389,7 +388,7 @@ def virtual(
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.lab.virtual.dataset import write_dataset
 
-    _tell_first_run()
+    _explain_first_run()
     with _progress("rendering") as progress:
         write_dataset(scene, out, progress)
 
@@ -400,7 +399,7 @@ def plan(
     out: Out,
     overwrite: Overwrite = False,
 ) -> None:
-    """Where each lamp will reflect, what uncertainty to expect, and where the lamps would stand better."""
+    """Predict where each lamp reflects, the uncertainty to expect, and better places for the lamps."""
     from rgbmidic.lab.demo import check_folder
     from rgbmidic.lab.planning import report as planning
     from rgbmidic.lab.planning.lamps import propose_colours, propose_lamps
@@ -411,7 +410,7 @@ def plan(
     made = make_plan(read_scene(scene))
     proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
     planning.write_plan(made, proposals, out, overwrite=overwrite)
-    title = "share of the field where lights reflect, all of them do, and only one or none is clean"
+    title = "fraction of the field where lights reflect, all of them do, and only one or none is clean"
     _print_table(title, *planning.zone_rows(made), planning.ZONE_WORDS)
     uncertainty = "standard uncertainty to expect over the field, px"
     _print_table(uncertainty, *planning.uncertainty_rows(made), planning.UNCERTAINTY_WORDS)
@@ -434,7 +433,7 @@ def frames(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """What a reader sees of raw frames: how many, of what size and levels, when they were taken, how many are lost."""
+    """List what a reader finds in raw frames: number, size, levels, times, missing frames."""
     from rgbmidic.frames.describe import describe, save_frame
     from rgbmidic.settings import FrameSettings
 
@@ -462,7 +461,7 @@ def inspect(
     out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
+    """Inspect one frame before a test: lights, reflections, speckle, noise, uncertainty to expect."""
     from rgbmidic.lab.demo import check_folder
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
     from rgbmidic.settings import read_test
@@ -470,14 +469,14 @@ def inspect(
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
     settings = None if test is None else read_test(test)
-    _tell_first_run()
+    _explain_first_run()
     with _progress("inspecting") as progress:
         inspection = inspect_files(
             frames,
             test=settings,
             calibration=calibration,
             frame=state_frames(settings, count=len(frames), **statement),
-            region=_numbers(region, "--region") if region else None,
+            region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
             element_size=element_size,
             accept=tuple(accept) if accept else None,
             progress=progress,
@@ -486,7 +485,7 @@ def inspect(
         report.write_inspection(inspection, out, overwrite=overwrite)
     rows, columns = inspection.frame_shape
     print(f"{inspection.name}: {inspection.kind}, {columns} x {rows} px\n")
-    _print_table("samples in the region, shares of the full scale", *report.channel_rows(inspection))
+    _print_table("samples in the region, fractions of the full scale", *report.channel_rows(inspection))
     _print_table("lights", *report.light_rows(inspection))
     known = "" if inspection.noise_known else " (noise estimated, not calibrated)"
     size = f"elements of {inspection.element_size:g} px"
@@ -514,13 +513,6 @@ def _print_table(
     print()
 
 
-def _numbers(text: str, option: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"{option} are numbers with commas between them, such as 0.333,8; not {text!r}") from None
-
-
 def _whole_numbers(text: str, option: str) -> list[int]:
     try:
         return [int(part) for part in text.split(",")]
@@ -528,8 +520,8 @@ def _whole_numbers(text: str, option: str) -> list[int]:
         raise InputError(f"{option} are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
 
 
-def _tell_first_run() -> None:
-    """Say why the first use takes longer."""
+def _explain_first_run() -> None:
+    """Print why the first use takes longer."""
     from rgbmidic._kernels import are_compiled
 
     if not are_compiled():
@@ -548,7 +540,7 @@ def _progress(what: str) -> AbstractContextManager[Callable[[int, int, str], Non
 
 
 def _print_summary(result: Result, seconds: float) -> None:
-    """What became of the deformed frames; the reference, matched with itself, says nothing."""
+    """Print how the deformed frames ended; the reference, matched with itself, is left out."""
     deformed = list(result.deformed)
     ends = [int((result.status[deformed] == code).sum()) for code in (_CONVERGED, _UNCONVERGED, _FAILED)]
     words = [f"{ends[0]} converged", *([f"{ends[1]} not converged"] if ends[1] else []), f"{ends[2]} failed"]
@@ -559,8 +551,8 @@ def _print_summary(result: Result, seconds: float) -> None:
     if (count := len(result.setting("frames", "reference", [0]))) > 1:
         gain = ((1 + 1 / count) / 2) ** 0.5
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
-    for light, share in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
-        known = share[share == share]
+    for light, fraction in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
+        known = fraction[fraction == fraction]
         rows[light] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
     if measured and (stages := _stages(result, deformed)):
         rows["frame"] = stages
@@ -576,8 +568,8 @@ def _stages(result: Result, frames: Sequence[int]) -> str:
     if not known:
         return ""
     mean = sum(known) / len(known)
-    shares = ", ".join(f"{name} {share:.0%}" for name, share in zip(STAGES, mean / mean.sum(), strict=True))
-    return f"{mean.sum():.2f} s: {shares}"
+    parts = ", ".join(f"{name} {part:.0%}" for name, part in zip(STAGES, mean / mean.sum(), strict=True))
+    return f"{mean.sum():.2f} s: {parts}"
 
 
 if __name__ == "__main__":

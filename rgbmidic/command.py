@@ -168,7 +168,13 @@ def read_place(text: str, option: str, form: str) -> tuple[float, ...]:
     return tuple(number for group in numbers for number in group)
 
 
-_EXAMPLES = {"X,Y": "120,85.5", "X0,Y0:X1,Y1": "40,60:200,60", "X,Y:R": "120,85:30", "X,Y:LENGTH": "120,85:75"}
+_EXAMPLES = {
+    "X,Y": "120,85.5",
+    "X0,Y0:X1,Y1": "40,60:200,60",
+    "X,Y:R": "120,85:30",
+    "X,Y:LENGTH": "120,85:75",
+    "X0,Y0,X1,Y1": "40,60,200,160",
+}
 
 
 def read_statement(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def registration(
         named_patterns(light, "--light"),
         dark,
         jobs.captures_as_stated(statement),
-        region=jobs.rectangle(region),
+        region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
         element_size=element_size,
     )
     calibration.write(out)
@@ -151,7 +151,7 @@ def check(
         named_patterns(together or (), "--together"),
         jobs.captures_as_stated(statement),
         limits=read_limits(limit or ()),
-        region=jobs.rectangle(region),
+        region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
     )
     display.verdict(verdict)
     if not verdict.passed:

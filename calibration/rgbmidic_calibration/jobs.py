@@ -31,7 +31,6 @@ __all__ = [
     "field_order",
     "find_groups",
     "merge_files",
-    "rectangle",
 ]
 
 LIT = 0.1
@@ -157,17 +156,6 @@ def calibrate_registration(
         provenance={"registration": provenance("registration", groups, details)},
         **_camera(groups[0], [value for files in found.values() for value in _unevenness(next(files.frames()))]),
     ), estimate
-
-
-def rectangle(text: str | None) -> tuple[float, float, float, float] | None:
-    """Rectangle that ``--region`` states as x0,y0,x1,y1 in px."""
-    if text is None:
-        return None
-    try:
-        x0, y0, x1, y1 = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ConfigurationError(f"--region is x0,y0,x1,y1 in px, not {text!r}") from None
-    return x0, y0, x1, y1
 
 
 def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float | None]]:

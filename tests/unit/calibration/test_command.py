@@ -160,7 +160,7 @@ def test_registration_of_speckled_captures(run, tmp_path):
     assert np.abs(found.parameters[:, :2]).max() < 0.05  # the bench's captures are registered
     code, _, error = run("registration", *LIGHTS, *STATED, "--out", out + "2", "--region", "here")
     assert code == 2
-    assert "--region is x0,y0,x1,y1" in error
+    assert "--region is X0,Y0,X1,Y1 in px" in error
 
 
 def test_check_passes_on_held_back_captures_and_fails_on_a_wrong_matrix(run, bench, tmp_path):
