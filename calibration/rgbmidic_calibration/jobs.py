@@ -1,6 +1,6 @@
-"""From capture files to sections of a calibration: what the sub-commands do, without the printing.
+"""Sections of a calibration from capture files, and several calibration files merged into one.
 
-Several calibration files into one: noise, crosstalk and registration are often measured on different days.
+Noise, crosstalk and registration are often measured on different days, hence the merging.
 """
 
 from __future__ import annotations
@@ -63,24 +63,24 @@ def field_order(text: str) -> int | None:
 
 
 def find_groups(
-    lights: Mapping[str, str], dark: str | None, told: FrameSettings
+    lights: Mapping[str, str], dark: str | None, stated: FrameSettings
 ) -> tuple[dict[str, CaptureFiles], CaptureFiles | None]:
     """Files of every light and of the dark frames."""
-    found = {name: CaptureFiles.find(f"light {name}", pattern, told) for name, pattern in lights.items()}
-    return found, None if dark is None else CaptureFiles.find("dark", dark, told)
+    found = {name: CaptureFiles.find(f"light {name}", pattern, stated) for name, pattern in lights.items()}
+    return found, None if dark is None else CaptureFiles.find("dark", dark, stated)
 
 
 def calibrate_crosstalk(
     lights: Mapping[str, str],
     dark: str | None,
-    told: FrameSettings,
+    stated: FrameSettings,
     *,
     block: int = 16,
     order: int | None = None,
     allow: Sequence[str] = (),
 ) -> tuple[Calibration, CrosstalkEstimate]:
     """Crosstalk section from capture files: patterns by light, pattern of the dark frames, what is stated of them."""
-    found, dark_files = find_groups(lights, dark, told)
+    found, dark_files = find_groups(lights, dark, stated)
     uneven: list[float] = []
     means = {name: _reduce(files, block, uneven) for name, files in found.items()}
     dark_means = _reduce(dark_files, block, uneven) if dark_files else []
@@ -103,7 +103,7 @@ def calibrate_crosstalk(
     return calibration, estimate
 
 
-def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
+def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
     """Noise section from capture files.
 
     Parameters
@@ -113,11 +113,11 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
     flats
         Patterns of the flat frames. A pattern ``TIME=FILES`` is one exposure with its time; else the files of every
         folder are one exposure.
-    told
+    stated
         What is stated of the files.
     """
-    dark_files = CaptureFiles.find("dark", dark, told)
-    groups = [group for text in flats for group in _exposures(text, told)]
+    dark_files = CaptureFiles.find("dark", dark, stated)
+    groups = [group for text in flats for group in _exposures(text, stated)]
     dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames")
     stacks = [stack_frames(files.frames(), exposure=time, name=files.role) for files, time in groups]
     estimate = photon_transfer(dark_stack, stacks)
@@ -134,13 +134,13 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
 def calibrate_registration(
     lights: Mapping[str, str],
     dark: str | None,
-    told: FrameSettings,
+    stated: FrameSettings,
     *,
     region: Sequence[float] | None = None,
     element_size: float = ELEMENT,
 ) -> tuple[Calibration, RegistrationEstimate]:
     """Registration section from capture files of a speckled target: patterns by light, the first is the reference."""
-    found, dark_files = find_groups(lights, dark, told)
+    found, dark_files = find_groups(lights, dark, stated)
     dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames") if dark_files else None
     stacks = {name: stack_frames(files.frames(), name=files.role) for name, files in found.items()}
     estimate = estimate_registration(stacks, dark_stack, region=region, element_size=element_size)
@@ -158,18 +158,18 @@ def calibrate_registration(
     ), estimate
 
 
-def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float | None]]:
+def _exposures(text: str, stated: FrameSettings) -> list[tuple[CaptureFiles, float | None]]:
     time, separator, pattern = text.partition("=")
     if separator:
         try:
-            return [(CaptureFiles.find(f"flat exposure {time}", pattern, told), float(time))]
+            return [(CaptureFiles.find(f"flat exposure {time}", pattern, stated), float(time))]
         except ValueError:
             raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
-    return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, told).by_folder()]
+    return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, stated).by_folder()]
 
 
 def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
-    """Of the histogram of every lit plane, where it can be told."""
+    """Unevenness of the histogram of every lit plane, where it can be determined."""
     found = []
     for plane, black in zip(*planes_of(capture)[1:], strict=True):
         if plane.mean() > black + LIT * (capture.white_level - black):
@@ -182,15 +182,15 @@ def _camera(files: CaptureFiles, uneven: Sequence[float]) -> dict[str, Any]:
 
     Levels that neither the file nor the user states stay open.
     """
-    told, frame = files.series.lights[0][0].told(0), next(files.frames())
+    header, frame = files.series.lights[0][0].told(0), next(files.frames())
     levels = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
-    said = {name for name in levels for source in (told, files.stated) if getattr(source, name) is not None}
+    stated = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
     kind = "bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome"
     return {
         "kind": kind,
         "unevenness": max(uneven, default=None),
         "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
-        **{name: level for name, level in levels.items() if name in said},
+        **{name: level for name, level in levels.items() if name in stated},
         "shape": (frame.values.shape[-2], frame.values.shape[-1]),
     }
 

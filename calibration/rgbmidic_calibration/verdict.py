@@ -1,4 +1,4 @@
-"""The sub-command `check`: a calibration file and captures that did not make it, in; a verdict with its limits, out."""
+"""The sub-command `check`: the verdict on a calibration file, from captures that were not used to make it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def check_calibration(
     lights: Mapping[str, str],
     dark: str | None,
     together: Mapping[str, str],
-    told: FrameSettings,
+    stated: FrameSettings,
     *,
     limits: Limits | None = None,
     region: Sequence[float] | None = None,
@@ -74,9 +74,9 @@ def check_calibration(
         Pattern of the dark frames.
     together
         Patterns of captures with several lights on, by the lights' names joined by ``+``.
-    told
+    stated
         What is stated of the files; it, the files and the calibration must agree, and the calibration fills in what
-        neither tells.
+        neither states.
     limits
         What may be left.
     region
@@ -84,7 +84,7 @@ def check_calibration(
     """
     limits = limits or Limits()
     calibration = Calibration.read(path)
-    files = _find(lights, dark, together, told, calibration)
+    files = _find(lights, dark, together, stated, calibration)
     calibration = calibration.cropped(None, next(iter(files.lights.values())).series.shape)
     warnings, skipped = _reused(calibration, files), []
     dark_stack = stack_frames(files.dark.frames(), drifts=False, name="the dark frames") if files.dark else None
@@ -131,11 +131,11 @@ def _find(
     lights: Mapping[str, str],
     dark: str | None,
     together: Mapping[str, str],
-    told: FrameSettings,
+    stated: FrameSettings,
     calibration: Calibration,
 ) -> _Captures:
     def find(role: str, pattern: str) -> CaptureFiles:
-        return CaptureFiles.find(role, pattern, told, calibration)
+        return CaptureFiles.find(role, pattern, stated, calibration)
 
     if not lights:
         raise ConfigurationError("check needs captures with one light on: --light NAME=FILES")
