@@ -50,18 +50,25 @@ _PLACES = {
     "strain_gauges": ("--strain-gauge", "X,Y:LENGTH", "Virtual strain gauge."),
 }
 """Keys of ``[probes]`` with the option, the form of a place and the help."""
-_PLACE_OPTIONS: dict[str, Any] = {
+_PROBE_OPTIONS: dict[str, Any] = {
     key: Annotated[list[str] | None, typer.Option(option, metavar=form, help=text)]
     for key, (option, form, text) in _PLACES.items()
+} | {
+    "measure": Annotated[str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")],
+    "window": Annotated[
+        int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more; 0: no rates.")
+    ],
+    "rigid_motion": Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")],
 }
 
 
-def _read_places(options: dict[str, list[str] | None]) -> dict[str, tuple[tuple[float, ...], ...]]:
-    """The places of every kind of probe that the options state."""
-    return {
+def _read_probes(options: dict[str, Any]) -> dict[str, Any]:
+    """The keys of ``[probes]`` that the options state, the places as numbers."""
+    places = {
         key: tuple(command.read_place(text, option, form) for text in options[key] or ())
         for key, (option, form, _) in _PLACES.items()
     }
+    return {key: value for key, value in {**options, **places}.items() if value is not None}
 
 
 def main() -> None:
@@ -266,18 +273,11 @@ def view(
 
 
 @app.command()
-@command.gather("places", _PLACE_OPTIONS, _read_places)
+@command.gather("probes", _PROBE_OPTIONS, _read_probes)
 def history(
     folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
-    places: dict[str, Any],
-    measure: Annotated[
-        str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")
-    ] = None,
-    window: Annotated[
-        int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more; 0: no rates.")
-    ] = None,
-    rigid: Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")] = None,
+    probes: dict[str, Any],
     channels: Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then a column each.")] = None,
     offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
     area: Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")] = None,
@@ -288,7 +288,7 @@ def history(
 ) -> None:
     """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
 
-    Places are in px on the reference; each option may be given several times.
+    Places are in px on the reference; the option of a place may be given several times.
     """
     from rgbmidic.report import history_figure, save_figure
     from rgbmidic.results import Channels, Result, history_rows, probes_of, write_histories
@@ -301,12 +301,13 @@ def history(
         check_file(file, overwrite=overwrite)
     result = Result.open(folder, partial=partial)
     settings = None if test is None else read_test(test)
-    probes = probes_of(result) if settings is None else settings.probes
-    changes: dict[str, Any] = {key: (*getattr(probes, key), *more) for key, more in places.items()}
-    changes |= {"measure": measure, "window": window, "rigid_motion": rigid}
+    kept = probes_of(result) if settings is None else settings.probes
+    stated: dict[str, Any] = {
+        key: (*getattr(kept, key), *value) if key in _PLACES else value for key, value in probes.items()
+    }
     histories = read_histories(
         result,
-        replace(probes, **{key: value for key, value in changes.items() if value is not None}),
+        replace(kept, **stated),
         scale=None if settings is None else settings.scale,
         channels=None if channels is None else Channels.read(channels),
         offset=offset,

@@ -124,6 +124,8 @@ class CrosstalkEstimate:
 
 @dataclass(frozen=True, slots=True)
 class _Dark:
+    """Dark level of the channels, with the covariances of its error."""
+
     level: FloatArray  # (C, R, S) mean dark signal above the stated black level
     mean_covariance: FloatArray  # (C, C) of the error of that mean, common to all blocks
     frame_covariance: FloatArray  # (C, C) of one frame's own offset
@@ -131,6 +133,8 @@ class _Dark:
 
 @dataclass(frozen=True, slots=True)
 class _Light:
+    """Captures of one light above dark, the blocks that are not saturated, and the channel that sees it best."""
+
     name: str
     captures: Sequence[BlockMeans]
     signal: FloatArray

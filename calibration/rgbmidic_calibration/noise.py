@@ -77,6 +77,8 @@ class NoiseEstimate:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
+    """Line of variance over mean of one plane."""
+
     read_variance: float
     slope: float
     covariance: FloatArray  # (2, 2)

@@ -90,7 +90,11 @@ def check_calibration(
     dark_stack = stack_frames(files.dark.frames(), drifts=False, name="the dark frames") if files.dark else None
     stacks = {name: stack_frames(group.frames(), name=group.role) for name, group in files.lights.items()}
     items = _leakage_items(calibration, files, limits)
-    sums = [_sum(names, group, stacks, dark_stack, calibration) for names, group in files.together.items()]
+    sums = []
+    for names, group in files.together.items():
+        singles = {name: stacks[name] for name in names.split("+")}
+        together_stack = stack_frames(group.frames(), name=group.role)
+        sums.append(additivity(together_stack, singles, dark_stack, noise=calibration.noise))
     items += [item for total in sums for item in total.items(limits)]
     for name, check in (("noise", _noise_items), ("registration", _registration_items)):
         try:
@@ -175,17 +179,6 @@ def _leakage_items(calibration: Calibration, files: _Captures, limits: Limits) -
     means = {name: [block_means(frame) for frame in group.frames()] for name, group in files.lights.items()}
     dark = [block_means(frame) for frame in files.dark.frames()] if files.dark else []
     return leakage(calibration.crosstalk, means, dark).items(limits.leakage)
-
-
-def _sum(
-    names: str,
-    group: CaptureFiles,
-    stacks: Mapping[str, TemporalStack],
-    dark: TemporalStack | None,
-    calibration: Calibration,
-) -> Additivity:
-    together = stack_frames(group.frames(), name=group.role)
-    return additivity(together, {name: stacks[name] for name in names.split("+")}, dark, noise=calibration.noise)
 
 
 def _noise_items(
