@@ -54,7 +54,7 @@ def crosstalk(
     allow: Allow = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """How strongly each camera channel sees each light: the matrix A in channels = A . lights."""
+    """Measure how strongly each camera channel sees each light: the matrix A in channels = A . lights."""
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import check_output, named_patterns
 
@@ -86,7 +86,7 @@ def noise(
     out: Out = Path("noise.json"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Gain, read noise, black level, saturation, linearity, fixed pattern and defects of the camera."""
+    """Measure gain, read noise, black level, saturation, linearity, fixed pattern and defects of the camera."""
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import check_output
 
@@ -107,7 +107,7 @@ def registration(
     element_size: Annotated[float, typer.Option(help="Side of the elements, px; several speckles.")] = 25.0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Lateral colour registration: where each light sees what the first light sees."""
+    """Measure lateral colour: where each light shows a point other than where the first light shows it."""
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import check_output, named_patterns
 
@@ -139,7 +139,7 @@ def check(
     ] = None,
     region: Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")] = None,
 ) -> None:
-    """Does a calibration hold on captures that did not make it? Exit status 1 where it does not."""
+    """Check a calibration on captures that were not used to make it; exit status 1 where it does not hold."""
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import named_patterns
     from rgbmidic_calibration.verdict import check_calibration, read_limits
@@ -176,7 +176,7 @@ def design(
     picture: Annotated[Path | None, typer.Option(help="Picture of spectra and matrix of the best set.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Before buying lamps: the crosstalk, condition number and noise that spectra predict, and the best set."""
+    """Predict crosstalk, condition number and noise from spectra, and find the best set of lamps to buy."""
     from rgbmidic_calibration import design as designs
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import check_output, named_patterns
@@ -197,7 +197,7 @@ def merge(
     out: Out = Path("calibration.json"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Noise, crosstalk and registration from several files into one."""
+    """Merge noise, crosstalk and registration from several files into one."""
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import check_output
     from rgbmidic_calibration.jobs import merge_files
@@ -214,7 +214,7 @@ def show(
     picture: Annotated[Path | None, typer.Option(help="Write a picture too (PNG, PDF or SVG).")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """A calibration file in words, and in one picture."""
+    """Show a calibration file as tables, and in one picture."""
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import check_output

@@ -49,7 +49,8 @@ COLOURS = ("#c0392b", "#27823b", "#2457a6", "#7d3c98")
 
 
 UNSEEN = 1e-3
-"""Response to a lamp, relative to that to the best wavelength, below which the camera does not see it."""
+"""Response to a lamp, relative to that to the best wavelength, below which the camera does not see it: chosen; such
+a lamp would need a thousand times the power of another."""
 
 
 class Lamp(Protocol):

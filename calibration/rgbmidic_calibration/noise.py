@@ -22,10 +22,11 @@ __all__ = ["NoiseEstimate", "TransferCurve", "photon_transfer"]
 
 
 HIGHEST = 0.9
-"""Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white."""
+"""Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white. Chosen."""
 
 KNEE = 0.8
-"""Variance over its prediction below which the sensor itself saturates before the white level does."""
+"""Variance over its prediction below which the sensor itself saturates before the white level does. Chosen: tiles must
+fall below it by three standard deviations as well."""
 
 DRIFT_LIMIT, DRIFT_WARNING = 0.2, 0.02
 """Drift of the lamp's strength within an exposure (`TemporalStack.drift`). Chosen: frames are scaled to one strength,

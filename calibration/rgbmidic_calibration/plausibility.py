@@ -249,14 +249,15 @@ WINDOW = 7
 """Side (samples of a plane) of the neighbourhood whose mean is taken out: shading and dirt are wider than this."""
 
 HOT = 8.0
-"""Robust standard deviations above the neighbourhood's median that make a pixel hot in the dark."""
+"""Robust standard deviations above the neighbourhood's median that make a pixel hot in the dark: chosen; of
+normal noise one sample in 1e15 lies there."""
 HOT_FRACTION = 0.005
-"""Fraction of the full scale that a hot pixel exceeds its neighbourhood by at least."""
+"""Fraction of the full scale that a hot pixel exceeds its neighbourhood by at least: chosen."""
 DEAD_FRACTION = 0.5
-"""Response relative to the neighbourhood's median below which a pixel is dead."""
+"""Response relative to the neighbourhood's median below which a pixel is dead: chosen."""
 
 TEXTURED = 0.05
-"""Local variation of the response above which the target, not the sensor, is uneven."""
+"""Local variation of the response above which the target, not the sensor, is uneven: chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

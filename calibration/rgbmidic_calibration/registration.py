@@ -29,13 +29,13 @@ LOCAL = 8.0
 """Standard deviation (px) of the neighbourhood whose mean a plane is divided by: several speckles."""
 
 CLEAR = 15.0
-"""Signal over noise of the mean frame below which a plane is not used for the light."""
+"""Signal over noise of the mean frame below which a plane is not used for the light: chosen."""
 
 BORDER = 8
-"""Pixels at the frame's edge that are left out."""
+"""Pixels at the frame's edge that are left out: the neighbourhood of `LOCAL` is cut off there."""
 
 ELEMENT = 25.0
-"""Side of the elements of the DIC between lights, px."""
+"""Side of the elements of the DIC between lights, px: the paper's (section 2.2)."""
 OUTLIER = 5.0
 """Standard deviations beyond which a node is left out of the fit (`rgbmidic_calibration.ratio.OUTLIER`)."""
 MEASURED_LIMIT = 0.5
@@ -136,7 +136,7 @@ def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Fl
 
 
 def _clear(stack: TemporalStack, dark: TemporalStack | None, plane: int, level: float, brightest: float) -> bool:
-    """Is a plane bright enough for its own noise? With a single frame: a tenth of the brightest plane."""
+    """Whether a plane exceeds its noise by `CLEAR`; of a single frame, a tenth of the brightest plane."""
     if level < 0.1 * brightest and stack.count < 2:
         return False
     noise = float(stack.variance[plane].mean(dtype=np.float64)) / stack.count
@@ -322,7 +322,7 @@ def _misfits(matches: Sequence[LightMatch]) -> list[str]:
 
 
 def jitter(stack: TemporalStack, picture: FloatImage) -> FloatArray:
-    """How much the picture moved from frame to frame: standard deviation (2,) in x and y, px; NaN for a single frame.
+    """Motion of the picture from frame to frame: standard deviation (2,) in x and y, px; NaN for a single frame.
 
     The temporal variance of a sample that moves by d is ``r^2 + K mu + (d . gradient)^2``; the coefficients of the
     squared gradients are fitted over the brightest plane.

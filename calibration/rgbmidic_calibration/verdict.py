@@ -89,7 +89,11 @@ def check_calibration(
     warnings, skipped = _reused(calibration, files), []
     dark_stack = stack_frames(files.dark.frames(), drifts=False, name="the dark frames") if files.dark else None
     stacks = {name: stack_frames(group.frames(), name=group.role) for name, group in files.lights.items()}
-    items = _leakage_items(calibration, files, limits)
+    if calibration.crosstalk is None:
+        raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
+    means = {name: [block_means(frame) for frame in group.frames()] for name, group in files.lights.items()}
+    dark_means = [block_means(frame) for frame in files.dark.frames()] if files.dark else []
+    items = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage)
     sums = []
     for names, group in files.together.items():
         singles = {name: stacks[name] for name in names.split("+")}
@@ -171,14 +175,6 @@ def _reused(calibration: Calibration, files: _Captures) -> list[str]:
         return []
     made = f"{len(reused)} of these captures made the calibration ({reused[0]} ...)"
     return [f"{made}: they always agree; a check needs others"]
-
-
-def _leakage_items(calibration: Calibration, files: _Captures, limits: Limits) -> list[CheckItem]:
-    if calibration.crosstalk is None:
-        raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
-    means = {name: [block_means(frame) for frame in group.frames()] for name, group in files.lights.items()}
-    dark = [block_means(frame) for frame in files.dark.frames()] if files.dark else []
-    return leakage(calibration.crosstalk, means, dark).items(limits.leakage)
 
 
 def _noise_items(

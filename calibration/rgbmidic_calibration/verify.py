@@ -36,7 +36,7 @@ an exposure series (`rgbmidic_calibration.crosstalk.INTENSITY_WARNING`)."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What a calibration may leave and still pass.
+    """Largest errors with which a calibration passes; chosen, and replaced by ``--limit`` of the command.
 
     Attributes
     ----------
