@@ -19,7 +19,6 @@ from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
     from rgbmidic.results import Result
-    from rgbmidic.settings import ProbeSettings
 
 __all__ = ["app", "main"]
 
@@ -35,38 +34,41 @@ _messages = Console(stderr=True)
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
-Kind = Annotated[str | None, typer.Option("--kind", help="bayer, rgb or monochrome.")]
-Cfa = Annotated[str | None, typer.Option("--cfa", help="Bayer pattern, such as RGGB.")]
-BlackLevel = Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample.")]
-WhiteLevel = Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level.")]
-Shape = Annotated[str, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")]
-Dtype = Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")]
-Told = Annotated[
+Reading = Annotated[
     Path | None,
     typer.Option("--test", help="TEST.toml whose [scale], [setup] and [probes] count instead of those kept."),
 ]
 Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")]
 
 _PLACES = {
-    "points": ("--point", "X,Y"),
-    "lines": ("--line", "X0,Y0:X1,Y1"),
-    "circles": ("--circle", "X,Y:R"),
-    "regions": ("--region", "X0,Y0:X1,Y1"),
-    "gauges": ("--gauge", "X0,Y0:X1,Y1"),
-    "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1"),
-    "strain_gauges": ("--strain-gauge", "X,Y:LENGTH"),
+    "points": ("--point", "X,Y", "Displacement there."),
+    "lines": ("--line", "X0,Y0:X1,Y1", "Mean displacement along it."),
+    "circles": ("--circle", "X,Y:R", "Mean displacement over it."),
+    "regions": ("--region", "X0,Y0:X1,Y1", "Mean displacement over it."),
+    "gauges": ("--gauge", "X0,Y0:X1,Y1", "Between two points that move."),
+    "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1", "Along the line as it was."),
+    "strain_gauges": ("--strain-gauge", "X,Y:LENGTH", "Virtual strain gauge."),
 }
-"""Keys of ``[probes]`` with the option and the form of a place."""
-_Texts = list[str] | None
-Points = Annotated[_Texts, typer.Option("--point", metavar="X,Y", help="Displacement there.")]
-Lines = Annotated[_Texts, typer.Option("--line", metavar="X0,Y0:X1,Y1", help="Mean displacement along it.")]
-Circles = Annotated[_Texts, typer.Option("--circle", metavar="X,Y:R", help="Mean displacement over it.")]
-Regions = Annotated[_Texts, typer.Option("--region", metavar="X0,Y0:X1,Y1", help="Mean displacement over it.")]
-Gauges = Annotated[_Texts, typer.Option("--gauge", metavar="X0,Y0:X1,Y1", help="Between two points that move.")]
-StraightGauges = Annotated[
-    _Texts, typer.Option("--straight-gauge", metavar="X0,Y0:X1,Y1", help="Along the line as it was.")
-]
-StrainGauges = Annotated[_Texts, typer.Option("--strain-gauge", metavar="X,Y:LENGTH", help="Virtual strain gauge.")]
+"""Keys of ``[probes]`` with the option, the form of a place and the help."""
+_PROBE_OPTIONS: dict[str, Any] = {
+    key: Annotated[list[str] | None, typer.Option(option, metavar=form, help=text)]
+    for key, (option, form, text) in _PLACES.items()
+} | {
+    "measure": Annotated[str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")],
+    "window": Annotated[
+        int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more; 0: no rates.")
+    ],
+    "rigid_motion": Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")],
+}
+
+
+def _read_probes(options: dict[str, Any]) -> dict[str, Any]:
+    """The keys of ``[probes]`` that the options state, the places as numbers."""
+    places = {
+        key: tuple(command.read_place(text, option, form) for text in options[key] or ())
+        for key, (option, form, _) in _PLACES.items()
+    }
+    return {key: value for key, value in {**options, **places}.items() if value is not None}
 
 
 def main() -> None:
@@ -101,7 +103,7 @@ def run(
     ] = "",
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
-    timings: Annotated[bool, typer.Option("--timings", help="Keep and tell the time of each stage.")] = False,
+    timings: Annotated[bool, typer.Option("--timings", help="Keep and print the time of each stage.")] = False,
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
@@ -113,8 +115,8 @@ def run(
     chosen = read_range(frames, "--frames") if frames else None
     if overwrite and (resume or frames):
         raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
-    _tell_first_run()
-    with _progress("measuring") as progress, _telling_how_to_go_on(test, out, frames, resume=resume):
+    _explain_first_run()
+    with _progress("measuring") as progress, _continuation_hint(test, out, frames, resume=resume):
         result = measure(
             settings,
             out,
@@ -147,8 +149,11 @@ def finish(
 
 
 def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
-    """Draw a finished result, in as many processes as cores if none are asked for, and tell what became of its frames;
-    a failure where more than `_TOO_MANY` of them failed or did not converge."""
+    """Draw a finished result and print how its frames ended.
+
+    The drawing takes as many processes as cores if none are asked for; the command fails where more than `_TOO_MANY`
+    of the frames failed or did not converge.
+    """
     from rgbmidic._kernels.threads import threads
     from rgbmidic.report import remove_figures, remove_report, write_figures
 
@@ -166,21 +171,20 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
         raise typer.Exit(command.fail(f"{count}; {first}", command.FAILURE))
 
 
-def _interrupt(*_: object) -> None:
-    """As Ctrl-C does, which a command in the background of a script ignores."""
-    raise KeyboardInterrupt
-
-
 @contextmanager
-def _telling_how_to_go_on(test: Path, out: Path, frames: str, *, resume: bool) -> Iterator[None]:
-    """An interruption, by Ctrl-C or by whoever runs the machine, says how to go on, if there is something."""
+def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> Iterator[None]:
+    """Print how to go on when the run is interrupted, by Ctrl-C or by SIGTERM, if anything was begun."""
     from rgbmidic.results.provenance import PROVENANCE
 
     def begun() -> bytes:
         return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""
 
+    def interrupt(*_: object) -> None:
+        """Act as Ctrl-C, which a command in the background of a script ignores."""
+        raise KeyboardInterrupt
+
     before_it = begun()
-    before = signal.signal(signal.SIGTERM, _interrupt)
+    before = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     except KeyboardInterrupt:
@@ -219,7 +223,7 @@ def export(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="File to write.")],
     to: Annotated[str, typer.Option("--to", help="Format: npz, csv or hdf5.")] = "npz",
-    test: Told = None,
+    test: Reading = None,
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
@@ -235,7 +239,7 @@ def export(
 def report(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path | None, typer.Option("--out", help="HTML file; by default RESULT/report.html.")] = None,
-    test: Told = None,
+    test: Reading = None,
     frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10, of which maps are shown.")] = "",
     overwrite: Overwrite = False,
     partial: Partial = False,
@@ -269,23 +273,11 @@ def view(
 
 
 @app.command()
+@command.gather("probes", _PROBE_OPTIONS, _read_probes)
 def history(
     folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
-    points: Points = None,
-    lines: Lines = None,
-    circles: Circles = None,
-    regions: Regions = None,
-    gauges: Gauges = None,
-    straight_gauges: StraightGauges = None,
-    strain_gauges: StrainGauges = None,
-    measure: Annotated[
-        str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")
-    ] = None,
-    window: Annotated[
-        int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more; 0: no rates.")
-    ] = None,
-    rigid: Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")] = None,
+    probes: dict[str, Any],
     channels: Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then a column each.")] = None,
     offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
     area: Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")] = None,
@@ -296,7 +288,7 @@ def history(
 ) -> None:
     """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
 
-    Places are in px on the reference; each option may be given several times.
+    Places are in px on the reference; the option of a place may be given several times.
     """
     from rgbmidic.report import history_figure, save_figure
     from rgbmidic.results import Channels, Result, history_rows, probes_of, write_histories
@@ -309,11 +301,13 @@ def history(
         check_file(file, overwrite=overwrite)
     result = Result.open(folder, partial=partial)
     settings = None if test is None else read_test(test)
-    given = (points, lines, circles, regions, gauges, straight_gauges, strain_gauges)
-    stated = probes_of(result) if settings is None else settings.probes
+    kept = probes_of(result) if settings is None else settings.probes
+    stated: dict[str, Any] = {
+        key: (*getattr(kept, key), *value) if key in _PLACES else value for key, value in probes.items()
+    }
     histories = read_histories(
         result,
-        _with_probes(stated, given, measure=measure, window=window, rigid_motion=rigid),
+        replace(kept, **stated),
         scale=None if settings is None else settings.scale,
         channels=None if channels is None else Channels.read(channels),
         offset=offset,
@@ -326,13 +320,6 @@ def history(
         _messages.print(f"note: {remark}", soft_wrap=True, markup=False, highlight=False)
     _print_table(f"{len(histories.frames)} frames", *history_rows(histories))
     print(f"table: {out}   picture: {picture}")
-
-
-def _with_probes(stated: ProbeSettings, given: Sequence[list[str] | None], **changes: Any) -> ProbeSettings:
-    """The probes of the settings and, after them, those of the command line, in the order of `_PLACES`."""
-    for (key, (option, form)), texts in zip(_PLACES.items(), given, strict=True):
-        changes[key] = (*getattr(stated, key), *(command.read_place(text, option, form) for text in texts or ()))
-    return replace(stated, **{key: value for key, value in changes.items() if value is not None})
 
 
 @app.command()
@@ -362,7 +349,7 @@ def demo(
     _messages.print(
         f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}", soft_wrap=True
     )
-    _tell_first_run()
+    _explain_first_run()
     from rgbmidic._kernels.threads import threads
     from rgbmidic.lab.demo import run_demo
     from rgbmidic.report import write_figures
@@ -402,7 +389,7 @@ def virtual(
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.lab.virtual.dataset import write_dataset
 
-    _tell_first_run()
+    _explain_first_run()
     with _progress("rendering") as progress:
         write_dataset(scene, out, progress)
 
@@ -413,7 +400,7 @@ def plan(
     out: Out,
     overwrite: Overwrite = False,
 ) -> None:
-    """Where each lamp will reflect, what uncertainty to expect, and where the lamps would stand better."""
+    """Predict where each lamp reflects, the uncertainty to expect, and better places for the lamps."""
     from rgbmidic.lab import check_folder
     from rgbmidic.lab.planning import report as planning
     from rgbmidic.lab.planning.lamps import propose_colours, propose_lamps
@@ -424,7 +411,7 @@ def plan(
     made = make_plan(read_scene(scene))
     proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
     planning.write_plan(made, proposals, out, overwrite=overwrite)
-    title = "share of the field where lights reflect, all of them do, and only one or none is clean"
+    title = "fraction of the field where lights reflect, all of them do, and only one or none is clean"
     _print_table(title, *planning.zone_rows(made), planning.ZONE_WORDS)
     uncertainty = "standard uncertainty to expect over the field, px"
     _print_table(uncertainty, *planning.uncertainty_rows(made), planning.UNCERTAINTY_WORDS)
@@ -437,26 +424,21 @@ def plan(
 
 
 @app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def frames(
     path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")],
+    statement: dict[str, Any],
     json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
     save: Annotated[
         tuple[int, Path] | None, typer.Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
     ] = None,
-    kind: Kind = None,
-    cfa: Cfa = None,
-    black_level: BlackLevel = None,
-    white_level: WhiteLevel = None,
-    shape: Shape = "",
-    dtype: Dtype = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """What a reader sees of raw frames: how many, of what size and levels, when they were taken, how many are lost."""
+    """List what a reader finds in raw frames: number, size, levels, times, missing frames."""
     from rgbmidic.frames.describe import describe, save_frame
     from rgbmidic.settings import FrameSettings
 
-    stated = _stated(kind, cfa, black_level, white_level, shape, dtype)
-    settings = FrameSettings(path=(path,), **{key: value for key, value in stated.items() if value is not None})
+    settings = FrameSettings(path=(path,), **statement)
     description = describe(settings)
     if save is not None:
         save_frame(settings, *save, overwrite=overwrite)
@@ -466,16 +448,12 @@ def frames(
 
 
 @app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def inspect(
     frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; one per light in succession.")],
+    statement: dict[str, Any],
     test: Annotated[Path | None, typer.Option("--test", help="TEST.toml the frame is meant for.")] = None,
     calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
-    kind: Kind = None,
-    cfa: Cfa = None,
-    black_level: BlackLevel = None,
-    white_level: WhiteLevel = None,
-    shape: Shape = "",
-    dtype: Dtype = None,
     region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or the frame.")] = "",
     element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's or 25.")] = None,
     accept: Annotated[
@@ -484,7 +462,7 @@ def inspect(
     out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """What one frame tells before a test: lights, reflections, speckle, noise, uncertainty to expect."""
+    """Inspect one frame before a test: lights, reflections, speckle, noise, uncertainty to expect."""
     from rgbmidic.lab import check_folder
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
     from rgbmidic.settings import read_test
@@ -492,15 +470,14 @@ def inspect(
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
     settings = None if test is None else read_test(test)
-    _tell_first_run()
-    stated = _stated(kind, cfa, black_level, white_level, shape, dtype)
+    _explain_first_run()
     with _progress("inspecting") as progress:
         inspection = inspect_files(
             frames,
             test=settings,
             calibration=calibration,
-            frame=state_frames(settings, count=len(frames), **stated),
-            region=_numbers(region, "--region") if region else None,
+            frame=state_frames(settings, count=len(frames), **statement),
+            region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
             element_size=element_size,
             accept=tuple(accept) if accept else None,
             progress=progress,
@@ -509,7 +486,7 @@ def inspect(
         report.write_inspection(inspection, out, overwrite=overwrite)
     rows, columns = inspection.frame_shape
     print(f"{inspection.name}: {inspection.kind}, {columns} x {rows} px\n")
-    _print_table("samples in the region, shares of the full scale", *report.channel_rows(inspection))
+    _print_table("samples in the region, fractions of the full scale", *report.channel_rows(inspection))
     _print_table("lights", *report.light_rows(inspection))
     known = "" if inspection.noise_known else " (noise estimated, not calibrated)"
     size = f"elements of {inspection.element_size:g} px"
@@ -518,19 +495,6 @@ def inspect(
         print(f"warning: {finding.text}")
     if out is not None:
         print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")
-
-
-def _stated(
-    kind: str | None,
-    cfa: str | None,
-    black_level: float | None,
-    white_level: float | None,
-    shape: str,
-    dtype: str | None,
-) -> dict[str, Any]:
-    """What the options state of frames, as `FrameSettings` names it."""
-    levels = {"black_level": black_level, "white_level": white_level}
-    return {"kind": kind, "cfa": cfa, **levels, "dtype": dtype, "shape": command.read_shape(shape)}
 
 
 def _print_table(
@@ -550,13 +514,6 @@ def _print_table(
     print()
 
 
-def _numbers(text: str, option: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"{option} are numbers with commas between them, such as 0.333,8; not {text!r}") from None
-
-
 def _whole_numbers(text: str, option: str) -> list[int]:
     try:
         return [int(part) for part in text.split(",")]
@@ -564,8 +521,8 @@ def _whole_numbers(text: str, option: str) -> list[int]:
         raise InputError(f"{option} are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
 
 
-def _tell_first_run() -> None:
-    """Say why the first use takes longer."""
+def _explain_first_run() -> None:
+    """Print why the first use takes longer."""
     from rgbmidic._kernels import are_compiled
 
     if not are_compiled():
@@ -584,7 +541,7 @@ def _progress(what: str) -> AbstractContextManager[Callable[[int, int, str], Non
 
 
 def _print_summary(result: Result, seconds: float) -> None:
-    """What became of the deformed frames; the reference, matched with itself, says nothing."""
+    """Print how the deformed frames ended; the reference, matched with itself, is left out."""
     deformed = list(result.deformed)
     ends = [int((result.status[deformed] == code).sum()) for code in (_CONVERGED, _UNCONVERGED, _FAILED)]
     words = [f"{ends[0]} converged", *([f"{ends[1]} not converged"] if ends[1] else []), f"{ends[2]} failed"]
@@ -595,8 +552,8 @@ def _print_summary(result: Result, seconds: float) -> None:
     if (count := len(result.setting("frames", "reference", [0]))) > 1:
         gain = ((1 + 1 / count) / 2) ** 0.5
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
-    for light, share in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
-        known = share[share == share]
+    for light, fraction in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
+        known = fraction[fraction == fraction]
         rows[light] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
     if measured and (stages := _stages(result, deformed)):
         rows["frame"] = stages
@@ -612,8 +569,8 @@ def _stages(result: Result, frames: Sequence[int]) -> str:
     if not known:
         return ""
     mean = sum(known) / len(known)
-    shares = ", ".join(f"{name} {share:.0%}" for name, share in zip(STAGES, mean / mean.sum(), strict=True))
-    return f"{mean.sum():.2f} s: {shares}"
+    parts = ", ".join(f"{name} {part:.0%}" for name, part in zip(STAGES, mean / mean.sum(), strict=True))
+    return f"{mean.sum():.2f} s: {parts}"
 
 
 if __name__ == "__main__":

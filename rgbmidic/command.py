@@ -1,24 +1,51 @@
-"""What both commands share: every error is one line and an exit status, and sizes are written one way."""
+"""What both commands have in common: errors as one line and an exit status, and options that several commands take."""
 
 from __future__ import annotations
 
 import errno
+import inspect
 import io
 import logging
 import re
 import sys
 import traceback
+from collections.abc import Callable, Mapping
+from functools import wraps
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
+
+import typer
 
 from rgbmidic.errors import InputError, RgbmidicError, disk_reason
 
-if TYPE_CHECKING:
-    import typer
-
-__all__ = ["FAILURE", "execute", "fail", "help_where_alone", "main", "optional", "read_place", "read_shape"]
+__all__ = [
+    "FAILURE",
+    "FRAME_OPTIONS",
+    "execute",
+    "fail",
+    "gather",
+    "help_where_alone",
+    "main",
+    "optional",
+    "read_place",
+    "read_shape",
+    "read_statement",
+]
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
+
+FRAME_OPTIONS: dict[str, Any] = {
+    "kind": Annotated[
+        str | None,
+        typer.Option("--kind", help="bayer, rgb (3-CCD) or monochrome; else what the files state, else bayer."),
+    ],
+    "cfa": Annotated[str | None, typer.Option("--cfa", help="Bayer pattern RGGB, BGGR, GRBG or GBRG.")],
+    "black_level": Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample, DN.")],
+    "white_level": Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level, DN.")],
+    "shape": Annotated[str | None, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")],
+    "dtype": Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")],
+}
+"""Options that state what the files of frames do not, by the keys of ``[frames]``."""
 
 
 def main(app: typer.Typer) -> None:
@@ -41,8 +68,6 @@ def main(app: typer.Typer) -> None:
 
 def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> int:
     """Run a command; its exit status: 0, 1 where it failed, 2 where the input is wrong, 130 where it was stopped."""
-    import typer
-
     try:
         status = app(args=arguments, standalone_mode=False) or 0
         if status != INTERRUPTED:  # typer's own answer to Ctrl-C
@@ -72,6 +97,41 @@ def help_where_alone(context: typer.Context) -> None:
     """Print the help of a group of commands where none of them is named."""
     if context.invoked_subcommand is None:
         print(context.get_help())
+
+
+def gather(
+    name: str, options: Mapping[str, Any], read: Callable[[dict[str, Any]], Any]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorator of a command whose parameter `name` is asked for as several options.
+
+    Parameters
+    ----------
+    name
+        Parameter of the command; it gets what `read` makes of the options.
+    options
+        Annotated type of every option by its key; each may be left out.
+    read
+        Function of the options' values by key, None for one that is left out.
+    """
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        @wraps(function)
+        def gathering(**values: Any) -> None:
+            given = {key: values.pop(key) for key in options}
+            function(**values, **{name: read(given)})
+
+        signature = inspect.signature(function, eval_str=True)
+        asked: list[inspect.Parameter] = []
+        for parameter in signature.parameters.values():
+            parts = options if parameter.name == name else {parameter.name: parameter.annotation}
+            default = None if parameter.name == name else parameter.default
+            kind = inspect.Parameter.KEYWORD_ONLY
+            asked += [inspect.Parameter(key, kind, default=default, annotation=hint) for key, hint in parts.items()]
+        gathering.__annotations__ = {parameter.name: parameter.annotation for parameter in asked}
+        vars(gathering)["__signature__"] = signature.replace(parameters=asked)
+        return gathering
+
+    return decorate
 
 
 def optional(module: str, extra: str) -> Any:
@@ -108,7 +168,25 @@ def read_place(text: str, option: str, form: str) -> tuple[float, ...]:
     return tuple(number for group in numbers for number in group)
 
 
-_EXAMPLES = {"X,Y": "120,85.5", "X0,Y0:X1,Y1": "40,60:200,60", "X,Y:R": "120,85:30", "X,Y:LENGTH": "120,85:75"}
+_EXAMPLES = {
+    "X,Y": "120,85.5",
+    "X0,Y0:X1,Y1": "40,60:200,60",
+    "X,Y:R": "120,85:30",
+    "X,Y:LENGTH": "120,85:75",
+    "X0,Y0,X1,Y1": "40,60,200,160",
+}
+
+
+def read_statement(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of `FRAME_OPTIONS` that are stated, as `rgbmidic.settings.FrameSettings` takes them.
+
+    Raises
+    ------
+    InputError
+        ``--shape`` has another form than ROWSxCOLUMNS.
+    """
+    values = {**options, "shape": read_shape(options["shape"])}
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def read_shape(text: str | None) -> tuple[int, int] | None:

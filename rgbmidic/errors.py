@@ -24,7 +24,7 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
 def legible(name: str | os.PathLike[str]) -> str:
-    """A file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\\xff``."""
+    r"""A file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\xff``."""
     return os.fspath(name).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
@@ -41,10 +41,10 @@ def first_line(error: Exception) -> str:
 
 
 class RgbmidicError(Exception):
-    """Base of all errors that rgbmidic raises on purpose.
+    r"""Base of all errors that rgbmidic raises on purpose.
 
     The message is one line: line ends and other control characters, which come from damaged files and from other
-    libraries, stand in it as ``\\n``, ``\\x1b``.
+    libraries, stand in it as ``\n``, ``\x1b``.
     """
 
     def __init__(self, message: str = "") -> None:

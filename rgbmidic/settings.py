@@ -66,18 +66,41 @@ def _bounded(default: Any, **bounds: float) -> Any:
     return field(default=default, metadata={"bounds": bounds})
 
 
+class _Checked:
+    """Settings that are checked when they are made: every field by its type and bounds, then what keys must keep."""
+
+    __slots__ = ()
+    section = ""
+
+    def __post_init__(self) -> None:
+        _normalise(self, self.section)
+        self._check()
+
+    def _check(self) -> None:
+        """Raise a `ConfigurationError` where keys contradict each other."""
+
+
+def _require(kept: object, message: str) -> None:
+    if not kept:
+        raise ConfigurationError(message)
+
+
+def _require_corners(where: str, corners: tuple[Any, ...], least: int, words: str) -> None:
+    _require(len(corners) >= least, f"{where} needs at least {words} corners [x, y], not {len(corners)}")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FrameSettings:
-    """Where the frames are and what the files do not tell (``[frames]``).
+class FrameSettings(_Checked):
+    """Where the frames are, and what the files do not state (``[frames]``).
 
     Attributes
     ----------
     path
         File patterns or folders, one per light fired in succession (monochrome); a single one otherwise.
     kind
-        None: what the file tells, else ``"bayer"``.
+        None: what the file states, else ``"bayer"``.
     cfa, black_level, white_level
-        None: what the file tells. A statement that contradicts the file is an error.
+        None: what the file states. A statement that contradicts the file is an error.
     reference
         Indices of the frames whose average is the reference, or a range of them: ``"0:20"`` are the first twenty.
     first, last, step
@@ -87,15 +110,17 @@ class FrameSettings:
         Number of lights that fire in turn before a monochrome camera which records one series: frame i shows light
         i mod `lights`, and so many frames make one state, which is what the other keys count.
     update_reference
-        Whether a later frame becomes the reference where the match with the one before no longer serves, for paint that
-        changes. Uncertainties add up (`rgbmidic.correlation.reference_update`), and a node that is lost in such a frame
-        is lost for good.
+        Whether a later frame becomes the reference where the correlation with the present one is low, for paint that
+        changes (incremental correlation). Uncertainties add up (`rgbmidic.correlation.reference_update`), and a node
+        that is without data in such a frame stays so.
     shape, dtype
         Rows and columns, and sample type, of headerless files.
     crop_origin
         Column and row of the calibrated frame at which cropped frames begin; None: they are as large as the calibrated
         ones, or nothing of the calibration depends on the place.
     """
+
+    section = "frames"
 
     path: tuple[str, ...]
     kind: FrameKind | None = None
@@ -112,36 +137,38 @@ class FrameSettings:
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
     crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)
 
-    def __post_init__(self) -> None:
-        _normalise(self, "frames")
-        if not self.path or not all(self.path):
-            raise ConfigurationError("frames.path must name the frame files")
-        if len(self.path) > 1 and self.kind != "monochrome":
-            raise ConfigurationError(
-                f"frames.path with {len(self.path)} entries means as many lights fired in succession before a "
-                'monochrome camera: state kind = "monochrome", or give a single path'
-            )
-        if self.lights > 1 and (len(self.path) > 1 or self.kind != "monochrome"):
-            raise ConfigurationError(
-                f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
-                f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}'
-            )
-        if self.last is not None and self.last < self.first:
-            raise ConfigurationError(f"frames.last must be at least frames.first ({self.first}), not {self.last}")
-        if not self.reference or len(set(self.reference)) < len(self.reference):
-            raise ConfigurationError(f"frames.reference must name different frames, not {list(self.reference)}")
+    def _check(self) -> None:
+        _require(self.path and all(self.path), "frames.path must name the frame files")
+        _require(
+            len(self.path) == 1 or self.kind == "monochrome",
+            f"frames.path with {len(self.path)} entries means as many lights fired in succession before a monochrome "
+            'camera: state kind = "monochrome", or give a single path',
+        )
+        _require(
+            self.lights == 1 or (len(self.path) == 1 and self.kind == "monochrome"),
+            f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
+            f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}',
+        )
+        _require(
+            self.last is None or self.last >= self.first,
+            f"frames.last must be at least frames.first ({self.first}), not {self.last}",
+        )
+        _require(
+            self.reference and len(set(self.reference)) == len(self.reference),
+            f"frames.reference must name different frames, not {list(self.reference)}",
+        )
         if self.cfa is not None:
             object.__setattr__(self, "cfa", self.cfa.upper())
-            if self.cfa not in BAYER_PATTERNS:
-                raise ConfigurationError(f'frames.cfa must be one of {", ".join(BAYER_PATTERNS)}, not "{self.cfa}"')
-        if self.black_level is not None and self.white_level is not None and self.white_level <= self.black_level:
-            raise ConfigurationError(
-                f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}"
-            )
+            allowed = ", ".join(BAYER_PATTERNS)
+            _require(self.cfa in BAYER_PATTERNS, f'frames.cfa must be one of {allowed}, not "{self.cfa}"')
+        _require(
+            self.black_level is None or self.white_level is None or self.white_level > self.black_level,
+            f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}",
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IlluminationSettings:
+class IlluminationSettings(_Checked):
     """How the frame becomes one image per light (``[illumination]``).
 
     Attributes
@@ -154,15 +181,14 @@ class IlluminationSettings:
         the grey levels as they are.
     """
 
+    section = "illumination"
+
     demosaic: Literal["auto", "reflection-aware", "malvar", "normalised"] = "auto"
     normalise: float = _bounded(10.0, at_least=0)
 
-    def __post_init__(self) -> None:
-        _normalise(self, "illumination")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RegionSettings:
+class RegionSettings(_Checked):
     """The region of interest (``[region]``): exactly one of rectangle, polygon and mask, without the holes.
 
     Attributes
@@ -177,31 +203,30 @@ class RegionSettings:
         Polygons, each of corners (x, y) in px, whose pixels do not belong to it.
     """
 
+    section = "region"
+
     rectangle: tuple[float, float, float, float] | None = None
     polygon: tuple[tuple[float, float], ...] | None = None
     mask: Path | None = None
     holes: tuple[tuple[tuple[float, float], ...], ...] = ()
 
-    def __post_init__(self) -> None:
-        _normalise(self, "region")
-        kinds = ["rectangle", "polygon", "mask"]
-        if (stated := sum(getattr(self, kind) is not None for kind in kinds)) != 1:
-            raise ConfigurationError(f"[region] needs exactly one of {', '.join(kinds)}; given are {stated}")
-        if self.rectangle is not None and not (
-            self.rectangle[0] < self.rectangle[2] and self.rectangle[1] < self.rectangle[3]
-        ):
-            raise ConfigurationError(
-                f"region.rectangle is [x0, y0, x1, y1] with x0 < x1 and y0 < y1, not {list(self.rectangle)}"
+    def _check(self) -> None:
+        stated = sum(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
+        _require(stated == 1, f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}")
+        if self.rectangle is not None:
+            x0, y0, x1, y1 = self.rectangle
+            _require(
+                x0 < x1 and y0 < y1,
+                f"region.rectangle is [x0, y0, x1, y1] with x0 < x1 and y0 < y1, not {list(self.rectangle)}",
             )
-        if self.polygon is not None and len(self.polygon) < 3:
-            raise ConfigurationError(f"region.polygon needs at least three corners [x, y], not {len(self.polygon)}")
+        if self.polygon is not None:
+            _require_corners("region.polygon", self.polygon, 3, "three")
         for number, hole in enumerate(self.holes):
-            if len(hole) < 3:
-                raise ConfigurationError(f"region.holes[{number}] needs at least three corners [x, y], not {len(hole)}")
+            _require_corners(f"region.holes[{number}]", hole, 3, "three")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WeightSettings:
+class WeightSettings(_Checked):
     """How each light is weighted (``[weights]``).
 
     Attributes
@@ -225,6 +250,8 @@ class WeightSettings:
         the variance that geometry, paint and camera noise let expect.
     """
 
+    section = "weights"
+
     method: Literal["statistics", "threshold", "geometry", "none"] = "statistics"
     threshold: float | Literal["auto"] = _bounded(2 / 3, above=0, at_most=1)
     blur: float = _bounded(10.0, above=0)
@@ -232,17 +259,18 @@ class WeightSettings:
     height_map: Path | None = None
     limit_deg: float | None = _bounded(None, above=0, below=180)
 
-    def __post_init__(self) -> None:
-        _normalise(self, "weights")
-        if (self.method == "geometry") != (self.geometry is not None):
-            raise ConfigurationError('weights.method = "geometry" and weights.geometry = "SCENE.toml" go together')
+    def _check(self) -> None:
+        geometric = self.method == "geometry"
+        _require(
+            geometric == (self.geometry is not None),
+            'weights.method = "geometry" and weights.geometry = "SCENE.toml" go together',
+        )
         for key in ("height_map", "limit_deg"):
-            if self.method != "geometry" and getattr(self, key) is not None:
-                raise ConfigurationError(f'weights.{key} is for weights.method = "geometry"')
+            _require(geometric or getattr(self, key) is None, f'weights.{key} is for weights.method = "geometry"')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SolverSettings:
+class SolverSettings(_Checked):
     """The MIDIC minimisation (``[solver]``), and the options of `rgbmidic.correlate`.
 
     Attributes
@@ -264,6 +292,8 @@ class SolverSettings:
         Iterations before the frame counts as not converged.
     """
 
+    section = "solver"
+
     prefilter: Literal["none", "binomial", "gaussian"] = "binomial"
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
     brightness: Literal["none", "global", "local"] = "none"
@@ -271,34 +301,32 @@ class SolverSettings:
     tolerance: float = _bounded(1e-3, above=0)
     max_iterations: int = _bounded(50, at_least=1)
 
-    def __post_init__(self) -> None:
-        _normalise(self, "solver")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScaleSettings:
-    """Physical units (``[scale]``); they change nothing of what is measured, only how it is told.
+class ScaleSettings(_Checked):
+    """Physical units (``[scale]``): they decide in which units results are reported, not what is measured.
 
     Attributes
     ----------
     mm_per_pixel
-        Millimetres on the specimen for a pixel; None: lengths are told in px.
+        Millimetres on the specimen for a pixel; None: lengths are reported in px.
     mm_per_pixel_std
         Its standard uncertainty.
     frame_rate
-        Frames per second, for files that do not tell when their frames were taken.
+        Frames per second, for files that do not state when their frames were taken.
     """
+
+    section = "scale"
 
     mm_per_pixel: float | None = _bounded(None, above=0)
     mm_per_pixel_std: float = _bounded(0.0, at_least=0)
     frame_rate: float | None = _bounded(None, above=0)
 
-    def __post_init__(self) -> None:
-        _normalise(self, "scale")
-        if self.mm_per_pixel_std and self.mm_per_pixel is None:
-            raise ConfigurationError(
-                "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing"
-            )
+    def _check(self) -> None:
+        _require(
+            not self.mm_per_pixel_std or self.mm_per_pixel is not None,
+            "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing",
+        )
 
 
 _Place2 = tuple[tuple[float, float], ...]
@@ -307,8 +335,8 @@ _Place4 = tuple[tuple[float, float, float, float], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProbeSettings:
-    """What `rgbmidic history` reads off a result (``[probes]``); nothing of what is measured depends on it.
+class ProbeSettings(_Checked):
+    """Probes that `rgbmidic history` evaluates on a result (``[probes]``); the measurement does not depend on them.
 
     All places and lengths are in px on the reference.
 
@@ -331,9 +359,11 @@ class ProbeSettings:
     window
         Frames that a parabola takes in for velocities, accelerations and strain rates; 0: none are taken.
     rigid_motion
-        ``"tell"``: shift and rotation of the measured field as a whole are told beside the probes; ``"remove"``: they
-        are also taken off the displacements.
+        ``"tell"``: shift and rotation of the measured field as a whole are reported beside the probes; ``"remove"``:
+        they are also subtracted from the displacements.
     """
+
+    section = "probes"
 
     points: _Place2 = ()
     lines: _Place4 = ()
@@ -346,13 +376,13 @@ class ProbeSettings:
     window: int = _bounded(0, at_least=0)
     rigid_motion: Literal["none", "tell", "remove"] = "none"
 
-    def __post_init__(self) -> None:
-        _normalise(self, "probes")
-        if 0 < self.window < 4:
-            raise ConfigurationError(f"probes.window must be 0 or at least 4 frames, not {self.window}")
+    def _check(self) -> None:
+        _require(
+            self.window == 0 or self.window >= 4, f"probes.window must be 0 or at least 4 frames, not {self.window}"
+        )
         for key in ("circles", "strain_gauges"):
-            if any(place[2] <= 0 for place in getattr(self, key)):
-                raise ConfigurationError(f"probes.{key} are [x, y, size] with a size above 0")
+            sizes = [size for *_, size in getattr(self, key)]
+            _require(all(size > 0 for size in sizes), f"probes.{key} are [x, y, size] with a size above 0, not {sizes}")
 
     @property
     def places(self) -> list[tuple[str, tuple[float, ...]]]:
@@ -366,8 +396,8 @@ class ProbeSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SetupSettings:
-    """What only the person in the laboratory knows (``[setup]``), in words for `rgbmidic report`; None: not stated.
+class SetupSettings(_Checked):
+    """Description of the experiment for `rgbmidic report` (``[setup]``), which no file holds; None: not stated.
 
     The good-practice guide of the International Digital Image Correlation Society asks for these (section 5 and
     appendix; doi:10.32720/idics/gpg.ed1).
@@ -392,6 +422,8 @@ class SetupSettings:
         Anything else.
     """
 
+    section = "setup"
+
     camera: str | None = None
     lens: str | None = None
     aperture: str | None = None
@@ -403,13 +435,10 @@ class SetupSettings:
     operator: str | None = None
     notes: str | None = None
 
-    def __post_init__(self) -> None:
-        _normalise(self, "setup")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TestSettings:
-    """Everything `rgbmidic.pipeline.measure` needs to know about a test.
+class TestSettings(_Checked):
+    """All settings of a test, as `rgbmidic.pipeline.measure` takes them.
 
     Attributes
     ----------
@@ -444,18 +473,14 @@ class TestSettings:
     probes: ProbeSettings = field(default_factory=ProbeSettings)
     base: Path = field(default_factory=Path, metadata={"key": ""})
 
-    def __post_init__(self) -> None:
-        _normalise(self, "")
+    def _check(self) -> None:
         for number, crack in enumerate(self.cracks):
-            if len(crack) < 2:
-                raise ConfigurationError(
-                    f"mesh.cracks[{number}] needs at least two corners [x, y]; given is {_plain(crack)}"
-                )
-        if self.frames.kind in ("bayer", "rgb") and self.calibration_file is None:
-            raise ConfigurationError(
-                f'frames.kind = "{self.frames.kind}" needs the lights\' crosstalk: state calibration.file, a file that '
-                "rgbmidic-calibrate writes"
-            )
+            _require_corners(f"mesh.cracks[{number}]", crack, 2, "two")
+        _require(
+            self.frames.kind not in ("bayer", "rgb") or self.calibration_file is not None,
+            f'frames.kind = "{self.frames.kind}" needs the lights\' crosstalk: state calibration.file, a file that '
+            "rgbmidic-calibrate writes",
+        )
 
     @classmethod
     def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:
@@ -509,7 +534,24 @@ class TestSettings:
 
 
 def read_section(kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".") -> _Section:
-    """One section of the settings from its keys and plain values; errors as `TestSettings.from_mapping`."""
+    """One section of the settings from its keys and plain values.
+
+    Parameters
+    ----------
+    kind
+        Class of the section, such as `FrameSettings`.
+    name
+        Name of the section, for messages.
+    content
+        Its keys and values.
+    base
+        Folder that relative paths start from.
+
+    Raises
+    ------
+    ConfigurationError
+        A key is unknown, missing, of the wrong type, out of range, or contradicts another.
+    """
     hints = _hints(cast(Any, kind))
     check_names(content, hints, "key", f"[{name}]")
     for entry in fields(cast(Any, kind)):
@@ -596,7 +638,20 @@ def _sections(settings: type[TestSettings]) -> dict[str, dict[str, Any]]:
 
 
 def check_names(given: Iterable[str], allowed: Iterable[str], what: str, where: str) -> None:
-    """Refuse a name that is not allowed, with the closest one as a hint."""
+    """Refuse a name that is not allowed.
+
+    Parameters
+    ----------
+    given, allowed
+        Names.
+    what, where
+        What the names are of and where they stand, for the message.
+
+    Raises
+    ------
+    ConfigurationError
+        A given name is not allowed; the message holds the closest one that is.
+    """
     allowed = list(allowed)
     for name in given:
         if name not in allowed:
@@ -615,7 +670,24 @@ _WORDS = {
 
 
 def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> Any:
-    """A value as the type that a field states; what is not losslessly of it is an error that names the field."""
+    """A value converted to the type of a field.
+
+    Parameters
+    ----------
+    value
+        As TOML or Python gives it; numpy's scalars and arrays count as Python's.
+    hint
+        Type of the field.
+    where
+        Section and key, for messages.
+    base
+        Folder that relative paths start from.
+
+    Raises
+    ------
+    ConfigurationError
+        The value cannot be converted without a loss.
+    """
     value, origin, kinds = _python(value), get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):  # X | None; a number | a word
         if value is None and NoneType in kinds:

@@ -1,6 +1,6 @@
-"""Where the time of a frame goes: seconds in every stage, what a stage calls of other stages not counted with it.
+"""Time that each stage of a frame takes, and the progress bar of a long command.
 
-The bar that shows how far a long command has come.
+The time of a stage that another one calls does not count with the caller.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ __all__ = ["STAGES", "each", "progress_bar", "stage", "timed"]
 T = TypeVar("T")
 
 STAGES = ("reading", "separation", "preparation", "search", "weights", "equations", "iteration", "conclusion", "rest")
-"""Of a frame: its file; one image per light; normalised and interpolable images; a start; comparison with the reference
-and the weights from it; Hessian and factors; Gauss-Newton; the field and its uncertainty; and all other work."""
+"""Of a frame: its file; one image per light; normalised and interpolable images; an initial guess; comparison with the
+reference and the weights from it; Hessian and factors; Gauss-Newton; the field and its uncertainty; all other work."""
 
 
 class _Clock:
-    """Gives the time since the last switch to the stage that was on."""
+    """Clock of one frame: every switch adds the time since the last one to the stage that was on."""
 
     def __init__(self) -> None:
         self.seconds = dict.fromkeys(STAGES, 0.0)
         self._on, self._since = "rest", time.perf_counter()
 
     def switch(self, name: str) -> str:
-        """Turn to a stage; the one before."""
+        """Switch to a stage and return the one before."""
         before, now = self._on, time.perf_counter()
         self.seconds[before] += now - self._since
         self._on, self._since = name, now
@@ -43,7 +43,7 @@ _clock: ContextVar[_Clock | None] = ContextVar("clock", default=None)
 
 @contextmanager
 def timed(wanted: bool = True) -> Iterator[dict[str, float]]:
-    """Measure the stages of what is done within; the seconds of each are there at the end, none unless `wanted`."""
+    """Measure the seconds of every stage within the block; the dict is complete at its end, empty unless `wanted`."""
     if not wanted:
         yield {}
         return
@@ -58,7 +58,7 @@ def timed(wanted: bool = True) -> Iterator[dict[str, float]]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """What is done within, or by the function decorated, belongs to a stage of `STAGES`."""
+    """Count the time within the block, or of the function decorated, to a stage of `STAGES`."""
     clock = _clock.get()
     if clock is None:
         yield
@@ -71,7 +71,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 def each(name: str, items: Iterable[T]) -> Iterator[T]:
-    """The items; finding the next one belongs to a stage, what is done with it does not."""
+    """Yield the items; the time to find the next one counts to a stage, the time of its use does not."""
     left = iter(items)
     while True:
         with stage(name):

@@ -1,6 +1,6 @@
-"""Capture files in, provenance out: which files went into a calibration, with their hashes.
+"""Captures of a calibration: the files of each group with their hashes, and their mean and temporal variance.
 
-Frames of one exposure reduced to the mean and the temporal variance of every sample, plane by plane.
+Mean and variance are those of every sample over the frames of one exposure, plane by plane.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 import rgbmidic
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
@@ -23,6 +24,7 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.ratio import plane_origins, saturation_pile
 
 __all__ = [
+    "TILE",
     "CaptureFiles",
     "TemporalStack",
     "check_output",
@@ -30,6 +32,7 @@ __all__ = [
     "provenance",
     "same_camera",
     "stack_frames",
+    "tile_means",
 ]
 
 
@@ -57,7 +60,7 @@ class CaptureFiles:
     ) -> CaptureFiles:
         """Files that a pattern or folder names; `stated` is what the user says of them (its path is not used).
 
-        What neither the files nor the user tell comes from the `calibration`, which must agree with both.
+        What neither the files nor the user state comes from the `calibration`, which must agree with both.
 
         Raises
         ------
@@ -177,7 +180,7 @@ class TemporalStack:
     white : float
         White level (DN).
     zeros : float
-        Largest share of a plane's samples that are 0 (cut off at the bottom).
+        Largest fraction of a plane's samples that are 0 (cut off at the bottom).
     piled_at : float or None
         Level below white where samples pile up as at saturation.
     shape : tuple of int
@@ -208,6 +211,11 @@ class TemporalStack:
     def count(self) -> int:
         """Number of frames."""
         return len(self.strength)
+
+    @property
+    def drift(self) -> float:
+        """Range of a plane's strength over the frames, relative to its mean (or to 1 DN), of the worst plane."""
+        return float((np.ptp(self.strength, axis=0) / np.maximum(self.strength.mean(axis=0), 1)).max())
 
 
 def stack_frames(
@@ -260,8 +268,8 @@ class _Running:
         shape = frame.values.shape[-2:]
         if names != self.names or shape != self.shape or frame.white_level != self.white:
             raise CalibrationError(
-                f"{name}: a frame is {_told(shape, names, frame.white_level)}, the first "
-                f"{_told(self.shape, self.names, self.white)}: all must come from the same camera and settings"
+                f"{name}: a frame is {_words(shape, names, frame.white_level)}, the first "
+                f"{_words(self.shape, self.names, self.white)}: all must come from the same camera and settings"
             )
         levels = np.array([plane.mean(dtype=np.float64) for plane in planes]) - black
         self.strength.append(levels)
@@ -297,8 +305,31 @@ class _Running:
         )
 
 
+TILE = 16
+"""Side of the tiles, in samples of a plane: of 256 samples the variance is known to 9 %."""
+
+
+def tile_means(values: npt.NDArray[np.generic]) -> FloatArray:
+    """Means over tiles of up to TILE x TILE samples; a border that does not fill a tile is left out.
+
+    Parameters
+    ----------
+    values
+        Shape (..., h, w).
+
+    Returns
+    -------
+    ndarray, shape (..., tiles)
+    """
+    *lead, height, width = values.shape
+    size = min(TILE, height, width)
+    rows, columns = height // size, width // size
+    cut = values[..., : rows * size, : columns * size].reshape(*lead, rows, size, columns, size)
+    return np.asarray(cut.mean(axis=(-3, -1), dtype=np.float64).reshape(*lead, rows * columns))
+
+
 def _ratio(levels: FloatArray, by: FloatArray) -> FloatArray:
-    """Ratio of strengths; 1 where there is hardly any light to drift."""
+    """Ratio of strengths; 1 for strengths up to 1 DN, where there is hardly any light to drift."""
     return np.where((levels > 1) & (by > 1), levels / np.where(by > 1, by, 1.0), 1.0)
 
 
@@ -312,13 +343,13 @@ def same_camera(stacks: Sequence[TemporalStack]) -> None:
     """
     first = stacks[0]
     for stack in stacks[1:]:
-        told = (stack.names, stack.shape, stack.white, stack.origins, tuple(stack.black))
-        if told != (first.names, first.shape, first.white, first.origins, tuple(first.black)):
+        camera = (stack.names, stack.shape, stack.white, stack.origins, tuple(stack.black))
+        if camera != (first.names, first.shape, first.white, first.origins, tuple(first.black)):
             raise CalibrationError(
-                f"the exposures are of different cameras or settings: {_told(stack.shape, stack.names, stack.white)} "
-                f"and {_told(first.shape, first.names, first.white)}"
+                f"the exposures are of different cameras or settings: {_words(stack.shape, stack.names, stack.white)} "
+                f"and {_words(first.shape, first.names, first.white)}"
             )
 
 
-def _told(shape: Sequence[int], names: Sequence[str], white: float) -> str:
+def _words(shape: Sequence[int], names: Sequence[str], white: float) -> str:
     return f"{shape[1]} x {shape[0]} px with planes {' '.join(names)} and white level {white:g}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -19,14 +19,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-Cfa = Annotated[
-    str | None, typer.Option(help="Bayer pattern RGGB, BGGR, GRBG or GBRG, where the files do not tell it.")
-]
-Black = Annotated[float | None, typer.Option(help="Black level in DN, where the files do not tell it.")]
-White = Annotated[float | None, typer.Option(help="Saturation level in DN, where the files do not tell it.")]
-Kind = Annotated[str | None, typer.Option(help="bayer (default unless the files tell), or rgb for a 3-CCD camera.")]
-Shape = Annotated[str | None, typer.Option(help="ROWSxCOLUMNS of headerless files, such as 512x768.")]
-Dtype = Annotated[str | None, typer.Option(help="Sample type of headerless files: uint8, uint16 or >u2.")]
 Out = Annotated[Path, typer.Option(help="Calibration file to write (JSON).")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing --out.")]
 Light = Annotated[list[str], typer.Option(help="NAME=FILES: captures with this light alone on. Once per light.")]
@@ -49,16 +41,12 @@ def _root(
 
 
 @app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def crosstalk(
     light: Light,
+    statement: dict[str, Any],
     out: Out = Path("calibration.json"),
     dark: Dark = None,
-    cfa: Cfa = None,
-    black_level: Black = None,
-    white_level: White = None,
-    kind: Kind = None,
-    shape: Shape = None,
-    dtype: Dtype = None,
     block: Annotated[int, typer.Option(help="Side of the blocks that are averaged, px.")] = 16,
     field: Annotated[
         str, typer.Option(help="Degree by which A varies over the field: 0 to 4, or auto: what the data ask for.")
@@ -66,16 +54,15 @@ def crosstalk(
     allow: Allow = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """How strongly each camera channel sees each light: the matrix A in channels = A . lights."""
+    """Measure how strongly each camera channel sees each light: the matrix A in channels = A . lights."""
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import check_output, named_patterns
 
     check_output(out, overwrite=overwrite)
-    statement = jobs.statement(kind, cfa, black_level, white_level, shape, dtype)
     calibration, estimate = jobs.calibrate_crosstalk(
         named_patterns(light, "--light"),
         dark,
-        statement,
+        jobs.captures_as_stated(statement),
         block=block,
         order=jobs.field_order(field),
         allow=tuple(allow or ()),
@@ -85,6 +72,7 @@ def crosstalk(
 
 
 @app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def noise(
     dark: Annotated[str, typer.Option(help="Dark frames, two at least: lens capped, exposure time of the test.")],
     flat: Annotated[
@@ -94,58 +82,53 @@ def noise(
             "one exposure with its time. May be repeated."
         ),
     ],
+    statement: dict[str, Any],
     out: Out = Path("noise.json"),
-    cfa: Cfa = None,
-    black_level: Black = None,
-    white_level: White = None,
-    kind: Kind = None,
-    shape: Shape = None,
-    dtype: Dtype = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Gain, read noise, black level, saturation, linearity, fixed pattern and defects of the camera."""
+    """Measure gain, read noise, black level, saturation, linearity, fixed pattern and defects of the camera."""
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import check_output
 
     check_output(out, overwrite=overwrite)
-    statement = jobs.statement(kind, cfa, black_level, white_level, shape, dtype)
-    calibration, estimate = jobs.calibrate_noise(dark, flat, statement)
+    calibration, estimate = jobs.calibrate_noise(dark, flat, jobs.captures_as_stated(statement))
     calibration.write(out)
     display.noise(estimate, out)
 
 
 @app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def registration(
     light: Light,
+    statement: dict[str, Any],
     out: Out = Path("registration.json"),
     dark: Dark = None,
     region: Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")] = None,
     element_size: Annotated[float, typer.Option(help="Side of the elements, px; several speckles.")] = 25.0,
-    cfa: Cfa = None,
-    black_level: Black = None,
-    white_level: White = None,
-    kind: Kind = None,
-    shape: Shape = None,
-    dtype: Dtype = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Lateral colour registration: where each light sees what the first light sees."""
+    """Measure lateral colour: where each light shows a point other than where the first light shows it."""
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import check_output, named_patterns
 
     check_output(out, overwrite=overwrite)
-    statement = jobs.statement(kind, cfa, black_level, white_level, shape, dtype)
     calibration, estimate = jobs.calibrate_registration(
-        named_patterns(light, "--light"), dark, statement, region=jobs.rectangle(region), element_size=element_size
+        named_patterns(light, "--light"),
+        dark,
+        jobs.captures_as_stated(statement),
+        region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
+        element_size=element_size,
     )
     calibration.write(out)
     display.registration(estimate, out)
 
 
 @app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def check(
     file: Annotated[Path, typer.Argument(help="Calibration file.")],
     light: Light,
+    statement: dict[str, Any],
     dark: Dark = None,
     together: Annotated[
         list[str] | None, typer.Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
@@ -155,14 +138,8 @@ def check(
         typer.Option(help="NAME=VALUE: leakage, additivity, strength, noise (in %), registration (in px)."),
     ] = None,
     region: Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")] = None,
-    cfa: Cfa = None,
-    black_level: Black = None,
-    white_level: White = None,
-    kind: Kind = None,
-    shape: Shape = None,
-    dtype: Dtype = None,
 ) -> None:
-    """Does a calibration hold on captures that did not make it? Exit status 1 where it does not."""
+    """Check a calibration on captures that were not used to make it; exit status 1 where it does not hold."""
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import named_patterns
     from rgbmidic_calibration.verdict import check_calibration, read_limits
@@ -172,9 +149,9 @@ def check(
         named_patterns(light, "--light"),
         dark,
         named_patterns(together or (), "--together"),
-        jobs.statement(kind, cfa, black_level, white_level, shape, dtype),
+        jobs.captures_as_stated(statement),
         limits=read_limits(limit or ()),
-        region=jobs.rectangle(region),
+        region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
     )
     display.verdict(verdict)
     if not verdict.passed:
@@ -199,7 +176,7 @@ def design(
     picture: Annotated[Path | None, typer.Option(help="Picture of spectra and matrix of the best set.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Before buying lamps: the crosstalk, condition number and noise that spectra predict, and the best set."""
+    """Predict crosstalk, condition number and noise from spectra, and find the best set of lamps to buy."""
     from rgbmidic_calibration import design as designs
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import check_output, named_patterns
@@ -220,7 +197,7 @@ def merge(
     out: Out = Path("calibration.json"),
     overwrite: Overwrite = False,
 ) -> None:
-    """Noise, crosstalk and registration from several files into one."""
+    """Merge noise, crosstalk and registration from several files into one."""
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import check_output
     from rgbmidic_calibration.jobs import merge_files
@@ -237,7 +214,7 @@ def show(
     picture: Annotated[Path | None, typer.Option(help="Write a picture too (PNG, PDF or SVG).")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """A calibration file in words, and in one picture."""
+    """Show a calibration file as tables, and in one picture."""
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import check_output

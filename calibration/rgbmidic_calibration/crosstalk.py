@@ -2,9 +2,8 @@
 
 For each light the channel that sees it best is the reference; the entries of the other channels are ratios to it,
 estimated from block averages (`rgbmidic_calibration.ratio`). The covariance of A adds to the scatter of the blocks the
-error of the dark level, which is common to all blocks and all lights, and what the captures scatter beyond their noise.
-
-What is found for one light, and whether all of them together can be true.
+error of the dark level, which is common to all blocks and all lights, and the scatter of the captures beyond their
+noise. The fitted columns are then checked against the names of the lights and against each other.
 """
 
 from __future__ import annotations
@@ -37,11 +36,70 @@ BLACK_LEVEL_STD = 0.3
 """Standard uncertainty (DN) of a black level that no series of dark frames measured: rounded to whole grey levels."""
 
 MIN_BLOCKS = 9
+"""Unsaturated blocks per capture at least: as many as the smallest frame has, 3 x 3 (`block_means`)."""
 AUTOMATIC_ORDER = 2
+"""Largest degree that the data may ask for: shading by lens and filters is a slope and a curvature."""
 LARGEST_ORDER = 4
+"""Largest degree that may be stated: 15 coefficients per entry. Chosen; higher ones only follow the noise of blocks."""
 FIELD_SIGNIFICANCE = 1e-3
+"""Significance level of the test for variation over the field. With 4999 random signs p is at least 2e-4."""
 FIELD_TOLERANCE = 5e-4
-"""Variation of an entry over the field (rms) that is let be, however significant: it leaks 0.05 % at most."""
+"""Variation of an entry over the field (rms) that is accepted, however significant: it leaks 0.05 % at most."""
+COLOURS = ("red", "green", "blue")
+
+INTENSITY_WARNING, DELIBERATE = 0.05, 0.30
+"""Range of the strengths, relative to their mean, between which the lamp is reported as drifting. Chosen; captures that
+differ by more are an exposure series, which is meant."""
+COLOUR_DRIFT_WARNING = 5e-4
+"""Scatter of an entry between captures: as `FIELD_TOLERANCE`, it leaks 0.05 %."""
+OFFSET_WARNING, OFFSET_SIGNIFICANCE = 0.002, 5.0
+"""Fraction of the signal, and standard uncertainties, from which an offset is reported: it leaks 0.2 %, of the order of
+what `check` allows (`rgbmidic_calibration.verify.Limits.leakage`)."""
+CONDITION_WARNING = 6.0
+"""Chosen: three LEDs on nine measured cameras give 1.6 to 2.5 (calibration/README.md). It decides on a warning only."""
+REJECTED_WARNING = 0.05
+"""Fraction of the blocks left out as outliers; of normal noise it is below 1e-5. It decides on a warning only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LightFit:
+    """Fit of one light's column of A, with its diagnostics.
+
+    Attributes
+    ----------
+    name : str
+    reference : int
+        Channel that sees the light best.
+    column : ndarray, shape (C,)
+        Column of A; 1 in the reference channel.
+    signal : float
+        Mean grey level (DN above dark) of the reference channel in the blocks used.
+    used, saturated, rejected : float
+        Fractions of the blocks that were used, left out as saturated, and left out as outliers.
+    intensity_drift : float
+        Range of the light's strength over the captures, relative to its mean.
+    colour_drift : float
+        Largest scatter (standard deviation) of an entry between captures beyond their noise.
+    offset, offset_std : ndarray, shape (C,)
+        Grey level that remains where the light is absent, and its uncertainty (`ratio.offsets_left`).
+    variation : Variation
+        The test whether the column varies over the field.
+    captures : int
+    """
+
+    name: str
+    reference: int
+    column: FloatArray
+    signal: float
+    used: float
+    saturated: float
+    rejected: float
+    intensity_drift: float
+    colour_drift: float
+    offset: FloatArray
+    offset_std: FloatArray
+    variation: Variation
+    captures: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +124,8 @@ class CrosstalkEstimate:
 
 @dataclass(frozen=True, slots=True)
 class _Dark:
+    """Dark level of the channels, with the covariances of its error."""
+
     level: FloatArray  # (C, R, S) mean dark signal above the stated black level
     mean_covariance: FloatArray  # (C, C) of the error of that mean, common to all blocks
     frame_covariance: FloatArray  # (C, C) of one frame's own offset
@@ -73,6 +133,8 @@ class _Dark:
 
 @dataclass(frozen=True, slots=True)
 class _Light:
+    """Captures of one light above dark, the blocks that are not saturated, and the channel that sees it best."""
+
     name: str
     captures: Sequence[BlockMeans]
     signal: FloatArray
@@ -111,7 +173,10 @@ def estimate_crosstalk(
         The captures cannot give a trustworthy matrix: too dark, saturated, of different sizes, of another light than
         named, of a wrong colour filter array, or contradicting each other.
     """
-    _check_options(order, allow)
+    if unknown := sorted(set(allow) - set(CHECKS)):
+        raise CalibrationError(f"unknown check {', '.join(unknown)}; those that can be waived are {', '.join(CHECKS)}")
+    if order is not None and not 0 <= order <= LARGEST_ORDER:
+        raise CalibrationError(f"the degree of the field is 0 to {LARGEST_ORDER}, not {order}")
     warnings = check_captures(lights, dark, allow=allow, labels=labels or {})
     like = next(iter(lights.values()))[0]
     offset = _dark_level(dark, like)
@@ -131,13 +196,6 @@ def estimate_crosstalk(
         dark_std=np.sqrt(np.diag(offset.mean_covariance)),
         warnings=tuple(warnings),
     )
-
-
-def _check_options(order: int | None, allow: Sequence[str]) -> None:
-    if unknown := sorted(set(allow) - set(CHECKS)):
-        raise CalibrationError(f"unknown check {', '.join(unknown)}; those that can be waived are {', '.join(CHECKS)}")
-    if order is not None and not 0 <= order <= LARGEST_ORDER:
-        raise CalibrationError(f"the degree of the field is 0 to {LARGEST_ORDER}, not {order}")
 
 
 def _dark_level(dark: Sequence[BlockMeans], like: BlockMeans) -> _Dark:
@@ -225,56 +283,6 @@ def _covariance(columns: Sequence[ColumnFit], dark: _Dark) -> FloatArray:
     return full
 
 
-COLOURS = ("red", "green", "blue")
-
-INTENSITY_WARNING, DELIBERATE = 0.05, 0.30
-"""Captures whose strengths differ by more than the second are meant to: an exposure series."""
-COLOUR_DRIFT_WARNING = 5e-4
-OFFSET_WARNING, OFFSET_SIGNIFICANCE = 0.002, 5.0
-CONDITION_WARNING = 6.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LightFit:
-    """What was found for one light.
-
-    Attributes
-    ----------
-    name : str
-    reference : int
-        Channel that sees the light best.
-    column : ndarray, shape (C,)
-        Column of A; 1 in the reference channel.
-    signal : float
-        Mean grey level (DN above dark) of the reference channel in the blocks used.
-    used, saturated, rejected : float
-        Shares of the blocks that were used, left out as saturated, and left out as outliers.
-    intensity_drift : float
-        Range of the light's strength over the captures, relative to its mean.
-    colour_drift : float
-        Largest scatter (standard deviation) of an entry between captures beyond their noise.
-    offset, offset_std : ndarray, shape (C,)
-        Grey level that is left where the light is absent, and its uncertainty (`ratio.offsets_left`).
-    variation : Variation
-        The test whether the column varies over the field.
-    captures : int
-    """
-
-    name: str
-    reference: int
-    column: FloatArray
-    signal: float
-    used: float
-    saturated: float
-    rejected: float
-    intensity_drift: float
-    colour_drift: float
-    offset: FloatArray
-    offset_std: FloatArray
-    variation: Variation
-    captures: int
-
-
 def check_matrix(fits: Sequence[LightFit], *, allow: Sequence[str]) -> list[str]:
     """Check the fitted columns: the right channel for each light's name, one light per channel, quiet lamps.
 
@@ -344,7 +352,7 @@ def _fit_warnings(fit: LightFit) -> list[str]:
             f"light {fit.name}: the {COLOURS[channel]} channel keeps {fit.offset[channel]:+.1f} DN where the light is "
             "absent: dark frames of other settings or another ambient light, or a camera that is not linear"
         )
-    if fit.rejected > 0.05:
+    if fit.rejected > REJECTED_WARNING:
         warnings.append(
             f"light {fit.name}: {100 * fit.rejected:.0f} % of the blocks are outliers: coloured or fluorescent "
             "spots on the target?"

@@ -1,4 +1,4 @@
-"""What the sub-commands print: tables for a person at the bench."""
+"""Tables that the sub-commands print, for a person at the bench."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["calibration", "crosstalk", "designs", "merged", "noise", "registrati
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
     """Print the matrix with its uncertainties, what it means for the noise, and the warnings."""
-    console = _console()
+    console = Console(highlight=False)
     _warnings(console, estimate.warnings)
     table = _matrix_table(estimate.crosstalk)
     table.add_row("signal, DN", *(f"{fit.signal:.0f}" for fit in estimate.lights))
@@ -41,7 +41,7 @@ def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
 
 def noise(estimate: NoiseEstimate, out: Path) -> None:
     """Print the noise figures per plane and the warnings."""
-    console = _console()
+    console = Console(highlight=False)
     _warnings(console, estimate.warnings)
     console.print(_noise_table(estimate.camera_noise))
     console.print(_defect_words(estimate.camera_noise))
@@ -50,20 +50,18 @@ def noise(estimate: NoiseEstimate, out: Path) -> None:
 
 def registration(estimate: RegistrationEstimate, out: Path) -> None:
     """Print the parameters of every light, how well they fit, and the warnings."""
-    console = _console()
+    console = Console(highlight=False)
     _warnings(console, estimate.warnings)
     console.print(registration_table(estimate.registration))
     for match in estimate.matches:
-        share = 100 * float(match.used.mean())
-        console.print(
-            f"{escape(match.name)}: residual {match.rms:.3f} px rms per node, {share:.0f} % of the nodes used"
-        )
+        used = 100 * float(match.used.mean())
+        console.print(f"{escape(match.name)}: residual {match.rms:.3f} px rms per node, {used:.0f} % of the nodes used")
     _written(console, out)
 
 
 def verdict(result: Verdict) -> None:
     """Print every figure with its limit, and the verdict."""
-    console = _console()
+    console = Console(highlight=False)
     _warnings(console, result.warnings)
     table = Table(title="Check of the calibration", title_justify="left")
     table.add_column("figure")
@@ -88,7 +86,7 @@ def verdict(result: Verdict) -> None:
 
 def designs(found: Sequence[Design]) -> None:
     """Print the predicted matrix of the best set of lamps, and how the other sets compare."""
-    console = _console()
+    console = Console(highlight=False)
     best = found[0]
     table = _matrix_table(best.crosstalk)
     table.title = "Predicted crosstalk of the best set" if len(found) > 1 else "Predicted crosstalk"
@@ -110,19 +108,19 @@ def designs(found: Sequence[Design]) -> None:
 
 def merged(result: Calibration, out: Path) -> None:
     """Print which sections a merged file has."""
-    console = _console()
+    console = Console(highlight=False)
     console.print(f"sections: {', '.join(_sections(result))}")
     _written(console, out)
 
 
 def calibration(result: Calibration, path: Path) -> None:
-    """Print all that a calibration file tells."""
-    console = _console()
+    """Print the content of a calibration file."""
+    console = Console(highlight=False)
     console.print(f"[bold]{escape(str(path))}[/]: {', '.join(_sections(result)) or 'empty'}")
     names = {"kind": "kind", "cfa": "pattern", "black_level": "black level", "white_level": "white level"}
-    told = [f"{word} {value}" for name, word in names.items() if (value := getattr(result, name)) is not None]
-    told += [f"{result.shape[1]} x {result.shape[0]} px"] if result.shape else []
-    console.print(f"camera: {', '.join(told) or 'nothing stated'}")
+    stated = [f"{word} {value}" for name, word in names.items() if (value := getattr(result, name)) is not None]
+    stated += [f"{result.shape[1]} x {result.shape[0]} px"] if result.shape else []
+    console.print(f"camera: {', '.join(stated) or 'nothing stated'}")
     if result.crosstalk is not None:
         console.print(_matrix_table(result.crosstalk))
         console.print(_matrix_words(result.crosstalk))
@@ -152,10 +150,6 @@ def registration_table(result: Registration) -> Table:
         cells = [f"{value:.4f}" + ("" if std is None else f" ± {std[term]:.4f}") for term, value in enumerate(values)]
         table.add_row(escape(name), *cells)
     return table
-
-
-def _console() -> Console:
-    return Console(highlight=False)
 
 
 def _sections(result: Calibration) -> list[str]:
@@ -201,7 +195,8 @@ def _noise_table(result: CameraNoise) -> Table:
         ("PRNU, %", result.prnu, 3),
     ]
     for name, quantity, digits in rows:
-        table.add_row(name, *(_figure(v, s, digits) for v, s in zip(quantity.value, quantity.std, strict=True)))
+        pairs = zip(quantity.value, quantity.std, strict=True)
+        table.add_row(name, *(f"{v:.{digits}f} ± {s:.{digits}f}" if np.isfinite(v) else "-" for v, s in pairs))
     table.add_row("dynamic range, dB", *(f"{value:.1f}" for value in result.dynamic_range))
     return table
 
@@ -209,10 +204,6 @@ def _noise_table(result: CameraNoise) -> Table:
 def _defect_words(result: CameraNoise) -> str:
     counts = [f"{sum(kind == name for *_, kind in result.defects)} {name}" for name in ("hot", "dead")]
     return f"pixels to distrust: {', '.join(counts)}"
-
-
-def _figure(value: float, std: float, digits: int) -> str:
-    return f"{value:.{digits}f} ± {std:.{digits}f}" if np.isfinite(value) else "-"
 
 
 def _entry(value: float, std: float | None) -> str:

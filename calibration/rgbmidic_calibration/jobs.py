@@ -1,6 +1,6 @@
-"""From capture files to sections of a calibration: what the sub-commands do, without the printing.
+"""Sections of a calibration from capture files, and several calibration files merged into one.
 
-Several calibration files into one: noise, crosstalk and registration are often measured on different days.
+Noise, crosstalk and registration are often measured on different days, hence the merging.
 """
 
 from __future__ import annotations
@@ -8,11 +8,10 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from rgbmidic.command import read_shape
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
@@ -28,54 +27,30 @@ __all__ = [
     "calibrate_crosstalk",
     "calibrate_noise",
     "calibrate_registration",
+    "captures_as_stated",
     "field_order",
     "find_groups",
     "merge_files",
-    "rectangle",
-    "statement",
 ]
 
-KINDS = ("bayer", "rgb", "monochrome")
 LIT = 0.1
 """Mean above black, relative to the full scale, of a plane whose histogram is looked at: in the dark, noise is too
 little to smooth it. Some cameras apply gains of their own to red and blue, so all planes are."""
-DTYPES = ("uint8", "uint16", ">u2")
 
 
-def statement(
-    kind: str | None,
-    cfa: str | None,
-    black_level: float | None,
-    white_level: float | None,
-    shape: str | None = None,
-    dtype: str | None = None,
-) -> FrameSettings:
-    """What the options say about the files.
+def captures_as_stated(statement: Mapping[str, Any]) -> FrameSettings:
+    """Settings of the captures as options state them (`rgbmidic.command.read_statement`).
 
     Raises
     ------
     ConfigurationError
-        An option has a value that is not allowed.
+        An option has a value that is not allowed; the option is named.
     """
-    for option, value, allowed in (("--kind", kind, KINDS), ("--dtype", dtype, DTYPES)):
-        if value is not None and value not in allowed:
-            raise ConfigurationError(f"{option} is one of {', '.join(allowed)}, not {value!r}")
     try:
-        return FrameSettings(
-            path=("captures",),
-            kind=cast(Any, kind),
-            cfa=cfa,
-            black_level=black_level,
-            white_level=white_level,
-            shape=read_shape(shape),
-            dtype=cast(Any, dtype),
-        )
+        return FrameSettings(path=("captures",), **statement)
     except ConfigurationError as error:
-        raise ConfigurationError(re.sub(r"frames\.(\w+)", _as_option, str(error))) from None
-
-
-def _as_option(key: re.Match[str]) -> str:
-    return "--" + key[1].replace("_", "-")
+        as_options = re.sub(r"frames\.(\w+)", lambda key: "--" + key[1].replace("_", "-"), str(error))
+        raise ConfigurationError(as_options) from None
 
 
 def field_order(text: str) -> int | None:
@@ -88,24 +63,24 @@ def field_order(text: str) -> int | None:
 
 
 def find_groups(
-    lights: Mapping[str, str], dark: str | None, told: FrameSettings
+    lights: Mapping[str, str], dark: str | None, stated: FrameSettings
 ) -> tuple[dict[str, CaptureFiles], CaptureFiles | None]:
     """Files of every light and of the dark frames."""
-    found = {name: CaptureFiles.find(f"light {name}", pattern, told) for name, pattern in lights.items()}
-    return found, None if dark is None else CaptureFiles.find("dark", dark, told)
+    found = {name: CaptureFiles.find(f"light {name}", pattern, stated) for name, pattern in lights.items()}
+    return found, None if dark is None else CaptureFiles.find("dark", dark, stated)
 
 
 def calibrate_crosstalk(
     lights: Mapping[str, str],
     dark: str | None,
-    told: FrameSettings,
+    stated: FrameSettings,
     *,
     block: int = 16,
     order: int | None = None,
     allow: Sequence[str] = (),
 ) -> tuple[Calibration, CrosstalkEstimate]:
     """Crosstalk section from capture files: patterns by light, pattern of the dark frames, what is stated of them."""
-    found, dark_files = find_groups(lights, dark, told)
+    found, dark_files = find_groups(lights, dark, stated)
     uneven: list[float] = []
     means = {name: _reduce(files, block, uneven) for name, files in found.items()}
     dark_means = _reduce(dark_files, block, uneven) if dark_files else []
@@ -128,7 +103,7 @@ def calibrate_crosstalk(
     return calibration, estimate
 
 
-def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
+def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
     """Noise section from capture files.
 
     Parameters
@@ -138,11 +113,11 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
     flats
         Patterns of the flat frames. A pattern ``TIME=FILES`` is one exposure with its time; else the files of every
         folder are one exposure.
-    told
+    stated
         What is stated of the files.
     """
-    dark_files = CaptureFiles.find("dark", dark, told)
-    groups = [group for text in flats for group in _exposures(text, told)]
+    dark_files = CaptureFiles.find("dark", dark, stated)
+    groups = [group for text in flats for group in _exposures(text, stated)]
     dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames")
     stacks = [stack_frames(files.frames(), exposure=time, name=files.role) for files, time in groups]
     estimate = photon_transfer(dark_stack, stacks)
@@ -159,13 +134,13 @@ def calibrate_noise(dark: str, flats: Sequence[str], told: FrameSettings) -> tup
 def calibrate_registration(
     lights: Mapping[str, str],
     dark: str | None,
-    told: FrameSettings,
+    stated: FrameSettings,
     *,
     region: Sequence[float] | None = None,
     element_size: float = ELEMENT,
 ) -> tuple[Calibration, RegistrationEstimate]:
     """Registration section from capture files of a speckled target: patterns by light, the first is the reference."""
-    found, dark_files = find_groups(lights, dark, told)
+    found, dark_files = find_groups(lights, dark, stated)
     dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames") if dark_files else None
     stacks = {name: stack_frames(files.frames(), name=files.role) for name, files in found.items()}
     estimate = estimate_registration(stacks, dark_stack, region=region, element_size=element_size)
@@ -183,29 +158,18 @@ def calibrate_registration(
     ), estimate
 
 
-def rectangle(text: str | None) -> tuple[float, float, float, float] | None:
-    """Rectangle that ``--region`` states as x0,y0,x1,y1 in px."""
-    if text is None:
-        return None
-    try:
-        x0, y0, x1, y1 = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ConfigurationError(f"--region is x0,y0,x1,y1 in px, not {text!r}") from None
-    return x0, y0, x1, y1
-
-
-def _exposures(text: str, told: FrameSettings) -> list[tuple[CaptureFiles, float | None]]:
+def _exposures(text: str, stated: FrameSettings) -> list[tuple[CaptureFiles, float | None]]:
     time, separator, pattern = text.partition("=")
     if separator:
         try:
-            return [(CaptureFiles.find(f"flat exposure {time}", pattern, told), float(time))]
+            return [(CaptureFiles.find(f"flat exposure {time}", pattern, stated), float(time))]
         except ValueError:
             raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
-    return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, told).by_folder()]
+    return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, stated).by_folder()]
 
 
 def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
-    """Of the histogram of every lit plane, where it can be told."""
+    """Unevenness of the histogram of every lit plane, where it can be determined."""
     found = []
     for plane, black in zip(*planes_of(capture)[1:], strict=True):
         if plane.mean() > black + LIT * (capture.white_level - black):
@@ -214,17 +178,19 @@ def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
 
 
 def _camera(files: CaptureFiles, uneven: Sequence[float]) -> dict[str, Any]:
-    """Camera settings of a calibration, from the first of its frames, and how even the grey levels of lit ones are;
-    levels that nobody stated or tells stay open."""
-    told, frame = files.series.lights[0][0].stored(0), next(files.frames())
+    """Camera settings of a calibration, from the first of its frames, and how even the grey levels of lit ones are.
+
+    Levels that neither the file nor the user states stay open.
+    """
+    header, frame = files.series.lights[0][0].stored(0), next(files.frames())
     levels = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
-    said = {name for name in levels for source in (told, files.stated) if getattr(source, name) is not None}
+    stated = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
     kind = "bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome"
     return {
         "kind": kind,
         "unevenness": max(uneven, default=None),
         "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
-        **{name: level for name, level in levels.items() if name in said},
+        **{name: level for name, level in levels.items() if name in stated},
         "shape": (frame.values.shape[-2], frame.values.shape[-1]),
     }
 

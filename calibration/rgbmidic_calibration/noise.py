@@ -11,32 +11,36 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.linearise import CameraNoise, Quantity
 from rgbmidic.typing import FloatArray
-from rgbmidic_calibration.captures import TemporalStack, same_camera
+from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
 from rgbmidic_calibration.plausibility import fixed_pattern
 
 __all__ = ["NoiseEstimate", "TransferCurve", "photon_transfer"]
 
 
-BLOCK = 16
-"""Side of the blocks, in samples of a plane."""
-
 HIGHEST = 0.9
-"""Blocks brighter than this share of the range are not used: the variance falls as samples reach white."""
+"""Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white. Chosen."""
 
 KNEE = 0.8
-"""Variance over its prediction below which the sensor itself saturates before the white level does."""
+"""Variance over its prediction below which the sensor itself saturates before the white level does. Chosen: tiles must
+fall below it by three standard deviations as well."""
 
 DRIFT_LIMIT, DRIFT_WARNING = 0.2, 0.02
+"""Drift of the lamp's strength within an exposure (`TemporalStack.drift`). Chosen: frames are scaled to one strength,
+so that drift does no harm; a fifth is another exposure rather than a lamp that warms up."""
 RANGE_WARNING = 0.2
+"""Fraction of the range: the relative error of the gain grows as its inverse. Chosen; it decides on a warning only."""
 SCATTER_WARNING = 1.5
+"""Scatter of the tiles' variances over that of noise alone: chosen; it decides on a warning only."""
 CURVE_WARNING, BEND_SIGNIFICANCE = 0.03, 4.0
+"""Departure of an exposure from the line, beyond so many standard deviations. Chosen; it decides on a warning only."""
 ZEROS_WARNING = 0.005
+"""Fraction of dark samples cut off at 0: chosen; of normal noise this lies 2.6 standard deviations above the cut."""
 PLANES_WARNING = 0.05
+"""Relative difference of the planes' gains: chosen; it decides on a warning only."""
 LINEARITY_WARNING = 0.5
 """Linearity error LE (%) from which lights that shine together are not the sum of the single ones to within what
 `check` allows (`rgbmidic_calibration.verify.Limits.additivity`); EMVA 1288 defines the figure and sets no limit."""
@@ -74,6 +78,8 @@ class NoiseEstimate:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
+    """Line of variance over mean of one plane."""
+
     read_variance: float
     slope: float
     covariance: FloatArray  # (2, 2)
@@ -134,11 +140,10 @@ def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
     if not flats:
         raise CalibrationError("no flat exposure is given: the gain needs lit frames at one exposure at least")
     for index, flat in enumerate(flats):
-        drift = float((np.ptp(flat.strength, axis=0) / np.maximum(flat.strength.mean(axis=0), 1)).max())
-        if drift > DRIFT_LIMIT:
+        if flat.drift > DRIFT_LIMIT:
             raise CalibrationError(
-                f"flat exposure {index + 1}: the frames' strengths differ by {100 * drift:.0f} %: each group must be "
-                "frames of one exposure with a steady lamp"
+                f"flat exposure {index + 1}: the frames' strengths differ by {100 * flat.drift:.0f} %: each group "
+                "must be frames of one exposure with a steady lamp"
             )
         if flat.piled_at is not None:
             raise CalibrationError(
@@ -150,28 +155,20 @@ def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
         raise CalibrationError("the dark frames are not darker than half of the brightest flat frames: was a lamp on?")
 
 
-def _blocks(values: npt.NDArray[np.generic]) -> FloatArray:
-    """Means over blocks of BLOCK x BLOCK samples, flattened; a border that does not fill a block is left out."""
-    size = min(BLOCK, *values.shape)
-    rows, columns = (side // size for side in values.shape)
-    cut = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
-    return np.asarray(cut.mean(axis=(1, 3), dtype=np.float64).ravel())
-
-
 def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -> _Line:
     """Line of variance over mean through the blocks of all exposures, weighted by the variance of a variance."""
-    level = _blocks(dark.mean[plane])
+    level = tile_means(dark.mean[plane])
     range_ = dark.white - float(dark.black[plane])
-    points = [(np.zeros_like(level), _blocks(dark.variance[plane]), dark.count)]
+    points = [(np.zeros_like(level), tile_means(dark.variance[plane]), dark.count)]
     for flat in flats:
-        mean = _blocks(flat.mean[plane]) - level
-        good = (_blocks(flat.clipped[plane]) == 0) & (mean + level < HIGHEST * range_)
-        variance = _blocks(flat.variance[plane])
+        mean = tile_means(flat.mean[plane]) - level
+        good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < HIGHEST * range_)
+        variance = tile_means(flat.variance[plane])
         points.append((np.where(good, mean, np.nan), variance, flat.count))
     exposure = np.concatenate([np.full(len(m), i) for i, (m, _, _) in enumerate(points)])
     mean = np.concatenate([m for m, _, _ in points])
     variance = np.concatenate([v for _, v, _ in points])
-    freedom = np.concatenate([np.full(len(m), BLOCK**2 * (n - 1)) for m, _, n in points])
+    freedom = np.concatenate([np.full(len(m), TILE**2 * (n - 1)) for m, _, n in points])
     used = np.isfinite(mean)
     if not (used & (exposure > 0)).any():
         raise CalibrationError(
@@ -241,10 +238,10 @@ def _saturation(
 def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line) -> float | None:
     lowest: float | None = None
     for flat in flats:
-        mean = _blocks(flat.mean[plane]) - _blocks(dark.mean[plane])
-        free = _blocks(flat.clipped[plane]) == 0
-        ratio = _blocks(flat.variance[plane]) / (line.read_variance + line.slope * np.maximum(mean, 0))
-        noise = np.sqrt(2 / (BLOCK**2 * (flat.count - 1)))
+        mean = tile_means(flat.mean[plane]) - tile_means(dark.mean[plane])
+        free = tile_means(flat.clipped[plane]) == 0
+        ratio = tile_means(flat.variance[plane]) / (line.read_variance + line.slope * np.maximum(mean, 0))
+        noise = np.sqrt(2 / (TILE**2 * (flat.count - 1)))
         broken = free & (ratio < KNEE - 3 * noise) & (mean > 0.3 * (dark.white - dark.black[plane]))
         if broken.sum() > 0.02 * len(mean):
             knee = float(np.median(mean[broken]))
@@ -280,7 +277,7 @@ def _warnings(
             f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise "
             "comes out too small; raise the camera's black level (offset)"
         )
-    drift = max(float((np.ptp(f.strength, axis=0) / np.maximum(f.strength.mean(axis=0), 1)).max()) for f in flats)
+    drift = max(flat.drift for flat in flats)
     if drift > DRIFT_WARNING:
         warnings.append(f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out")
     reach = max(float(curve.mean.max()) for curve in curves)

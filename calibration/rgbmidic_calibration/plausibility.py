@@ -1,8 +1,7 @@
-"""Checks of the captures that keep a mistake with lamps, files or settings from becoming a wrong crosstalk matrix.
+"""Plausibility of the captures before anything is fitted, and the fixed pattern and defects of the sensor.
 
-A check that fails is an error; the user who knows better waives it by name. What is merely worth knowing is a warning.
-
-Fixed pattern and defects of the sensor: DSNU, PRNU, hot and dead pixels (EMVA standard 1288, sections 4 and 8).
+A check that fails is an error, unless it is waived by name; what is merely worth knowing is a warning. The fixed
+pattern (DSNU, PRNU) and hot and dead pixels follow EMVA standard 1288, sections 4 and 8.
 """
 
 from __future__ import annotations
@@ -35,18 +34,24 @@ CHECKS = {
     "white-level": "no samples pile up below the white level",
 }
 
-DARK_SHARE_LIMIT = 0.10
-"""Dark frames brighter than this share of the weakest light's own signal are not dark."""
+DARK_FRACTION_LIMIT = 0.10
+"""Dark frames brighter than this fraction of the weakest light's own signal are not dark."""
 DARK_SCALE_LIMIT = 0.05
-"""Dark frames brighter than this share of the full scale are not dark."""
+"""Dark frames brighter than this fraction of the full scale are not dark."""
 DARK_WARNING = 0.005
+"""Fraction of the full scale by which dark frames may differ from each other, or from black: chosen; as leakage, it is
+of the order of what `check` allows (`rgbmidic_calibration.verify.Limits.leakage`)."""
 DARK_LEVEL_WARNING = 2.0
 """Departure (DN) of the dark frames from the stated black level that the user should know of."""
 GREENS_LIMIT, GREENS_WARNING = 0.08, 0.03
+"""Difference of the two green planes over the strongest channel. Chosen: with the right pattern the greens differ by
+their filters only, with a wrong one they are two colours."""
 WEAK_LIMIT, WEAK_WARNING = 0.01, 0.10
+"""Signal over full scale: chosen; 30 to 70 % is advised (calibration/README.md)."""
 COLOUR_LIMIT = 0.02
 """A capture whose entry departs by more than this from the median of its light is another picture."""
 DETAIL_LIMIT = 0.6
+"""Detail of a capture over the median of its light: chosen; it decides on a warning only."""
 
 
 def check_captures(
@@ -68,7 +73,13 @@ def check_captures(
     CalibrationError
         A check that is not waived by `allow` fails.
     """
-    _check_presence(lights)
+    if not lights:
+        raise CalibrationError("no light is given: state each with --light NAME=FILES")
+    if len(lights) > 3:
+        raise CalibrationError(f"a camera with three channels separates at most three lights, not {len(lights)}")
+    for name, captures in lights.items():
+        if not captures:
+            raise CalibrationError(f"light {name} has no captures")
     _check_sizes({**lights, "dark": dark}, labels)
     warnings: list[str] = []
 
@@ -84,16 +95,6 @@ def check_captures(
         warnings += _check_greens(name, captures, level, report)
         warnings += _check_agreement(name, captures, level, labels.get(name, ()), report)
     return warnings
-
-
-def _check_presence(lights: Mapping[str, Sequence[BlockMeans]]) -> None:
-    if not lights:
-        raise CalibrationError("no light is given: state each with --light NAME=FILES")
-    if len(lights) > 3:
-        raise CalibrationError(f"a camera with three channels separates at most three lights, not {len(lights)}")
-    for name, captures in lights.items():
-        if not captures:
-            raise CalibrationError(f"light {name} has no captures")
 
 
 def _check_sizes(groups: Mapping[str, Sequence[BlockMeans]], labels: Labels) -> None:
@@ -146,7 +147,7 @@ def _check_dark(
         for captures in lights.values()
     ]
     level = float(median.max())
-    if level > DARK_SCALE_LIMIT * scale or level > max(DARK_WARNING * scale, DARK_SHARE_LIMIT * min(brightest)):
+    if level > DARK_SCALE_LIMIT * scale or level > max(DARK_WARNING * scale, DARK_FRACTION_LIMIT * min(brightest)):
         report(
             "ambient",
             f"the dark frames are not dark: {level:.1f} DN above the black level, where the weakest light with its "
@@ -204,15 +205,15 @@ def _check_greens(
     clear = [~frame.saturated for frame in captures]
     brightest = np.mean([(f.channels - level)[:, c].mean(axis=1).max() for f, c in zip(captures, clear, strict=True)])
     gap = np.mean([(f.planes[1] - f.planes[2])[c].mean() for f, c in zip(captures, clear, strict=True)])
-    share = abs(float(gap / max(brightest, 1e-9)))
+    difference = abs(float(gap / max(brightest, 1e-9)))
     message = (
-        f"light {name}: the two green planes differ by {100 * share:.1f} % of the strongest channel: "
+        f"light {name}: the two green planes differ by {100 * difference:.1f} % of the strongest channel: "
         "is the colour filter array (--cfa) right?"
     )
-    if share > GREENS_LIMIT:
+    if difference > GREENS_LIMIT:
         report("greens", message)
         return []
-    return [message] if share > GREENS_WARNING else []
+    return [message] if difference > GREENS_WARNING else []
 
 
 def _check_agreement(
@@ -248,14 +249,15 @@ WINDOW = 7
 """Side (samples of a plane) of the neighbourhood whose mean is taken out: shading and dirt are wider than this."""
 
 HOT = 8.0
-"""Robust standard deviations above the neighbourhood's median that make a pixel hot in the dark."""
-HOT_SHARE = 0.005
-"""Share of the full scale that a hot pixel exceeds its neighbourhood by at least."""
-DEAD_SHARE = 0.5
-"""Response relative to the neighbourhood's median below which a pixel is dead."""
+"""Robust standard deviations above the neighbourhood's median that make a pixel hot in the dark: chosen; of
+normal noise one sample in 1e15 lies there."""
+HOT_FRACTION = 0.005
+"""Fraction of the full scale that a hot pixel exceeds its neighbourhood by at least: chosen."""
+DEAD_FRACTION = 0.5
+"""Response relative to the neighbourhood's median below which a pixel is dead: chosen."""
 
 TEXTURED = 0.05
-"""Local variation of the response above which the target, not the sensor, is uneven."""
+"""Local variation of the response above which the target, not the sensor, is uneven: chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,7 +277,9 @@ def fixed_pattern(dark: TemporalStack, flats: Sequence[TemporalStack], saturatio
     """
     dsnu, prnu, defects, textured = [], [], [], []
     for plane, name in enumerate(dark.names):
-        hot = _hot(dark, plane)
+        excess = dark.mean[plane] - ndimage.median_filter(dark.mean[plane], 5)
+        floor = HOT_FRACTION * (dark.white - float(dark.black[plane]))
+        hot = excess > max(HOT * float(np.median(np.abs(excess))) / 0.6745, floor)
         level = _spread(dark.mean[plane], dark.variance[plane] / dark.count, ~hot)
         dsnu.append(level)
         flat = min(flats, key=lambda f: abs(float(f.strength[:, plane].mean()) - saturation.value[plane] / 2))
@@ -285,40 +289,28 @@ def fixed_pattern(dark: TemporalStack, flats: Sequence[TemporalStack], saturatio
             response, dead = None, np.zeros_like(hot)
         prnu.append((100 * response[0], 100 * response[1]) if response else (np.nan, np.nan))
         defects += [*_places(dark, plane, hot, "hot"), *_places(dark, plane, dead & ~hot, "dead")]
+    warnings = [
+        f"the target is textured or the lamp uneven (local variation {', '.join(textured)}): PRNU and dead pixels need "
+        "a plain white target out of focus"
+    ]
     values, uncertainties = np.array(dsnu).T
     responses, response_uncertainties = np.array(prnu).T
     return FixedPattern(
         dsnu=Quantity(values, uncertainties),
         prnu=Quantity(responses, response_uncertainties),
         defects=tuple(sorted(defects)),
-        warnings=_texture_warning(textured),
+        warnings=tuple(warnings if textured else ()),
     )
-
-
-def _texture_warning(planes: Sequence[str]) -> tuple[str, ...]:
-    if not planes:
-        return ()
-    return (
-        f"the target is textured or the lamp uneven (local variation {', '.join(planes)}): PRNU and dead pixels need a "
-        "plain white target out of focus",
-    )
-
-
-def _hot(dark: TemporalStack, plane: int) -> BoolArray:
-    excess = dark.mean[plane] - ndimage.median_filter(dark.mean[plane], 5)
-    spread = float(np.median(np.abs(excess))) / 0.6745
-    floor = HOT_SHARE * (dark.white - float(dark.black[plane]))
-    return np.asarray(excess > max(HOT * spread, floor))
 
 
 def _response(
     dark: TemporalStack, flat: TemporalStack, plane: int, hot: BoolArray
 ) -> tuple[tuple[float, float] | None, BoolArray]:
-    """Relative spread of the response with its uncertainty, None where it cannot be told; dead pixels."""
+    """Relative spread of the response with its uncertainty, None where it cannot be determined; dead pixels."""
     signal = flat.mean[plane] - dark.mean[plane]
     around = ndimage.median_filter(signal, 5)
     usable = ~hot & ~flat.clipped[plane]
-    dead = usable & (signal < DEAD_SHARE * around) & (around > 0.02 * (flat.white - flat.black[plane]))
+    dead = usable & (signal < DEAD_FRACTION * around) & (around > 0.02 * (flat.white - flat.black[plane]))
     level = float(signal[usable].mean()) if usable.any() else 0.0
     if level < 0.02 * (flat.white - float(flat.black[plane])):
         return None, np.zeros_like(dead)

@@ -1,20 +1,19 @@
-"""One column of A from one light's block averages: ratios of sums, constant or varying over the field.
+"""Columns of the crosstalk matrix A from the block averages of single-light captures.
 
-With x the reference channel's block average, y another channel's and phi the Legendre products over the field, the
-entry a(position) = sum_t a_t phi_t solves
+*Block averages.* The samples of different channels of a Bayer mosaic lie at different points of the target, so on a
+speckled target their ratio pixel by pixel is meaningless. Averages over a block are comparable, provided that every
+plane's average is taken about the same point: the window is a box convolved with [1 2 1] in rows and columns. Its
+transfer function has a triple zero at the carriers of the 2x2 cell, hence the four planes see the mean, the slope and
+the curvature of the picture alike.
+
+*Ratios of sums.* With x the reference channel's block average, y another channel's and phi the Legendre products over
+the field, the entry a(position) = sum_t a_t phi_t solves
 
     sum over blocks of  w phi (y - x sum_t a_t phi_t) = 0,
 
 an instrumental-variable estimate: the instrument is the position, which carries no noise, so noise in x does not
 attenuate a as it does in least squares (Fuller, Measurement Error Models, 1987, section 1.4). The covariance is the
 cluster sandwich: the scatter of the score over neighbouring blocks, whatever causes it (noise, the texture's aliasing).
-
-Block averages of each colour plane: what the calibration compares instead of single samples.
-
-The samples of different channels of a Bayer mosaic lie at different points of the target, so on a speckled target
-their ratio pixel by pixel says nothing. Averages over a block do, provided that every plane's average is taken about
-the same point: the window is a box convolved with [1 2 1] in rows and columns. Its transfer function has a triple zero
-at the carriers of the 2x2 cell, hence the four planes see the mean, the slope and the curvature of the picture alike.
 """
 
 from __future__ import annotations
@@ -42,219 +41,6 @@ __all__ = [
     "saturation_pile",
     "variation",
 ]
-
-OUTLIER = 5.0
-"""Robust standard deviations beyond which a block is left out: a fluorescent spot, a label, a hot cluster."""
-
-DRIFT_SIGNIFICANCE = 0.01
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ColumnFit:
-    """A column of A as a polynomial over the field.
-
-    Attributes
-    ----------
-    coefficients : ndarray, shape (T, C)
-        Per Legendre product and channel; (1, 0, 0 ...) in the reference channel.
-    covariance : ndarray, shape (T, C, T, C)
-        From the scatter of the blocks.
-    leverage : ndarray, shape (T, C, C)
-        Change of the coefficients per grey level that all blocks of a channel (last axis) have too much.
-    weights : ndarray, shape (N, R, S)
-        1 for the blocks used, 0 for the others.
-    residual : ndarray, shape (N, C, R, S)
-        y - a x of the blocks used, 0 elsewhere.
-    mass : ndarray, shape (N,)
-        Sum of the reference channel over the blocks used, per capture.
-    """
-
-    coefficients: FloatArray
-    covariance: FloatArray
-    leverage: FloatArray
-    weights: FloatArray
-    residual: FloatArray
-    mass: FloatArray
-
-
-def fit_column(signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray) -> ColumnFit:
-    """Fit one light's column.
-
-    Parameters
-    ----------
-    signal : ndarray, shape (N, C, R, S)
-        Block averages above dark of N captures.
-    valid : ndarray, shape (N, R, S), bool
-        Blocks without saturated samples.
-    reference
-        Channel the others are compared with.
-    design : ndarray, shape (R, S, T)
-        Legendre products at the blocks' centres; T = 1 for a constant column.
-    """
-    base = signal[:, reference]
-    weights, coefficients = _without_outliers(signal, valid, reference, design)
-    residual = weights[:, None] * _residual(signal, base, design, coefficients)
-    inverse = np.linalg.inv(_moment(weights * base, design))
-    score = np.einsum("ncrs,rst->tcrs", residual, design)
-    sums = _cluster_sums(score.reshape(-1, *score.shape[2:]))
-    count = max(len(sums), 2)
-    terms, channels = coefficients.shape
-    spread = (sums.T @ sums * count / (count - 1)).reshape(terms, channels, terms, channels)
-    lever = np.einsum("tu,uc,cd->tcd", inverse, _total(weights, design)[:, None], np.eye(channels))
-    lever[:, :, reference] -= inverse @ _moment(weights, design) @ coefficients
-    return ColumnFit(
-        coefficients=coefficients,
-        covariance=np.einsum("tu,ucvd,wv->tcwd", inverse, spread, inverse),
-        leverage=lever,
-        weights=weights,
-        residual=residual,
-        mass=(weights * base).sum(axis=(1, 2)),
-    )
-
-
-def _moment(weights: FloatArray, design: FloatArray) -> FloatArray:
-    flat = design.reshape(-1, design.shape[-1])
-    return np.asarray((flat * weights.sum(axis=0).reshape(-1, 1)).T @ flat)
-
-
-def _total(weights: FloatArray, design: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nrs,rst->t", weights, design))
-
-
-def _residual(signal: FloatArray, base: FloatArray, design: FloatArray, coefficients: FloatArray) -> FloatArray:
-    return np.asarray(signal - np.einsum("rst,tc->crs", design, coefficients) * base[:, None])
-
-
-def _without_outliers(
-    signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Weights and coefficients, iterated from the median of the blocks' ratios.
-
-    Every channel's residual is compared with its median spread times the square root of x (shot noise). Weights
-    between 0 and 1 would need a correction of the sandwich and would cost efficiency.
-    """
-    base = signal[:, reference]
-    root = np.sqrt(np.maximum(base, 1e-3 * np.median(base[valid])))
-    ratios = signal / np.where(base > 0, base, np.inf)[:, None]
-    coefficients = np.zeros((design.shape[-1], signal.shape[1]))
-    coefficients[0] = np.median(ratios.transpose(0, 2, 3, 1)[valid], axis=0)
-    weights = valid.astype(np.float64)
-    for _ in range(20):
-        scaled = _residual(signal, base, design, coefficients) / root[:, None]
-        spread = np.median(np.abs(scaled.transpose(0, 2, 3, 1)[valid]), axis=0) / 0.6745
-        limit = np.where(spread > 0, OUTLIER * spread, np.inf)[:, None, None]
-        weights = (valid & (np.abs(scaled) <= limit).all(axis=1)).astype(np.float64)
-        right = np.einsum("crs,rst->tc", (weights[:, None] * signal).sum(axis=0), design)
-        update = np.linalg.solve(_moment(weights * base, design), right)
-        done = np.abs(update - coefficients).max() < 1e-10
-        coefficients = update
-        if done:
-            break
-    coefficients[:, reference] = np.eye(len(coefficients))[0]
-    return weights, coefficients
-
-
-def _cluster_sums(values: FloatArray) -> FloatArray:
-    """Sums (clusters, Q) of (Q, R, S) over 2 x 2 blocks: what spills over a block's border stays within a cluster."""
-    rows, columns = values.shape[1:]
-    step = 2 if rows * columns >= 64 else 1
-    by_rows = np.add.reduceat(values, np.arange(0, rows, step), axis=1)
-    return np.asarray(np.add.reduceat(by_rows, np.arange(0, columns, step), axis=2).reshape(len(values), -1).T)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Variation:
-    """Does a column vary over the field by certain terms?
-
-    Attributes
-    ----------
-    p_value : float
-        Probability of scores this large without that variation.
-    rms : float
-        Root mean square over the field of these terms as fitted, of the channel where it is largest.
-    """
-
-    p_value: float
-    rms: float
-
-
-def variation(signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray, known: int) -> Variation:
-    """Test whether the Legendre products after the first `known` ones are needed in any channel.
-
-    A score test with random signs: the model of the first terms is fitted, its residuals are correlated with the other
-    terms in clusters of blocks, and the sum is compared with those of 4999 random choices of the clusters' signs. It
-    keeps its level with few clusters and with heavy tails, which a Wald test with a sandwich covariance does not
-    (Cameron, Gelbach & Miller, Review of Economics and Statistics 90, 414, 2008).
-
-    Parameters
-    ----------
-    signal, valid, reference, design
-        See `fit_column`; `design` has all terms.
-    known
-        How many of the terms the null hypothesis has.
-    """
-    null = fit_column(signal, valid, reference, design[..., :known])
-    moment = _moment(null.weights * signal[:, reference], design)
-    # What the fitted terms cannot imitate of the others.
-    extra = design[..., known:] - design[..., :known] @ np.linalg.solve(moment[:known, :known], moment[:known, known:])
-    others = [c for c in range(signal.shape[1]) if c != reference]
-    score = np.einsum("crs,rst->ctrs", null.residual[:, others].sum(axis=0), extra)
-    sums = _cluster_sums(score.reshape(-1, *score.shape[2:]))
-    inverse = np.linalg.pinv(sums.T @ sums)
-    signs = np.random.default_rng(0).choice((-1.0, 1.0), (4999, len(sums)))
-    flips = signs @ sums
-    flipped = ((flips @ inverse) * flips).sum(axis=1)
-    observed = sums.sum(axis=0) @ inverse @ sums.sum(axis=0)
-    coefficients = fit_column(signal, valid, reference, design).coefficients[known:, others]
-    norms = (design[..., known:] ** 2).mean(axis=(0, 1))
-    return Variation(
-        p_value=float((1 + (flipped >= observed).sum()) / (1 + len(flipped))),
-        rms=float(np.sqrt((coefficients**2 * norms[:, None]).sum(axis=0)).max()),
-    )
-
-
-def capture_scatter(fit: ColumnFit) -> FloatArray:
-    """Variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
-
-    The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
-    """
-    count, channels = fit.residual.shape[:2]
-    if count < 2:
-        return np.zeros(channels)
-    share = fit.residual / fit.mass[:, None, None, None]
-    own = (share - share.mean(axis=0)).transpose(1, 0, 2, 3).reshape(channels, -1)
-    noise = (own**2).sum(axis=1) / (count - 1)
-    scatter = share.sum(axis=(2, 3)).var(axis=0, ddof=1)
-    limit = fdtri(count - 1, own.shape[1], 1 - DRIFT_SIGNIFICANCE / channels)
-    return np.where(scatter > limit * noise, scatter - noise, 0.0)
-
-
-def offsets_left(
-    signal: FloatArray, weights: FloatArray, reference: int, design: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
-
-    ``y = x a + o`` with the other captures' x as instrument for the slope: their noise is independent. NaN for fewer
-    than two captures. The offset of a dark level that is right is zero; on a plain target it is poorly determined.
-    """
-    count, channels = signal.shape[:2]
-    offset, std = np.full(channels, np.nan), np.full(channels, np.nan)
-    if count < 2:
-        return offset, std
-    base = signal[:, reference]
-    others = (base.sum(axis=0) - base) / (count - 1)
-    columns = [base[..., None] * design, np.ones((*base.shape, 1))]
-    instruments = [np.broadcast_to(design, (count, *design.shape)), others[..., None]]
-    left = weights[..., None] * np.concatenate(instruments, axis=-1)
-    right = np.concatenate(columns, axis=-1)
-    matrix = np.einsum("nrsi,nrsj->ij", left, right)
-    inverse = np.linalg.inv(matrix)
-    for channel in (c for c in range(channels) if c != reference):
-        solution = inverse @ np.einsum("nrsi,nrs->i", left, signal[:, channel])
-        score = (left * (signal[:, channel] - right @ solution)[..., None]).sum(axis=0)
-        sums = _cluster_sums(score.transpose(2, 0, 1)) @ inverse.T
-        offset[channel], std[channel] = solution[-1], np.sqrt((sums[:, -1] ** 2).sum())
-    return offset, std
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -336,19 +122,25 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
     step = 2 if isinstance(frame, Mosaic) else 1
     means = [
         _window(shape[0], len(plane), block, step, row) @ plane @ _window(shape[1], plane.shape[1], block, step, col).T
-        - level
-        for plane, level, (row, col) in zip(planes, black, offsets, strict=True)
+        - dark
+        for plane, dark, (row, col) in zip(planes, black, offsets, strict=True)
     ]
     stack = np.stack(means)
     brightest = int(stack.mean(axis=(1, 2)).argmax())
+    picture = planes[brightest].astype(np.float32)
+    level = max(float(picture.mean()) - float(black[brightest]), 1.0)
+    clipped = np.atleast_3d(frame.white_level <= frame.values.T).any(axis=2).T.astype(np.float32)
+    # the window is positive on the block and its rim of one pixel, 0 elsewhere
+    over_rows, over_columns = (_window(side, side, block, 1, 0) for side in shape)
+    saturated = over_rows @ clipped @ over_columns.T > 0
     return BlockMeans(
         planes=stack,
         names=names,
-        saturated=_saturated(frame, block),
+        saturated=saturated,
         full_scale=frame.white_level - float(np.mean(black)),
         shape=shape,
         block=block,
-        detail=_detail(planes[brightest], float(black[brightest])),
+        detail=float(((picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]) ** 2).mean()) / level**2,
         piled_at=saturation_pile(planes[brightest], frame.white_level),
     )
 
@@ -373,17 +165,6 @@ def _window(side: int, length: int, block: int, step: int, offset: int) -> Float
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float64)
 
 
-def _saturated(frame: Mosaic | ChannelFrame, block: int) -> BoolArray:
-    clipped = np.atleast_3d(frame.white_level <= frame.values.T).any(axis=2).T
-    rows, columns = (_starts(side, block) for side in clipped.shape)
-    # Summed-area table over each block with its rim of one pixel.
-    table = np.zeros((clipped.shape[0] + 1, clipped.shape[1] + 1), dtype=np.int64)
-    table[1:, 1:] = clipped.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
-    top, bottom, left, right = rows - 1, rows + block + 1, columns - 1, columns + block + 1
-    count = table[np.ix_(bottom, right)] - table[np.ix_(top, right)] - table[np.ix_(bottom, left)]
-    return np.asarray(count + table[np.ix_(top, left)] > 0)
-
-
 def saturation_pile(plane: npt.NDArray[np.uint16], white: float) -> float | None:
     """Largest value of a plane where it occurs far more often than the values just below it."""
     top = int(plane.max())
@@ -393,8 +174,215 @@ def saturation_pile(plane: npt.NDArray[np.uint16], white: float) -> float | None
     return float(top) if count > 20 and count > 2 * below else None
 
 
-def _detail(plane: npt.NDArray[np.uint16], black: float) -> float:
-    values = plane.astype(np.float32)
-    second = values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2]
-    level = max(float(values.mean()) - black, 1.0)
-    return float((second**2).mean()) / level**2
+OUTLIER = 5.0
+"""Robust standard deviations beyond which a block is left out: a fluorescent spot, a label, a hot cluster. Of normal
+noise 6e-7 are beyond, less than one block of a calibration."""
+
+DRIFT_SIGNIFICANCE = 0.01
+"""Significance level of the F test for scatter between captures: one calibration in a hundred gets a needless addition
+to its covariance."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColumnFit:
+    """A column of A as a polynomial over the field.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (T, C)
+        Per Legendre product and channel; (1, 0, 0 ...) in the reference channel.
+    covariance : ndarray, shape (T, C, T, C)
+        From the scatter of the blocks.
+    leverage : ndarray, shape (T, C, C)
+        Change of the coefficients per grey level that all blocks of a channel (last axis) have too much.
+    weights : ndarray, shape (N, R, S)
+        1 for the blocks used, 0 for the others.
+    residual : ndarray, shape (N, C, R, S)
+        y - a x of the blocks used, 0 elsewhere.
+    mass : ndarray, shape (N,)
+        Sum of the reference channel over the blocks used, per capture.
+    """
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    leverage: FloatArray
+    weights: FloatArray
+    residual: FloatArray
+    mass: FloatArray
+
+
+def fit_column(signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray) -> ColumnFit:
+    """Fit one light's column of A by ratios of sums (equation of the module), without outliers.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (N, C, R, S)
+        Block averages above dark of N captures.
+    valid : ndarray, shape (N, R, S), bool
+        Blocks without saturated samples.
+    reference
+        Channel the others are compared with.
+    design : ndarray, shape (R, S, T)
+        Legendre products at the blocks' centres; T = 1 for a constant column.
+    """
+    base = signal[:, reference]
+    weights, coefficients = _without_outliers(signal, valid, reference, design)
+    residual = weights[:, None] * _residual(signal, base, design, coefficients)
+    inverse = np.linalg.inv(_moment(weights * base, design))
+    score = np.einsum("ncrs,rst->tcrs", residual, design)
+    sums = _cluster_sums(score.reshape(-1, *score.shape[2:]))
+    count = max(len(sums), 2)
+    terms, channels = coefficients.shape
+    spread = (sums.T @ sums * count / (count - 1)).reshape(terms, channels, terms, channels)
+    total = np.einsum("nrs,rst->t", weights, design)
+    lever = np.einsum("tu,u,cd->tcd", inverse, total, np.eye(channels))
+    lever[:, :, reference] -= inverse @ _moment(weights, design) @ coefficients
+    return ColumnFit(
+        coefficients=coefficients,
+        covariance=np.einsum("tu,ucvd,wv->tcwd", inverse, spread, inverse),
+        leverage=lever,
+        weights=weights,
+        residual=residual,
+        mass=(weights * base).sum(axis=(1, 2)),
+    )
+
+
+def _moment(weights: FloatArray, design: FloatArray) -> FloatArray:
+    flat = design.reshape(-1, design.shape[-1])
+    return np.asarray((flat * weights.sum(axis=0).reshape(-1, 1)).T @ flat)
+
+
+def _residual(signal: FloatArray, base: FloatArray, design: FloatArray, coefficients: FloatArray) -> FloatArray:
+    return np.asarray(signal - np.einsum("rst,tc->crs", design, coefficients) * base[:, None])
+
+
+def _without_outliers(
+    signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Weights and coefficients, iterated from the median of the blocks' ratios.
+
+    Every channel's residual is compared with its median spread times the square root of x (shot noise). Weights
+    between 0 and 1 would need a correction of the sandwich and would cost efficiency.
+    """
+    base = signal[:, reference]
+    root = np.sqrt(np.maximum(base, 1e-3 * np.median(base[valid])))
+    ratios = signal / np.where(base > 0, base, np.inf)[:, None]
+    coefficients = np.zeros((design.shape[-1], signal.shape[1]))
+    coefficients[0] = np.median(ratios.transpose(0, 2, 3, 1)[valid], axis=0)
+    weights = valid.astype(np.float64)
+    for _ in range(20):
+        scaled = _residual(signal, base, design, coefficients) / root[:, None]
+        spread = np.median(np.abs(scaled.transpose(0, 2, 3, 1)[valid]), axis=0) / 0.6745
+        limit = np.where(spread > 0, OUTLIER * spread, np.inf)[:, None, None]
+        weights = (valid & (np.abs(scaled) <= limit).all(axis=1)).astype(np.float64)
+        right = np.einsum("crs,rst->tc", (weights[:, None] * signal).sum(axis=0), design)
+        update = np.linalg.solve(_moment(weights * base, design), right)
+        done = np.abs(update - coefficients).max() < 1e-10
+        coefficients = update
+        if done:
+            break
+    coefficients[:, reference] = np.eye(len(coefficients))[0]
+    return weights, coefficients
+
+
+def _cluster_sums(values: FloatArray) -> FloatArray:
+    """Sums (clusters, Q) of (Q, R, S) over 2 x 2 blocks: what spills over a block's border stays within a cluster."""
+    rows, columns = values.shape[1:]
+    step = 2 if rows * columns >= 64 else 1
+    by_rows = np.add.reduceat(values, np.arange(0, rows, step), axis=1)
+    return np.asarray(np.add.reduceat(by_rows, np.arange(0, columns, step), axis=2).reshape(len(values), -1).T)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variation:
+    """Result of `variation`: whether a column varies over the field by certain terms.
+
+    Attributes
+    ----------
+    p_value : float
+        Probability of scores this large without that variation.
+    rms : float
+        Root mean square over the field of these terms as fitted, of the channel where it is largest.
+    """
+
+    p_value: float
+    rms: float
+
+
+def variation(signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray, known: int) -> Variation:
+    """Test whether the Legendre products after the first `known` ones are needed in any channel.
+
+    A score test with random signs: the model of the first terms is fitted, its residuals are correlated with the other
+    terms in clusters of blocks, and the sum is compared with those of 4999 random choices of the clusters' signs. It
+    keeps its level with few clusters and with heavy tails, which a Wald test with a sandwich covariance does not
+    (Cameron, Gelbach & Miller, Review of Economics and Statistics 90, 414, 2008).
+
+    Parameters
+    ----------
+    signal, valid, reference, design
+        See `fit_column`; `design` has all terms.
+    known
+        How many of the terms the null hypothesis has.
+    """
+    null = fit_column(signal, valid, reference, design[..., :known])
+    moment = _moment(null.weights * signal[:, reference], design)
+    # What the fitted terms cannot imitate of the others.
+    extra = design[..., known:] - design[..., :known] @ np.linalg.solve(moment[:known, :known], moment[:known, known:])
+    others = [c for c in range(signal.shape[1]) if c != reference]
+    score = np.einsum("crs,rst->ctrs", null.residual[:, others].sum(axis=0), extra)
+    sums = _cluster_sums(score.reshape(-1, *score.shape[2:]))
+    inverse = np.linalg.pinv(sums.T @ sums)
+    signs = np.random.default_rng(0).choice((-1.0, 1.0), (4999, len(sums)))
+    flips = signs @ sums
+    flipped = ((flips @ inverse) * flips).sum(axis=1)
+    observed = sums.sum(axis=0) @ inverse @ sums.sum(axis=0)
+    coefficients = fit_column(signal, valid, reference, design).coefficients[known:, others]
+    norms = (design[..., known:] ** 2).mean(axis=(0, 1))
+    return Variation(
+        p_value=float((1 + (flipped >= observed).sum()) / (1 + len(flipped))),
+        rms=float(np.sqrt((coefficients**2 * norms[:, None]).sum(axis=0)).max()),
+    )
+
+
+def capture_scatter(fit: ColumnFit) -> FloatArray:
+    """Variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
+
+    The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
+    """
+    count, channels = fit.residual.shape[:2]
+    if count < 2:
+        return np.zeros(channels)
+    relative = fit.residual / fit.mass[:, None, None, None]
+    departures = (relative - relative.mean(axis=0)).transpose(1, 0, 2, 3).reshape(channels, -1)
+    noise = (departures**2).sum(axis=1) / (count - 1)
+    scatter = relative.sum(axis=(2, 3)).var(axis=0, ddof=1)
+    limit = fdtri(count - 1, departures.shape[1], 1 - DRIFT_SIGNIFICANCE / channels)
+    return np.where(scatter > limit * noise, scatter - noise, 0.0)
+
+
+def offsets_left(
+    signal: FloatArray, weights: FloatArray, reference: int, design: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
+
+    ``y = x a + o`` with the other captures' x as instrument for the slope: their noise is independent. NaN for fewer
+    than two captures. The offset of a dark level that is right is zero; on a plain target it is poorly determined.
+    """
+    count, channels = signal.shape[:2]
+    offset, std = np.full(channels, np.nan), np.full(channels, np.nan)
+    if count < 2:
+        return offset, std
+    base = signal[:, reference]
+    others = (base.sum(axis=0) - base) / (count - 1)
+    columns = [base[..., None] * design, np.ones((*base.shape, 1))]
+    instruments = [np.broadcast_to(design, (count, *design.shape)), others[..., None]]
+    left = weights[..., None] * np.concatenate(instruments, axis=-1)
+    right = np.concatenate(columns, axis=-1)
+    matrix = np.einsum("nrsi,nrsj->ij", left, right)
+    inverse = np.linalg.inv(matrix)
+    for channel in (c for c in range(channels) if c != reference):
+        solution = inverse @ np.einsum("nrsi,nrs->i", left, signal[:, channel])
+        score = (left * (signal[:, channel] - right @ solution)[..., None]).sum(axis=0)
+        sums = _cluster_sums(score.transpose(2, 0, 1)) @ inverse.T
+        offset[channel], std[channel] = solution[-1], np.sqrt((sums[:, -1] ** 2).sum())
+    return offset, std

@@ -29,25 +29,32 @@ LOCAL = 8.0
 """Standard deviation (px) of the neighbourhood whose mean a plane is divided by: several speckles."""
 
 CLEAR = 15.0
-"""Signal over noise of the mean frame below which a plane is not used for the light."""
+"""Signal over noise of the mean frame below which a plane is not used for the light: chosen."""
 
 BORDER = 8
-"""Pixels at the frame's edge that are left out."""
+"""Pixels at the frame's edge that are left out: the neighbourhood of `LOCAL` is cut off there."""
 
 ELEMENT = 25.0
-"""Side of the elements of the DIC between lights, px."""
+"""Side of the elements of the DIC between lights, px: the paper's (section 2.2)."""
 OUTLIER = 5.0
+"""Standard deviations beyond which a node is left out of the fit (`rgbmidic_calibration.ratio.OUTLIER`)."""
 MEASURED_LIMIT = 0.5
+"""Fraction of the nodes that must be measured: chosen; pictures that do not match have nearly none."""
 RESIDUAL_LIMIT = 0.3
+"""Residual of the fit (px rms) above which the target moved: chosen, ten times `MOTION_WARNING`."""
 MISFIT_WARNING = 0.05
+"""Smooth misfit (px rms), of the order of what `check` allows (`rgbmidic_calibration.verify.Limits.registration`)."""
 MOTION_WARNING = 0.03
+"""Motion from capture to capture (px): what `check` allows (`rgbmidic_calibration.verify.Limits.registration`)."""
 MIN_SAMPLES = 1000
+"""Samples at least for the fit of the motion, with four unknowns: chosen; a plane of 32 x 32 has as many."""
 SATURATED_LIMIT = 0.5
+"""Fraction of a picture that may be saturated: chosen; as `MEASURED_LIMIT`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightMatch:
-    """What the DIC between the first light and another gave.
+    """Result of the DIC between the first light and another.
 
     Attributes
     ----------
@@ -105,18 +112,18 @@ def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Fl
     height, width = stack.shape
     picture = np.full((height, width), np.nan, dtype=np.float32)
     used = np.zeros((height, width), dtype=np.float32)
-    shares = []
+    planes = []
     for plane in range(len(stack.names)):
         signal = stack.mean[plane] - (0 if dark is None else dark.mean[plane])
         level = float(signal.mean(dtype=np.float64))
-        shares.append((level, plane, signal))
-    brightest = max(level for level, *_ in shares)
+        planes.append((level, plane, signal))
+    brightest = max(level for level, *_ in planes)
     if brightest < 0.005 * (stack.white - float(stack.black.min())):
         raise CalibrationError(f"the light gives {brightest:.1f} DN above dark only: was the lamp on?")
     if stack.step == 1:
-        _, plane, signal = max(shares, key=lambda share: share[0])
+        _, plane, signal = max(planes, key=lambda entry: entry[0])
         return _relative(signal, stack.clipped[plane], LOCAL)
-    for level, plane, signal in shares:
+    for level, plane, signal in planes:
         if not _clear(stack, dark, plane, level, brightest):
             continue
         row, column = stack.origins[plane]
@@ -129,7 +136,7 @@ def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Fl
 
 
 def _clear(stack: TemporalStack, dark: TemporalStack | None, plane: int, level: float, brightest: float) -> bool:
-    """Is a plane bright enough for its own noise? With a single frame: a tenth of the brightest plane."""
+    """Whether a plane exceeds its noise by `CLEAR`; of a single frame, a tenth of the brightest plane."""
     if level < 0.1 * brightest and stack.count < 2:
         return False
     noise = float(stack.variance[plane].mean(dtype=np.float64)) / stack.count
@@ -231,8 +238,10 @@ def _picture(name: str, stack: TemporalStack, dark: TemporalStack | None) -> Flo
         picture = light_picture(stack, dark)
     except CalibrationError as error:
         raise CalibrationError(f"light {name}: {error}") from None
-    if (lost := float(np.isnan(picture).mean())) > SATURATED_LIMIT:
-        raise CalibrationError(f"light {name}: {100 * lost:.0f} % of the picture is saturated; shorten the exposure")
+    if (saturated := float(np.isnan(picture).mean())) > SATURATED_LIMIT:
+        raise CalibrationError(
+            f"light {name}: {100 * saturated:.0f} % of the picture is saturated; shorten the exposure"
+        )
     return picture
 
 
@@ -245,17 +254,15 @@ def _match(
 ) -> Solution:
     height, width = reference.shape
     inside = region if region is not None else (BORDER, BORDER, width - 1 - BORDER, height - 1 - BORDER)
-    told = f"the pictures of lights {names[0]} and {names[1]}"
+    pair = f"the pictures of lights {names[0]} and {names[1]}"
     try:
         solution = correlate(reference, other, region=inside, element_size=element_size)
     except RgbmidicError as error:
-        raise CalibrationError(
-            f"the pictures of lights {names[0]} and {names[1]} cannot be compared: {error}"
-        ) from None
+        raise CalibrationError(f"{pair} cannot be compared: {error}") from None
     measured = float((solution.node_status == NodeStatus.MEASURED).mean())
     if measured < MEASURED_LIMIT:
         raise CalibrationError(
-            f"{told} match in {100 * measured:.0f} % of the field only: is the target speckled and at rest, sharp "
+            f"{pair} match in {100 * measured:.0f} % of the field only: is the target speckled and at rest, sharp "
             "under both lights, and not saturated?"
         )
     return solution
@@ -270,7 +277,10 @@ def _fit(
     weight = np.nan_to_num(1 / solution.displacement_std**2, posinf=0.0)
     used = good = np.asarray((np.isfinite(value) & (weight > 0)).all(axis=1))
     for _ in range(10):
-        parameters, inverse, residual = _least_squares(basis, value, weight * used[:, None])
+        scaled = basis * (weight * used[:, None])[..., None]  # values of weight 0 may be NaN
+        inverse = np.linalg.inv(np.einsum("ndp,ndq->pq", scaled, basis))
+        parameters = inverse @ np.einsum("ndp,nd->p", scaled, np.nan_to_num(value))
+        residual = value - basis @ parameters
         size = np.linalg.norm(residual, axis=1)
         limit = OUTLIER * np.median(size[good]) / 1.1774
         update = good & (np.nan_to_num(size, nan=np.inf) <= limit)
@@ -287,16 +297,6 @@ def _fit(
             f"{match.rms:.2f} px rms: did the target deform or move, or is it another target?"
         )
     return parameters, covariance, match
-
-
-def _least_squares(
-    basis: FloatArray, value: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Parameters, inverse of the normal matrix and residuals; values of weight 0 may be NaN."""
-    scaled = basis * weight[..., None]
-    inverse = np.linalg.inv(np.einsum("ndp,ndq->pq", scaled, basis))
-    parameters = inverse @ np.einsum("ndp,nd->p", scaled, np.nan_to_num(value))
-    return parameters, inverse, value - basis @ parameters
 
 
 def _cell_sums(values: FloatArray, nodes: FloatArray, side: float) -> FloatArray:
@@ -322,7 +322,7 @@ def _misfits(matches: Sequence[LightMatch]) -> list[str]:
 
 
 def jitter(stack: TemporalStack, picture: FloatImage) -> FloatArray:
-    """How much the picture moved from frame to frame: standard deviation (2,) in x and y, px; NaN for a single frame.
+    """Motion of the picture from frame to frame: standard deviation (2,) in x and y, px; NaN for a single frame.
 
     The temporal variance of a sample that moves by d is ``r^2 + K mu + (d . gradient)^2``; the coefficients of the
     squared gradients are fitted over the brightest plane.

@@ -1,4 +1,4 @@
-"""The sub-command `check`: a calibration file and captures that did not make it, in; a verdict with its limits, out."""
+"""The sub-command `check`: the verdict on a calibration file, from captures that were not used to make it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def check_calibration(
     lights: Mapping[str, str],
     dark: str | None,
     together: Mapping[str, str],
-    told: FrameSettings,
+    stated: FrameSettings,
     *,
     limits: Limits | None = None,
     region: Sequence[float] | None = None,
@@ -74,9 +74,9 @@ def check_calibration(
         Pattern of the dark frames.
     together
         Patterns of captures with several lights on, by the lights' names joined by ``+``.
-    told
+    stated
         What is stated of the files; it, the files and the calibration must agree, and the calibration fills in what
-        neither tells.
+        neither states.
     limits
         What may be left.
     region
@@ -84,13 +84,21 @@ def check_calibration(
     """
     limits = limits or Limits()
     calibration = Calibration.read(path)
-    files = _find(lights, dark, together, told, calibration)
+    files = _find(lights, dark, together, stated, calibration)
     calibration = calibration.cropped(None, next(iter(files.lights.values())).series.shape)
     warnings, skipped = _reused(calibration, files), []
     dark_stack = stack_frames(files.dark.frames(), drifts=False, name="the dark frames") if files.dark else None
     stacks = {name: stack_frames(group.frames(), name=group.role) for name, group in files.lights.items()}
-    items = _leakage_items(calibration, files, limits)
-    sums = [_sum(names, group, stacks, dark_stack, calibration) for names, group in files.together.items()]
+    if calibration.crosstalk is None:
+        raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
+    means = {name: [block_means(frame) for frame in group.frames()] for name, group in files.lights.items()}
+    dark_means = [block_means(frame) for frame in files.dark.frames()] if files.dark else []
+    items = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage)
+    sums = []
+    for names, group in files.together.items():
+        singles = {name: stacks[name] for name in names.split("+")}
+        together_stack = stack_frames(group.frames(), name=group.role)
+        sums.append(additivity(together_stack, singles, dark_stack, noise=calibration.noise))
     items += [item for total in sums for item in total.items(limits)]
     for name, check in (("noise", _noise_items), ("registration", _registration_items)):
         try:
@@ -131,11 +139,11 @@ def _find(
     lights: Mapping[str, str],
     dark: str | None,
     together: Mapping[str, str],
-    told: FrameSettings,
+    stated: FrameSettings,
     calibration: Calibration,
 ) -> _Captures:
     def find(role: str, pattern: str) -> CaptureFiles:
-        return CaptureFiles.find(role, pattern, told, calibration)
+        return CaptureFiles.find(role, pattern, stated, calibration)
 
     if not lights:
         raise ConfigurationError("check needs captures with one light on: --light NAME=FILES")
@@ -167,25 +175,6 @@ def _reused(calibration: Calibration, files: _Captures) -> list[str]:
         return []
     made = f"{len(reused)} of these captures made the calibration ({reused[0]} ...)"
     return [f"{made}: they always agree; a check needs others"]
-
-
-def _leakage_items(calibration: Calibration, files: _Captures, limits: Limits) -> list[CheckItem]:
-    if calibration.crosstalk is None:
-        raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
-    means = {name: [block_means(frame) for frame in group.frames()] for name, group in files.lights.items()}
-    dark = [block_means(frame) for frame in files.dark.frames()] if files.dark else []
-    return leakage(calibration.crosstalk, means, dark).items(limits.leakage)
-
-
-def _sum(
-    names: str,
-    group: CaptureFiles,
-    stacks: Mapping[str, TemporalStack],
-    dark: TemporalStack | None,
-    calibration: Calibration,
-) -> Additivity:
-    together = stack_frames(group.frames(), name=group.role)
-    return additivity(together, {name: stacks[name] for name in names.split("+")}, dark, noise=calibration.noise)
 
 
 def _noise_items(

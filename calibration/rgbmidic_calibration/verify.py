@@ -1,4 +1,4 @@
-"""Does a calibration hold on captures that were not used to make it? Leakage, additivity, noise, registration left."""
+"""Measures of a calibration on captures that were not used to make it: leakage, additivity, noise, registration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linearise import QUANTISATION, NoiseModel
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.typing import FloatArray
-from rgbmidic_calibration.captures import TemporalStack, same_camera
+from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
 from rgbmidic_calibration.ratio import BlockMeans, block_centres
 from rgbmidic_calibration.registration import estimate_registration
 
@@ -29,15 +29,14 @@ __all__ = [
 ]
 
 
-BLOCK = 16
-
 SAME_EXPOSURE = 0.05
-"""Range of the captures' strengths, relative to their mean, up to which their scatter is noise."""
+"""Drift of the captures (`TemporalStack.drift`) up to which they count as one exposure; more is a lamp that drifts or
+an exposure series (`rgbmidic_calibration.crosstalk.INTENSITY_WARNING`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What a calibration may leave and still pass.
+    """Largest errors with which a calibration passes; chosen, and replaced by ``--limit`` of the command.
 
     Attributes
     ----------
@@ -79,7 +78,7 @@ class CheckItem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Leakage:
-    """What unmixing leaves of light j (column) in the image of light i (row).
+    """Fraction of light j (column) that unmixing leaves in the image of light i (row).
 
     Attributes
     ----------
@@ -118,7 +117,7 @@ class Leakage:
 def leakage(
     crosstalk: Crosstalk, lights: Mapping[str, Sequence[BlockMeans]], dark: Sequence[BlockMeans] = ()
 ) -> Leakage:
-    """Unmix captures with one light on and see what is left in the other lights' images.
+    """Fraction of a light that unmixing leaves in the images of the other lights, from captures with one light on.
 
     Parameters
     ----------
@@ -155,18 +154,18 @@ def _unmixed(
     channels = np.mean([frame.channels for frame in captures], axis=0) - level
     unmixing = crosstalk.unmixing_at(block_centres(first.shape, first.block))
     values = np.einsum("rskc,crs->krs", unmixing, channels)[:, clear]
-    own = crosstalk.lights.index(name)
-    total = float(values[own].sum())
+    lit = crosstalk.lights.index(name)
+    total = float(values[lit].sum())
     brightest = int(values.sum(axis=1).argmax())
-    if total <= 0 or brightest != own:
+    if total <= 0 or brightest != lit:
         raise CalibrationError(
             f"the captures of light {name} show most light in {crosstalk.lights[brightest]} after unmixing: are the "
             "captures swapped, was the lamp off, or is the calibration of another camera?"
         )
     ratio = values.sum(axis=1) / total
-    scatter = values - ratio[:, None] * values[own]
+    scatter = values - ratio[:, None] * values[lit]
     std = np.sqrt((scatter**2).sum(axis=1)) / total
-    local = np.sqrt(((values / values[own].mean()) ** 2).mean(axis=1))
+    local = np.sqrt(((values / values[lit].mean()) ** 2).mean(axis=1))
     return ratio, std, local
 
 
@@ -187,7 +186,7 @@ class Additivity:
     change, change_std : ndarray, shape (k,)
         Relative change of every light's strength between its own and the common capture.
     left : float
-        Rms over blocks of what remains, as a share of the mean signal, noise taken out.
+        Rms over tiles of what remains, as a fraction of the mean signal, noise taken out.
     signal : float
         Mean of the sum, DN.
     """
@@ -247,10 +246,11 @@ def additivity(
     same_camera([together, *singles.values(), *([dark] if dark else [])])
     images = [_difference(together, singles, dark, plane, noise) for plane in range(len(together.names))]
     samples = np.concatenate([image[:, np.isfinite(image[0])] for image in images], axis=1)
-    if samples.shape[1] < BLOCK**2:
+    if samples.shape[1] < TILE**2:
         raise CalibrationError("nearly every sample is saturated in one of the captures; shorten the exposure")
-    blocks = np.concatenate([_blocks(image) for image in images], axis=1)
-    difference, variance, lights = blocks[0], blocks[1], blocks[2:]
+    tiles = np.concatenate([tile_means(image) for image in images], axis=1)
+    tiles = tiles[:, np.isfinite(tiles[0])]  # without saturated samples
+    difference, variance, lights = tiles[0], tiles[1] / min(TILE, *images[0].shape[1:]) ** 2, tiles[2:]
     design = np.concatenate([np.ones((1, len(difference))), lights]).T
     inverse = np.linalg.pinv(design.T @ design)
     solution = inverse @ (design.T @ difference)
@@ -300,16 +300,6 @@ def _variance(stack: TemporalStack, plane: int, noise: NoiseModel | None) -> npt
     return np.full(stack.mean[plane].shape, QUANTISATION)
 
 
-def _blocks(rows: FloatArray) -> FloatArray:
-    """Means over blocks without saturated samples, (2 + k, blocks); the variance row becomes that of the mean."""
-    count, height, width = rows.shape
-    size = min(BLOCK, height, width)
-    cut = rows[:, : height // size * size, : width // size * size]
-    means = cut.reshape(count, height // size, size, width // size, size).mean(axis=(2, 4)).reshape(count, -1)
-    means[1] /= size**2
-    return np.asarray(means[:, np.isfinite(means[0])])
-
-
 def registration_left(
     registration: Registration,
     lights: Mapping[str, TemporalStack],
@@ -317,7 +307,18 @@ def registration_left(
     *,
     region: Sequence[float] | None = None,
 ) -> list[tuple[str, float, float]]:
-    """What the registration leaves of captures of a speckled target.
+    """Displacement between the lights that the registration leaves in captures of a speckled target.
+
+    Parameters
+    ----------
+    registration
+        The registration under test.
+    lights
+        Captures with one light on, by light.
+    dark
+        Captures with all lights off; none: the stated black level.
+    region
+        Rectangle (x0, y0, x1, y1) of the target in px; None: the whole frame.
 
     Returns
     -------
@@ -353,7 +354,7 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
     """
     if stack.count < 2:
         raise CalibrationError("noise needs at least two captures of the same scene")
-    if float((np.ptp(stack.strength, axis=0) / np.maximum(stack.strength.mean(axis=0), 1)).max()) > SAME_EXPOSURE:
+    if stack.drift > SAME_EXPOSURE:
         raise CalibrationError("the captures of a light have different exposures")
     observed = predicted = 0.0
     samples = 0

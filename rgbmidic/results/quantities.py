@@ -119,9 +119,7 @@ _RIGID = (
 )
 _UNREAD = "1 where the frame failed because it could not be read, which `--resume` tries again, else 0"
 _TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
-_REFLECTION = (
-    "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not report it"
-)
+_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not give it"
 _SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
@@ -169,7 +167,7 @@ _TABLE = (
         ("node", "light"),
         "",
         "light_fraction",
-        "fraction of each light in what determines a node",
+        "fraction of each light in the information that determines a node",
         blank=0,
     ),
     ResultQuantity("residual", _LIGHT, "", "residual", _RESIDUAL),

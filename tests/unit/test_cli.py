@@ -11,17 +11,18 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import h5py
 import numpy as np
 import pytest
 import tifffile
+import typer
 from cine_files import write_cine
 from results import make_origin, make_result, random_record, smooth_record
 
 from rgbmidic import __version__, cli, report
-from rgbmidic.command import execute, read_shape
+from rgbmidic.command import FRAME_OPTIONS, execute, gather, read_shape
 from rgbmidic.errors import FrameError
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 
@@ -447,3 +448,34 @@ def test_kernels_are_not_compiled_where_the_cache_is_empty(tmp_path: Path) -> No
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_the_frame_options_are_the_same_in_all_commands():
+    from rgbmidic_calibration import cli as calibrate
+
+    first = None
+    calibrations = ("crosstalk", "noise", "registration", "check")
+    for program, names in ((cli.app, ("frames", "inspect")), (calibrate.app, calibrations)):
+        for name in names:
+            options = {part.name: part for part in typer.main.get_command(program).commands[name].params}
+            found = [(key, options[key].opts, options[key].help, options[key].required) for key in FRAME_OPTIONS]
+            first = first or found
+            assert found == first, name
+
+
+def test_a_parameter_is_gathered_from_its_options():
+    gathered, app = [], typer.Typer()
+    options = {"a": Annotated[int | None, typer.Option("--a")], "b": Annotated[str | None, typer.Option("--b")]}
+
+    @app.command()
+    @gather("sizes", options, dict)
+    def command(
+        path: Annotated[str, typer.Argument()],
+        sizes: dict[str, Any],
+        flag: Annotated[bool, typer.Option("--flag")] = False,
+    ) -> None:
+        gathered.append((path, sizes, flag))
+
+    for arguments in (["x"], ["x", "--b", "c", "--flag", "--a", "3"]):
+        assert execute(app, arguments) == 0
+    assert gathered == [("x", {"a": None, "b": None}, False), ("x", {"a": 3, "b": "c"}, True)]

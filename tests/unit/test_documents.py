@@ -101,8 +101,45 @@ def test_status_codes_are_documented(codes):
         assert f"| {int(code)} | `{code.name}` |" in text
 
 
+GUIDE = [
+    "noise floor",
+    "matching criterion",
+    "virtual strain gauge (VSG) length",
+    "field of view",
+    "stand-off distance",
+]
+GUIDE += ["spatial resolution", "interpolant", "data point spacing", "initial guess", "reference update", "residual"]
+
+
+def glossary():
+    """Rows of the glossary of docs/conventions.md: term, name here, symbol, definition."""
+    text = (DOCS / "conventions.md").read_text(encoding="utf-8").split("## Words and symbols")[1]
+    return [line.strip("|").split("|") for line in text.splitlines() if line.startswith("|")][2:]
+
+
+@pytest.mark.parametrize("term", GUIDE)
+def test_the_glossary_has_the_terms_of_the_good_practices_guide(term):
+    assert any(term in row[0] for row in glossary())
+
+
+def test_every_term_of_the_glossary_is_defined_in_a_sentence():
+    for term, _, _, definition in glossary():
+        assert definition.strip().endswith("."), term
+
+
+def test_the_identifiers_of_the_glossary_exist():
+    """Names in code quotes are keys of TEST.toml, quantities of a result, or names in the package."""
+    keys = {key for section in _sections(TestSettings).values() for key in section} | {*QUANTITIES, *SHARED}
+    source = "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "rgbmidic").rglob("*.py"))
+    source += "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "calibration").rglob("*.py"))
+    for _, names, *_ in glossary():
+        for name in re.findall(r"`([\w.]+)`", names):
+            part = name.split(".")[-1]
+            assert part in keys or re.search(rf"(class|def) {part}\b|^ *{part}( =|:)", source, re.MULTILINE), name
+
+
 SIZES = {"node": "N", "light": "k", "element": "E", "function": "m", "row": "h", "column": "w", "iteration": "i"}
-SIZES |= {"image row": "H", "image column": "W", "file": "files"}
+SIZES |= {"image row": "H", "image column": "W", "file": "files", "reference_update": "r"}
 
 
 @pytest.mark.parametrize(("quantities", "frames"), [(SHARED, ()), (QUANTITIES, ("T",))])

@@ -101,7 +101,7 @@ def test_an_existing_file_is_kept_unless_told_otherwise(run, tmp_path):
         (["--light", "red=light_red/*.tif", "--light", "red=light_blue/*.tif"], "--light red is given twice"),
         (["--light", "red=nothing/*.tif"], "light red: no frames: no file matches: nothing/*.tif"),
         (["--light", "red=light_red/*.tif", "--cfa", "RGBG"], "--cfa must be one of RGGB"),
-        (["--light", "red=light_red/*.tif", "--kind", "colour"], "--kind is one of"),
+        (["--light", "red=light_red/*.tif", "--kind", "colour"], "--kind must be one of"),
         (["--light", "red=light_red/*.tif", "--shape", "big"], "--shape is ROWSxCOLUMNS"),
         (["--light", "red=light_green/*.tif", *STATED], "seen best by the green channel"),
     ],
@@ -160,7 +160,7 @@ def test_registration_of_speckled_captures(run, tmp_path):
     assert np.abs(found.parameters[:, :2]).max() < 0.05  # the bench's captures are registered
     code, _, error = run("registration", *LIGHTS, *STATED, "--out", out + "2", "--region", "here")
     assert code == 2
-    assert "--region is x0,y0,x1,y1" in error
+    assert "--region is X0,Y0,X1,Y1 in px" in error
 
 
 def test_check_passes_on_held_back_captures_and_fails_on_a_wrong_matrix(run, bench, tmp_path):
