@@ -225,7 +225,7 @@ class CameraNoise:
         """Build it from what `to_document` gave; KeyError, TypeError or ValueError where it is damaged."""
         quantities = {
             entry.name: Quantity(
-                *([np.nan if v is None else v for v in document[entry.name][key]] for key in ("value", "std"))
+                *(np.array([np.nan if v is None else v for v in document[entry.name][key]]) for key in ("value", "std"))
             )
             for entry in fields(cls)
             if entry.name not in ("planes", "defects")
