@@ -156,6 +156,7 @@ class Mosaic:
     white_level: float
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         values = np.asarray(self.values)
         if values.ndim != 2:
             raise InputError(f"a mosaic is one (H, W) image, not an array of shape {values.shape}")
@@ -187,6 +188,7 @@ class ChannelFrame:
     white_level: float
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         values = np.asarray(self.values)
         if values.ndim != 3 or values.shape[0] not in (1, 3):
             raise InputError(f"a channel frame has shape (1 or 3, H, W), not {values.shape}")

@@ -12,6 +12,7 @@ from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.formats import reader_name
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.frames.series import FrameSeries, open_series
+from rgbmidic.frames.tiff import TIFF_ENDINGS
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import FloatArray
 
@@ -139,7 +140,7 @@ def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bo
     series = _opened(settings)
     if not 0 <= index < len(series):
         raise InputError(f"there is no frame {index}: {settings.path[0]} holds {len(series)} (0 to {len(series) - 1})")
-    if path.suffix.lower() not in (".tif", ".tiff"):
+    if path.suffix.lower() not in TIFF_ENDINGS:
         raise InputError(f"a frame is saved as .tif, not as {path}")
     if path.exists() and not overwrite:
         raise InputError(f"{path} exists already; --overwrite replaces it")

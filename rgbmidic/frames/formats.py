@@ -135,7 +135,7 @@ class _UnknownFile(FrameSource):
     def _shape(self) -> NoReturn:
         if text := advice(self.path):
             raise FrameError(f"{self.path} is {text}")
-        with self.path.open("rb"):  # one that cannot be opened is reported as that
+        with self.path.open("rb"):  # one that cannot be opened is told as that
             allowed = ", ".join(known.name for known in FORMATS)
         raise FrameError(f"{self.path} is not a frame that rgbmidic reads; allowed are {allowed}")
 
@@ -166,7 +166,7 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
 
 
 def reader_name(source: FrameSource) -> str:
-    """Return the name of the format that a source is read as."""
+    """Name of the format that a source is read as."""
     return next((known.name for known in FORMATS if known.source is type(source)), "unknown")
 
 

@@ -99,6 +99,7 @@ class MrawFile(Movie):
     """
 
     def __post_init__(self) -> None:
+        """Take the file of the samples where the header is named."""
         if self.path.suffix.lower() != ".mraw":
             object.__setattr__(self, "path", _beside(self.path, ".mraw") or self.path.with_suffix(".mraw"))
 

@@ -56,6 +56,7 @@ class FrameSeries:
     _ends: tuple[tuple[int, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        """Count the frames and fill in what follows from their number."""
         ends = tuple(tuple(accumulate(len(source) for source in sources)) for sources in self.lights)
         object.__setattr__(self, "_ends", ends)
         object.__setattr__(self, "begins", self.begins or range(0, ends[0][-1] - self.turn + 1, self.turn))
@@ -105,7 +106,7 @@ class FrameSeries:
         Raises
         ------
         FrameError
-            A file is damaged or not what the settings say.
+            A file is damaged or not what the settings state.
         IndexError
             There is no such state.
         """
@@ -113,7 +114,7 @@ class FrameSeries:
 
     def gone(self) -> str:
         """Name the lights of which no file exists any more, by first file and number of files; else empty."""
-        exists = os.path.exists  # which raises nothing, whatever the disk says
+        exists = os.path.exists  # which raises nothing
         lost = [sources for sources in self.lights if not any(exists(source.path) for source in sources)]
         return "; ".join(f"{sources[0].path} and all {len(sources)} files of its series" for sources in lost)
 

@@ -146,6 +146,7 @@ class Hdf5File(Movie):
     dataset: str = field(init=False)
 
     def __post_init__(self) -> None:
+        """Take apart the names of file and dataset."""
         path, dataset = split_dataset(self.path)
         object.__setattr__(self, "path", Path(path))
         object.__setattr__(self, "dataset", dataset)

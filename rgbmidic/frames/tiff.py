@@ -15,7 +15,7 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.images import decode
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import CHECKED_FROM, StoredFrame, check_size, damaged
-from rgbmidic.frames.tiff_pages import cfa_pattern, is_stored_as_is, missing_data, tag, tiff_pages
+from rgbmidic.frames.tiff_pages import UNCOMPRESSED, cfa_pattern, is_stored_as_is, missing_data, tag, tiff_pages
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ __all__ = ["TIFF_ENDINGS", "TiffFile", "checked_page", "page_frame", "page_rows"
 
 TIFF_ENDINGS = (".tif", ".tiff")
 
-_UNCOMPRESSED = 1
 _BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
 """Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
 _BY_OPENCV = (5, 7, 32773)
@@ -117,14 +116,14 @@ def checked_page(page: TiffPage, path: Path) -> None:
     if reason := missing_data(page, size):
         raise damaged(path, reason)
     stored = sum(page.databytecounts)
-    if page.compression == _UNCOMPRESSED and not is_stored_as_is(page):
+    if page.compression == UNCOMPRESSED and not is_stored_as_is(page):
         raise damaged(path, f"its header announces {stored} bytes of image data, too few for its size")
     check_size(path, needed=page.nbytes, stored=min(stored, size))
 
 
 def _samples(page: TiffPage, path: Path) -> AnyArray:
     """Read the samples of a page as they are stored, (H, W) or (H, W, C)."""
-    if page.compression not in (_UNCOMPRESSED, *_BY_TIFFFILE):
+    if page.compression not in (UNCOMPRESSED, *_BY_TIFFFILE):
         raise _not_read(page, path)
     if page.compression in _BY_TIFFFILE:
         _check_unpacked(page, path)

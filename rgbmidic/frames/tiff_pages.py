@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HEADERS",
+    "UNCOMPRESSED",
     "RawStructure",
     "cfa_pattern",
     "is_dng",
@@ -42,7 +43,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 _BYTE_ORDERS: dict[bytes, Literal["little", "big"]] = {b"II*\0": "little", b"MM\0*": "big"}
 HEADERS = (*_BYTE_ORDERS, b"II+\0", b"MM\0+")
 """Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
-_UNCOMPRESSED = 1
+UNCOMPRESSED = 1
 _REDUCED = 1
 _RAW_PHOTOMETRIC = (32803, 34892)
 _DNG_VERSION = 50706
@@ -136,7 +137,7 @@ def is_stored_as_is(page: TiffPage) -> bool:
     """Return whether the page's samples are uncompressed and their bytes are all there."""
     bits = page.bitspersample if isinstance(page.bitspersample, int) else page.bitspersample[0]
     needed = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
-    return bool(page.compression == _UNCOMPRESSED and sum(page.databytecounts) >= needed)
+    return bool(page.compression == UNCOMPRESSED and sum(page.databytecounts) >= needed)
 
 
 def tag(page: TiffPage, code: int) -> tuple[Any, ...] | None:

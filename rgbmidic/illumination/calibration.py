@@ -84,6 +84,7 @@ class Calibration:
     name: str = field(default="the calibration", compare=False)
 
     def __post_init__(self) -> None:
+        """Check that the sections agree, and fill in the summary of the noise."""
         if self.crosstalk and self.registration and self.crosstalk.lights != self.registration.lights:
             raise CalibrationError(
                 f"crosstalk and registration are of different lights: {', '.join(self.crosstalk.lights)} and "

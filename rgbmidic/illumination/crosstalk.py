@@ -74,6 +74,7 @@ class CrosstalkField:
     std: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         values = np.asarray(self.coefficients, dtype=np.float64)
         terms = (self.order + 1) * (self.order + 2) // 2 - 1
         if self.order < 1 or values.ndim != 3 or len(values) != terms or not np.isfinite(values).all():
@@ -117,6 +118,7 @@ class Crosstalk:
     field: CrosstalkField | None = None
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         matrix = np.asarray(self.matrix, dtype=np.float64)
         if matrix.ndim != 2 or matrix.shape[1] != len(self.lights) or matrix.shape[1] > matrix.shape[0]:
             raise CalibrationError(
@@ -239,6 +241,7 @@ class Led:
     width: float = 25.0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         if not (200 < self.centre < 1200 and 0 < self.width < 300):
             raise InputError(f"an LED has its centre in 200 to 1200 nm and its width in 0 to 300 nm, not {self}")
 
@@ -267,6 +270,7 @@ class Sensitivities:
     values: FloatArray
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         wavelengths, values = np.asarray(self.wavelengths, dtype=float), np.asarray(self.values, dtype=float)
         if wavelengths.ndim != 1 or values.shape != (3, wavelengths.size) or wavelengths.size < 2:
             raise InputError(

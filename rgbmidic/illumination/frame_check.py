@@ -114,11 +114,13 @@ def check_state(
     Parameters
     ----------
     state
-        A raw frame, or one per light fired in succession; called `name` in messages.
+        A raw frame, or one per light fired in succession.
     calibration
         Cropped to the frame.
     inside : ndarray, shape (H, W), bool
         The region.
+    name
+        What messages call the state.
     accept
         Names of checks whose contradictions are accepted.
     repeat

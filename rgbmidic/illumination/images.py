@@ -57,6 +57,7 @@ class IlluminationImages:
     origin: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         values = np.ascontiguousarray(self.values, dtype=np.float32)
         if values.ndim != 3:
             raise InputError(f"illumination images have shape (k, H, W), not {values.shape}")

@@ -122,6 +122,7 @@ class Quantity:
     std: FloatArray
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         value = np.array(self.value, dtype=np.float64, ndmin=1)
         std = np.array(self.std, dtype=np.float64, ndmin=1)
         if value.ndim != 1 or value.shape != std.shape or (std < 0).any():
@@ -173,6 +174,7 @@ class CameraNoise:
     defects: tuple[tuple[int, int, str], ...] = ()
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         for entry in fields(self):
             quantity = getattr(self, entry.name)
             if isinstance(quantity, Quantity) and len(quantity.value) != len(self.planes):
@@ -222,7 +224,9 @@ class CameraNoise:
     def from_document(cls, document: dict[str, Any]) -> CameraNoise:
         """Build it from what `to_document` gave; KeyError, TypeError or ValueError where it is damaged."""
         quantities = {
-            entry.name: _quantity(document[entry.name])
+            entry.name: Quantity(
+                *(np.array([np.nan if v is None else v for v in document[entry.name][key]]) for key in ("value", "std"))
+            )
             for entry in fields(cls)
             if entry.name not in ("planes", "defects")
         }
@@ -237,7 +241,3 @@ def _product(value: FloatArray, gain: Quantity, relative: FloatArray) -> Quantit
 
 def _listed(values: FloatArray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
-
-
-def _quantity(section: dict[str, Any]) -> Quantity:
-    return Quantity(*(np.array([np.nan if v is None else v for v in section[key]]) for key in ("value", "std")))

@@ -58,6 +58,7 @@ class Registration:
     covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
         count, terms = len(self.lights), len(PARAMETERS)
         parameters = np.asarray(self.parameters, dtype=np.float64)
         if parameters.shape != (count, terms) or not np.isfinite(parameters).all() or parameters[0].any():

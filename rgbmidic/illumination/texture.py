@@ -88,6 +88,7 @@ class TextureModel:
     correlation: float = 1.0
 
     def __post_init__(self) -> None:
+        """Check the values."""
         w, s = np.asarray(self.weights, float), np.asarray(self.widths, float)
         if w.ndim != 1 or w.shape != s.shape or not (w >= 0).all() or not w.sum() > 0 or not (s > 0).all():
             raise InputError(f"a texture needs weights >= 0 and widths > 0, equally many; given are {w} and {s}")
