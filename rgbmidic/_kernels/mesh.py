@@ -20,7 +20,7 @@ __all__ = [
     "colour_nodes",
     "factorise",
     "fill_unknown",
-    "interpolate_nodal",
+    "interpolate_at_points",
     "node_energies",
     "predict",
     "solve_factors",
@@ -81,7 +81,7 @@ _EDGE = -1e-9
 
 @over_ranges("out", grain=4096)
 @compiled()
-def interpolate_nodal(start, stop, out, x, y, nodes, elements, values, box, first, members):
+def interpolate_at_points(start, stop, out, x, y, nodes, elements, values, box, first, members):
     """Write the linear interpolation (2,) of `values` (N, 2) at every point, NaN outside the mesh.
 
     Parameters

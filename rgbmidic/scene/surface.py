@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.mesh import interpolate_nodal
+from rgbmidic._kernels.mesh import interpolate_at_points
 from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray
@@ -329,7 +329,7 @@ def _interpolate(
 ) -> tuple[FloatArray, FloatArray]:
     out = np.empty((x.size, 2))
     flat_x, flat_y = np.ascontiguousarray(x, dtype=float).ravel(), np.ascontiguousarray(y, dtype=float).ravel()
-    interpolate_nodal(out, flat_x, flat_y, nodes, elements, values, *_bins(nodes, elements))
+    interpolate_at_points(out, flat_x, flat_y, nodes, elements, values, *_bins(nodes, elements))
     return out[:, 0].reshape(x.shape), out[:, 1].reshape(x.shape)
 
 
