@@ -1,4 +1,4 @@
-"""What is made of a finished result: figures, the pictures beside it, pages of text and pictures."""
+"""Figures, reports and pages of text and pictures of a result."""
 
 from rgbmidic.report.curves import history_figure
 from rgbmidic.report.document import Page, write_report

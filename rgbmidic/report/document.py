@@ -187,11 +187,11 @@ class _Report:
         for frame in self.shown:
             values = physical.frame(frame)
             maps = {f"{name} ({length})": (values[name], values[f"{name}_std"]) for name in ("u", "v")}
-            self._show(page, figures.field_figure(physical.result, frame, maps), f"displacement, {self._when(frame)}")
+            _show(page, figures.field_figure(physical.result, frame, maps), f"displacement, {self._when(frame)}")
             maps = {name: (values[name], values[f"{name}_std"]) for name in ("exx", "eyy", "exy")}
-            self._show(page, figures.field_figure(physical.result, frame, maps), f"strain, {self._when(frame)}")
+            _show(page, figures.field_figure(physical.result, frame, maps), f"strain, {self._when(frame)}")
         caption = "over the test: median of the nodes (line) and 5 to 95 % of them (band)"
-        self._show(page, field_history_figure(physical, self.history), f"displacement and strain {caption}")
+        _show(page, field_history_figure(physical, self.history), f"displacement and strain {caption}")
 
     def _probes(self, page: Page) -> None:
         """Add place and time history of the probes."""
@@ -204,7 +204,7 @@ class _Report:
         page.table(("probe", "place in px"), places)
         histories = read_histories(self.physical.result, self.probes, scale=self.physical.scale)
         caption = "time history of the probes; the bands extend two standard uncertainties to both sides"
-        self._show(page, history_figure(histories), caption)
+        _show(page, history_figure(histories), caption)
         if histories.remarks:
             page.bullets(histories.remarks)
 
@@ -225,26 +225,26 @@ class _Report:
         page.table(("standard uncertainty", "unit", "5 % of the nodes below", "median", "95 % below"), rows)
         caption = "stated standard uncertainty over the test, median of the nodes"
         caption += "" if self.floor is None else "; thin lines: noise floor of the static frames"
-        self._show(page, uncertainty_figure(physical, self.history, self.floor), caption)
+        _show(page, uncertainty_figure(physical, self.history, self.floor), caption)
         frame, values = self.shown[-1], physical.frame(self.shown[-1])
         maps = {f"{name} ({length})": (values[name], values[name] * 0) for name in ("u_std", "v_std")}
         figure = figures.field_figure(physical.result, frame, maps, positive=True)
-        self._show(page, figure, f"standard uncertainty, {self._when(frame)}")
+        _show(page, figure, f"standard uncertainty, {self._when(frame)}")
 
     def _lights(self, page: Page) -> None:
         result, frame = self.physical.result, self.shown[-1]
         page.heading("Lights and reflections")
-        self._show(page, figures.brightness_figure(result), "gain and offset of each light against the reference")
-        self._show(page, figures.residual_figure(result), "residual of each light, and its fraction in the nodes")
+        _show(page, figures.brightness_figure(result), "gain and offset of each light against the reference")
+        _show(page, figures.residual_figure(result), "residual of each light, and its fraction in the nodes")
         if len(result.lights) > 1:
             caption = f"fraction of each light in what determines the nodes, {self._when(frame)}"
-            self._show(page, figures.fraction_figure(result, frame), caption)
+            _show(page, figures.fraction_figure(result, frame), caption)
         for caption, figure in (
             ("reflection index of each light", figures.reflection_figure(result, frame)),
             ("part of each light that the weights exclude", figures.mask_figure(result, frame)),
         ):
             if figure is not None:
-                self._show(page, figure, f"{caption}, {self._when(frame)}")
+                _show(page, figure, f"{caption}, {self._when(frame)}")
 
     def _quality(self, page: Page) -> None:
         result, frame = self.physical.result, self.shown[-1]
@@ -259,11 +259,11 @@ class _Report:
             if len(odd) > _LISTED:
                 page.text(f"And {len(odd) - _LISTED} more.")
         if self.history.fractions[:, 0].min() < 1:
-            self._show(page, status_figure(self.history), "status of the nodes")
+            _show(page, status_figure(self.history), "status of the nodes")
         else:
             page.text("Every node is measured in every frame.")
-        self._show(page, figures.convergence_figure(result), "convergence: largest motion of a node in each iteration")
-        self._show(page, figures.map_figure(result, frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
+        _show(page, figures.convergence_figure(result), "convergence: largest motion of a node in each iteration")
+        _show(page, figures.map_figure(result, frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
 
     def _provenance(self, page: Page) -> None:
         kept = self.physical.result.provenance
@@ -282,9 +282,9 @@ class _Report:
         when = f" at {time_text(times[frame], times)}" if self.physical.units.timed else ""
         return f"frame {frame} ({self.physical.result.names[frame]}){when}"
 
-    @staticmethod
-    def _show(page: Page, figure: Figure, caption: str) -> None:
-        page.picture(embedded(figure), caption)
+
+def _show(page: Page, figure: Figure, caption: str) -> None:
+    page.picture(embedded(figure), caption)
 
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -328,7 +328,15 @@ class Page:
         self._html.append("<ul>" + "".join(f"<li>{_inline(text)}</li>" for text in texts) + "</ul>")
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Add a table of texts, a header and rows of as many columns."""
+        """Add a table of texts.
+
+        Parameters
+        ----------
+        header
+            Names of the columns.
+        rows
+            Cells of each row.
+        """
         lines = [header, ["---"] * len(header), *rows]
         cells = (" | ".join(cell.replace("|", "\\|") for cell in line) for line in lines)
         self._markdown.append("\n".join(f"| {line} |" for line in cells))
@@ -338,7 +346,15 @@ class Page:
         self._html.append(f'<div class="table">{table}</div>')
 
     def picture(self, source: str, caption: str) -> None:
-        """Add a picture: a file in the page's folder, or a data URL (`rgbmidic.report.style.embedded`)."""
+        """Add a picture with a caption.
+
+        Parameters
+        ----------
+        source
+            A file in the page's folder, or a data URL (`rgbmidic.report.style.embedded`).
+        caption
+            Its caption.
+        """
         self._markdown.append(f"![{caption}]({source})\n\n*{caption}*")
         source, caption = html.escape(source), html.escape(caption)
         self._html.append(f'<figure><img src="{source}" alt="{caption}"><figcaption>{caption}</figcaption></figure>')
@@ -354,7 +370,18 @@ class Page:
         )
 
     def write(self, folder: Path) -> tuple[Path, Path]:
-        """Write ``report.md`` and ``report.html`` into a folder and return their paths."""
+        """Write the page into a folder.
+
+        Parameters
+        ----------
+        folder
+            An existing folder.
+
+        Returns
+        -------
+        tuple of Path
+            ``report.md`` and ``report.html``.
+        """
         markdown, page = folder / "report.md", folder / "report.html"
         markdown.write_text(legible("\n\n".join(self._markdown) + "\n"), encoding="utf-8")
         page.write_text(self.html, encoding="utf-8")

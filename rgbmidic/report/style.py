@@ -318,7 +318,17 @@ def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *
 
 
 def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
-    """Label the axes, set as many numbers along x as there is room for, `whole` ones if asked, and a light grid."""
+    """Label the axes of a plot, set as many numbers along x as there is room for, and a light grid.
+
+    Parameters
+    ----------
+    axis
+        Axes of the plot, with its data drawn.
+    x, y
+        Labels.
+    whole
+        Whether the numbers along x are whole.
+    """
     from matplotlib.ticker import ScalarFormatter
 
     axis.set_xlabel(x)
