@@ -73,7 +73,8 @@ class FrameSettings:
     Attributes
     ----------
     path
-        File patterns or folders, one per light fired in succession (monochrome); a single one otherwise.
+        File patterns or folders, one per light fired in succession (monochrome); a single one otherwise. Empty where a
+        script gives the frames (`source` of `rgbmidic.measure`).
     kind
         None: what the file tells, else ``"bayer"``.
     cfa, black_level, white_level
@@ -114,7 +115,7 @@ class FrameSettings:
 
     def __post_init__(self) -> None:
         _normalise(self, "frames")
-        if not self.path or not all(self.path):
+        if not all(self.path):
             raise ConfigurationError("frames.path must name the frame files")
         if len(self.path) > 1 and self.kind != "monochrome":
             raise ConfigurationError(
@@ -416,7 +417,7 @@ class TestSettings:
     frames, region, illumination, weights, solver, scale, setup, probes
         The sections of the same name.
     calibration_file
-        ``file`` in ``[calibration]``; needed for colour frames.
+        ``file`` in ``[calibration]``; needed for colour frames, unless a script gives its own separation.
     accept
         ``accept`` in ``[calibration]``: checks of the reference frame against the calibration whose contradictions are
         accepted (`rgbmidic.illumination.frame_check`).
@@ -451,11 +452,6 @@ class TestSettings:
                 raise ConfigurationError(
                     f"mesh.cracks[{number}] needs at least two corners [x, y]; given is {_plain(crack)}"
                 )
-        if self.frames.kind in ("bayer", "rgb") and self.calibration_file is None:
-            raise ConfigurationError(
-                f'frames.kind = "{self.frames.kind}" needs the lights\' crosstalk: state calibration.file, a file that '
-                "rgbmidic-calibrate writes"
-            )
 
     @classmethod
     def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 
-from rgbmidic.errors import FrameError, disk_reason, legible
+from rgbmidic.errors import ConfigurationError, FrameError, disk_reason, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import FRAME_ENDINGS, advice, open_source
 from rgbmidic.frames.source import FrameSource, file_fingerprint
@@ -25,7 +25,7 @@ from rgbmidic.settings import FrameSettings
 
 logger = logging.getLogger(__name__)
 
-__all__ = ["FrameSeries", "list_frames", "open_series"]
+__all__ = ["FrameSeries", "chosen_frames", "list_frames", "open_series"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,6 +65,10 @@ class FrameSeries:
     def __len__(self) -> int:
         """Number of mechanical states."""
         return len(self.begins)
+
+    def __getitem__(self, index: int) -> tuple[Mosaic | ChannelFrame, ...]:
+        """State `index`, as `read` gives it: a series of files is a frame source as any other."""
+        return self.read(index)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -181,11 +185,18 @@ def open_series(
 
     Raises
     ------
+    ConfigurationError
+        `frames.path` is empty.
     FrameError
         No file matches, a movie's header is damaged, a frame has another size than the first, the lights have different
         frames, or a reference frame or the first or last frame does not exist. A damaged file of one frame is left for
         `FrameSeries.read` to tell.
     """
+    if not settings.path:
+        raise ConfigurationError(
+            "frames.path must name the frame files; it is empty, which is for a frame source that a script gives "
+            "(rgbmidic.measure(settings, out, source=...))"
+        )
     files = [list_frames(text, base) for text in settings.path]
     lights = tuple(_sources(paths, settings, camera) for paths in files)
     _check_counts(settings, lights)
@@ -196,7 +207,7 @@ def open_series(
     else:
         series = FrameSeries(lights=lights, numbers=numbers)
     _check_sizes(series)
-    return replace(series, chosen=_chosen(settings, len(series)))
+    return replace(series, chosen=chosen_frames(settings, len(series)))
 
 
 def _sources(paths: Sequence[Path], settings: FrameSettings, camera: Camera | None) -> tuple[FrameSource, ...]:
@@ -219,7 +230,7 @@ def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[
     return begins, tuple(state - states[0] for state in states)
 
 
-def _chosen(settings: FrameSettings, count: int) -> range:
+def chosen_frames(settings: FrameSettings, count: int) -> range:
     """The states that the settings choose.
 
     Raises
