@@ -210,7 +210,7 @@ class WeightSettings:
     method
         ``"statistics"``: inverse variance of each light's own residual around each pixel, robust; ``"threshold"``: the
         paper's second method, 0 where the blurred image exceeds `threshold`, 1 elsewhere; ``"geometry"``: the paper's
-        first method, from lamps, camera and specimen; ``"none"``: 1 everywhere.
+        first method, from lamps, camera and specimen; ``"images"``: masks made by hand; ``"none"``: 1 everywhere.
     threshold
         Fraction of the camera's dynamic range (the paper: 2/3); ``"auto"``: found as in the paper, section 3.2, on the
         first deformed frame.
@@ -221,22 +221,28 @@ class WeightSettings:
     height_map
         npy file with the height (mm, towards the camera) of the specimen at every pixel of the reference over the plane
         of the scene's front point; instead of the scene's body.
+    images
+        Masks for ``"images"``, of the size of the frames, one per light in the lights' order; see
+        `rgbmidic.weights.MaskWeights.read`.
     limit_deg
         Light is excluded within this angle of the mirror direction (the paper: 15); None: soft weights, the inverse of
         the variance that geometry, paint and camera noise let expect.
     """
 
-    method: Literal["statistics", "threshold", "geometry", "none"] = "statistics"
+    method: Literal["statistics", "threshold", "geometry", "images", "none"] = "statistics"
     threshold: float | Literal["auto"] = _bounded(2 / 3, above=0, at_most=1)
     blur: float = _bounded(10.0, above=0)
     geometry: Path | None = None
     height_map: Path | None = None
+    images: tuple[Path, ...] = ()
     limit_deg: float | None = _bounded(None, above=0, below=180)
 
     def __post_init__(self) -> None:
         _normalise(self, "weights")
         if (self.method == "geometry") != (self.geometry is not None):
             raise ConfigurationError('weights.method = "geometry" and weights.geometry = "SCENE.toml" go together')
+        if (self.method == "images") != bool(self.images):
+            raise ConfigurationError('weights.method = "images" and weights.images = ["MASK.png", ...] go together')
         for key in ("height_map", "limit_deg"):
             if self.method != "geometry" and getattr(self, key) is not None:
                 raise ConfigurationError(f'weights.{key} is for weights.method = "geometry"')
@@ -516,7 +522,11 @@ def read_section(kind: type[_Section], name: str, content: Mapping[str, Any], ba
 
 def _from(base: Path, value: Any, hint: Any) -> Any:
     """A value of the file; where it names a file, from the folder that relative paths start from."""
-    return base / value if Path in (hint, *get_args(hint)) and isinstance(value, str | PurePath) else value
+    if Path not in (hint, *get_args(hint)):
+        return value
+    if isinstance(value, list | tuple):
+        return [_from(base, entry, Path) for entry in value]
+    return base / value if isinstance(value, str | PurePath) else value
 
 
 def regular(path: Path) -> Path:

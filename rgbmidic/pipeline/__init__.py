@@ -4,6 +4,7 @@ from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan, read_region
 from rgbmidic.pipeline.run import measure
 from rgbmidic.pipeline.separation import LightSeparation, Separation, correlated
+from rgbmidic.pipeline.sequence import measure_sequence
 from rgbmidic.pipeline.source import FrameSequence
 
 __all__ = [
@@ -14,5 +15,6 @@ __all__ = [
     "correlated",
     "measure",
     "measure_frame",
+    "measure_sequence",
     "read_region",
 ]

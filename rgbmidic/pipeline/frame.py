@@ -27,7 +27,7 @@ from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["failed_frame", "measure_frame", "read_state"]
+__all__ = ["failed_frame", "measure_frame", "next_reference", "read_state", "solve_frame"]
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
     """
     try:
         with timed(plan.timings) as seconds:
-            values = _measure(plan, index, start, _renewal(plan, updated))
+            values = solve_frame(plan, index, start, _renewal(plan, updated))
         return FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
@@ -100,8 +100,21 @@ def read_state(plan: Plan, index: int, window: Window | None = None) -> tuple[Ra
         raise _UnreadError(str(error)) from error
 
 
-def _measure(plan: Plan, index: int, start: Start, reference_update: ReferenceUpdate) -> dict[str, Any]:
-    """What `FrameRecord.from_solution` is given."""
+def solve_frame(plan: Plan, index: int, start: Start, reference_update: ReferenceUpdate) -> dict[str, Any]:
+    """What `FrameRecord.from_solution` is given: the ``solution`` of a frame, and what else its record holds.
+
+    Parameters
+    ----------
+    plan, index, start
+        As `measure_frame`.
+    reference_update
+        The reference that ``start.reference_updates`` make.
+
+    Raises
+    ------
+    RgbmidicError
+        The frame cannot be read or is not what the settings say.
+    """
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
@@ -171,17 +184,27 @@ def _causes(
     return causes
 
 
+def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: Solution) -> ReferenceUpdate:
+    """The reference that frame `index` becomes, measured with `solution` on the reference `before`.
+
+    Raises
+    ------
+    RgbmidicError
+        The frame cannot be read, or no element of it is measured.
+    """
+    window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
+    images = plan.lights(read_state(plan, index, window)[0], window)
+    ready = correlated(images, plan.settings.illumination)
+    return before.updated(solution, ready, plan.frame_weights(images, index), window.origin)
+
+
 def _renewal(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUpdate:
     """The reference that the frames `updated` make in turn."""
 
     def make() -> ReferenceUpdate:
         reference_update = ReferenceUpdate.none(plan.reference)
         for index, solution in updated:
-            window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
-            images = plan.lights(read_state(plan, index, window)[0], window)
-            weights = plan.frame_weights(images, index)
-            ready = correlated(images, plan.settings.illumination)
-            reference_update = reference_update.updated(solution, ready, weights, window.origin)
+            reference_update = next_reference(plan, reference_update, index, solution)
         return reference_update
 
     return plan.updates.get(tuple(index for index, _ in updated), make)

@@ -113,6 +113,8 @@ def measure(
     plan = Plan.from_settings(settings, source=source, separation=separation, weights=weights, mesh=mesh)
     plan = replace(plan, timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
+    if settings.weights.method == "images":  # the masks, whatever their files are called
+        objects["weights"] = describe(plan.weights)
     places = _places(plan.series.chosen, frames)
     if workers is None:
         workers = max(min(available_cores(), len(places) // FRAMES_A_WORKER), 1)

@@ -27,7 +27,13 @@ from rgbmidic.view.canvas import Canvas
 
 __all__ = ["HOLES", "OUTLINES", "Draft", "Sketch", "arranged", "marks_of", "region_of", "rings"]
 
-_FILES = (("calibration", "file"), ("region", "mask"), ("weights", "geometry"), ("weights", "height_map"))
+_FILES = (
+    ("calibration", "file"),
+    ("region", "mask"),
+    ("weights", "geometry"),
+    ("weights", "height_map"),
+    ("weights", "images"),
+)
 """Keys that name files, beside the frames."""
 
 
@@ -135,9 +141,8 @@ class Draft:
         return replace(self, file=file)
 
     def _paths(self) -> list[str]:
-        named = self.section("frames").get("path", [])
-        texts = [named] if isinstance(named, str) else list(named)
-        return texts + [text for section, key in _FILES if (text := self.section(section).get(key)) is not None]
+        named = [self.section(section).get(key, []) for section, key in (("frames", "path"), *_FILES)]
+        return [text for one in named for text in ([one] if isinstance(one, str) else one)]
 
     def write(self) -> None:
         """Write it, once it is a whole test.
