@@ -38,7 +38,7 @@ from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.start import Start, track
 from rgbmidic.frames import Mosaic, Window, cfa_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.separation import Separation, correlated, reference_images
 from rgbmidic.results import Result

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.linearise import CameraNoise, Quantity
+from rgbmidic.illumination.linear import CameraNoise, Quantity
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import TemporalStack, same_camera
 from rgbmidic_calibration.plausibility import fixed_pattern

@@ -27,7 +27,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
-from rgbmidic.illumination.linearise import QUANTISATION
+from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.separation import (

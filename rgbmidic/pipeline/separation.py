@@ -12,10 +12,10 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.images import IlluminationImages, normalise
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.linear import LinearChannels, linearise
+from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmix import align, unmix
+from rgbmidic.illumination.unmixing import align
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import FloatImage
 
@@ -94,10 +94,8 @@ class Separation:
             images = IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)], names)
         elif len(linear) > 1:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
-        elif isinstance(only := linear[0], LinearMosaic):
-            images = separate(only, self._crosstalk(), self.demosaic, texture=self.texture)
         else:
-            images = unmix(only, self._crosstalk())
+            images = separate(linear[0], self._crosstalk(), self.demosaic, texture=self.texture)
         return images if known.registration is None else align(images, known.registration)
 
     def learnt(self, images: IlluminationImages) -> Separation:

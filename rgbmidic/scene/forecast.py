@@ -23,8 +23,8 @@ from functools import cache
 import numpy as np
 
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
-from rgbmidic.illumination.linearise import QUANTISATION
-from rgbmidic.illumination.unmix import NEGLIGIBLE
+from rgbmidic.illumination.linear import QUANTISATION
+from rgbmidic.illumination.unmixing import NEGLIGIBLE
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cross_spectra, mosaic_disturbances
@@ -147,7 +147,7 @@ class Instrument:
         element_size
             Of the TRI3 mesh, px.
         demosaic
-            Method for a Bayer camera (`rgbmidic.illumination.separate.DEMOSAICERS`).
+            Method for a Bayer camera (`rgbmidic.illumination.separation.DEMOSAICERS`).
         prefilter
             Of the solve (`rgbmidic.correlation.images.PREFILTERS`).
         """

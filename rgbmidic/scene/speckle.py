@@ -20,8 +20,8 @@ from rgbmidic._kernels.render import PLATE
 from rgbmidic.correlation.images import PREFILTERS
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import sampled_channels, shift_cfa
-from rgbmidic.illumination.linearise import LinearMosaic
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.linear import LinearMosaic
+from rgbmidic.illumination.separation import separate
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.surface import Surface
 from rgbmidic.typing import FloatArray

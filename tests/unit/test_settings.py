@@ -155,7 +155,7 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST.replace('path = "frames/*.dng"', ""), r"frames\.path is missing"),
         (LEAST.replace('"frames/*.dng"', "3"), r"frames\.path must be a text in quotes, not 3"),
         (LEAST.replace('"frames/*.dng"', '""'), r"frames\.path must name"),
-        (LEAST.replace('"frames/*.dng"', "[]"), r"frames\.path must name"),
+        (LEAST.replace('"frames/*.dng"', '["a", ""]'), r"frames\.path must name"),
         (LEAST.replace('"frames/*.dng"', '["a", "b"]'), r"2 entries.*monochrome"),
         (
             LEAST.replace('dng"', 'dng"\nkind = "color"'),

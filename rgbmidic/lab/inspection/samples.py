@@ -27,10 +27,10 @@ from scipy.optimize import nnls
 from rgbmidic.frames.data import ChannelFrame, Mosaic, sampled_channels, shift_cfa
 from rgbmidic.illumination.colour_factors import BLOCK, LEAST, MEAN_BLOCK, enlarged
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.demosaic import SPARKLE_VARIANCE, Reconstruction
+from rgbmidic.illumination.demosaicing import SPARKLE_VARIANCE, Reconstruction
 from rgbmidic.illumination.images import IlluminationImages, local_mean
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.mesh import Region
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage

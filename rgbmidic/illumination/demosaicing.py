@@ -17,7 +17,7 @@ Demosaicing that survives reflections: the speckle's own statistics fill in what
 Usual methods assume that the three channels show one texture. Under coloured lights that holds where the paint is mat
 and breaks where one light reflects. Here it is measured, block by block, how much of each channel's contrast is common
 and how much its own (`rgbmidic.illumination.colour_factors`), and every channel is predicted from all the samples
-around with exactly that trust (`rgbmidic.illumination.demosaic`). A channel in a reflection no longer leaks
+around with exactly that trust (`rgbmidic.illumination.demosaicing`). A channel in a reflection no longer leaks
 into the others, its own sparkle is kept, the coarse lattices of red and blue are filled from what the others see; a
 coloured specimen, whose channels have nothing in common, is reconstructed channel by channel.
 """
@@ -50,9 +50,9 @@ from rgbmidic.illumination.colour_factors import (
     widened,
 )
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmix import needed
+from rgbmidic.illumination.unmixing import needed
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = [
@@ -304,7 +304,7 @@ class ReflectionAwareDemosaicer:
             The linearised frame.
         mixing : (n, 3), or None
             Mixtures of the channels to give instead of them; not valid where a channel that matters in one
-            (`rgbmidic.illumination.unmix.needed`) is not.
+            (`rgbmidic.illumination.unmixing.needed`) is not.
 
         Raises
         ------
