@@ -438,7 +438,8 @@ def plan(
 
 @app.command()
 def frames(
-    path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")],
+    path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
+    formats: Annotated[bool, typer.Option("--formats", help="List the formats that are read.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
     save: Annotated[
         tuple[int, Path] | None, typer.Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
@@ -452,9 +453,16 @@ def frames(
     overwrite: Overwrite = False,
 ) -> None:
     """What a reader sees of raw frames: how many, of what size and levels, when they were taken, how many are lost."""
+    from rgbmidic.frames import known_formats
     from rgbmidic.frames.describe import describe, save_frame
     from rgbmidic.settings import FrameSettings
 
+    if formats:
+        for known in known_formats():
+            print(f"{known.name}: {' '.join((*known.endings, *known.movies)) or 'by content'}")
+        return
+    if not path:
+        raise InputError("PATH must name a movie, a frame, a folder or a pattern; --formats lists what is read")
     stated = _stated(kind, cfa, black_level, white_level, shape, dtype)
     settings = FrameSettings(path=(path,), **{key: value for key, value in stated.items() if value is not None})
     description = describe(settings)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rgbmidic.errors import ConfigurationError, FrameError, disk_reason, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.formats import FRAME_ENDINGS, advice, open_source
+from rgbmidic.frames.formats import advice, frame_endings, open_source
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
@@ -328,7 +328,7 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     try:
         if place.is_dir():
             found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-            files = [file for file in found if file.suffix.lower() in FRAME_ENDINGS]
+            files = [file for file in found if file.suffix.lower() in frame_endings()]
         else:
             found = files = _matching(Path(text), Path(base))
         files = [file for file in files if not file.is_dir()]  # what else is no file is told when it is read
