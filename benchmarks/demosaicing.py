@@ -35,10 +35,10 @@ from rgbmidic._kernels.threads import threads
 from rgbmidic.correlation import correlate
 from rgbmidic.fields import at_pixels
 from rgbmidic.illumination.images import IlluminationImages, normalise
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.registration import Registration
-from rgbmidic.illumination.separate import DEMOSAICERS, separate
-from rgbmidic.illumination.unmix import align, unmix
+from rgbmidic.illumination.separation import DEMOSAICERS, separate
+from rgbmidic.illumination.unmixing import align, unmix
 from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.camera import PIXEL

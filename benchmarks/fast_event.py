@@ -36,11 +36,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.start import Start, track
-from rgbmidic.frames import Mosaic, cfa_channels
+from rgbmidic.frames import Mosaic, Window, cfa_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.separation import Separation, correlated
+from rgbmidic.pipeline.separation import Separation, correlated, reference_images
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE, IlluminationSettings, SolverSettings
 from rgbmidic.typing import FloatArray, FloatImage
@@ -314,7 +314,9 @@ def glare(draws: int) -> None:
         plate = HoledPlate.drawn(draw)
         renderer, region = _GlaringRenderer(plate), plate.region()
         frames = [(renderer.mosaic(number),) for number in range(plate.rest + plate.moving)]
-        images, separation = Separation(calibration=calibration).reference(frames[0], frames[1 : plate.rest])
+        images, separation = reference_images(
+            Separation(calibration=calibration), frames[: plate.rest], Window.whole(frames[0][0].values.shape[-2:])
+        )
         mesh = Tri3Mesh.from_region(region, ELEMENT_SIZE)
         reference = Reference.prepare(correlated(images, settings), region, mesh=mesh, prefilter=solver.prefilter)
         start, errors, stated = Start(displacement=np.zeros_like(mesh.nodes)), [], []

@@ -34,7 +34,7 @@ from rgbmidic.frames import open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.frame_check import mismatches
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.lab.virtual import plate_scene, sphere_scene
 from rgbmidic.scene.camera import PIXEL
 from rgbmidic.settings import FrameSettings

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.lab.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import Region, Tri3Mesh
-    from rgbmidic.pipeline import measure
+    from rgbmidic.pipeline import measure, measure_sequence
     from rgbmidic.results import Result
     from rgbmidic.settings import TestSettings, read_test
 
@@ -37,6 +37,7 @@ __all__ = [
     "correlate",
     "inspect_frame",
     "measure",
+    "measure_sequence",
     "read_frame",
     "read_test",
 ]
@@ -55,6 +56,7 @@ _HOMES = {
     "correlate": "rgbmidic.correlation",
     "inspect_frame": "rgbmidic.lab.inspection",
     "measure": "rgbmidic.pipeline",
+    "measure_sequence": "rgbmidic.pipeline",
     "read_frame": "rgbmidic.frames",
     "read_test": "rgbmidic.settings",
 }

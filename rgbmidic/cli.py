@@ -426,8 +426,9 @@ def plan(
 @app.command()
 @command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def frames(
-    path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")],
     statement: dict[str, Any],
+    path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
+    formats: Annotated[bool, typer.Option("--formats", help="List the formats that are read.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
     save: Annotated[
         tuple[int, Path] | None, typer.Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
@@ -435,9 +436,16 @@ def frames(
     overwrite: Overwrite = False,
 ) -> None:
     """List what a reader finds in raw frames: number, size, levels, times, missing frames."""
+    from rgbmidic.frames import known_formats
     from rgbmidic.frames.describe import describe, save_frame
     from rgbmidic.settings import FrameSettings
 
+    if formats:
+        for known in known_formats():
+            print(f"{known.name}: {' '.join((*known.endings, *known.movies)) or 'by content'}")
+        return
+    if not path:
+        raise InputError("PATH must name a movie, a frame, a folder or a pattern; --formats lists what is read")
     settings = FrameSettings(path=(path,), **statement)
     description = describe(settings)
     if save is not None:

@@ -96,7 +96,8 @@ class FrameSettings(_Checked):
     Attributes
     ----------
     path
-        File patterns or folders, one per light fired in succession (monochrome); a single one otherwise.
+        File patterns or folders, one per light fired in succession (monochrome); a single one otherwise. Empty where a
+        script gives the frames (`source` of `rgbmidic.measure`).
     kind
         None: what the file states, else ``"bayer"``.
     cfa, black_level, white_level
@@ -138,9 +139,9 @@ class FrameSettings(_Checked):
     crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)
 
     def _check(self) -> None:
-        _require(self.path and all(self.path), "frames.path must name the frame files")
+        _require(all(self.path), "frames.path must name the frame files")
         _require(
-            len(self.path) == 1 or self.kind == "monochrome",
+            len(self.path) <= 1 or self.kind == "monochrome",
             f"frames.path with {len(self.path)} entries means as many lights fired in succession before a monochrome "
             'camera: state kind = "monochrome", or give a single path',
         )
@@ -174,8 +175,8 @@ class IlluminationSettings(_Checked):
     Attributes
     ----------
     demosaic
-        Method of `rgbmidic.illumination.separate` for Bayer frames; ``"auto"``: the reflection-aware one, and Malvar's
-        for frames too small for it.
+        Method of `rgbmidic.illumination.separation` for Bayer frames; ``"auto"``: the reflection-aware one, and
+        Malvar's for frames too small for it.
     normalise
         Standard deviation in px of the local mean by which each light's image is divided before the solve; 0 leaves
         the grey levels as they are.
@@ -234,7 +235,7 @@ class WeightSettings(_Checked):
     method
         ``"statistics"``: inverse variance of each light's own residual around each pixel, robust; ``"threshold"``: the
         paper's second method, 0 where the blurred image exceeds `threshold`, 1 elsewhere; ``"geometry"``: the paper's
-        first method, from lamps, camera and specimen; ``"none"``: 1 everywhere.
+        first method, from lamps, camera and specimen; ``"images"``: masks made by hand; ``"none"``: 1 everywhere.
     threshold
         Fraction of the camera's dynamic range (the paper: 2/3); ``"auto"``: found as in the paper, section 3.2, on the
         first deformed frame.
@@ -245,6 +246,9 @@ class WeightSettings(_Checked):
     height_map
         npy file with the height (mm, towards the camera) of the specimen at every pixel of the reference over the plane
         of the scene's front point; instead of the scene's body.
+    images
+        Masks for ``"images"``, of the size of the frames, one per light in the lights' order; see
+        `rgbmidic.weights.MaskWeights.read`.
     limit_deg
         Light is excluded within this angle of the mirror direction (the paper: 15); None: soft weights, the inverse of
         the variance that geometry, paint and camera noise let expect.
@@ -252,11 +256,12 @@ class WeightSettings(_Checked):
 
     section = "weights"
 
-    method: Literal["statistics", "threshold", "geometry", "none"] = "statistics"
+    method: Literal["statistics", "threshold", "geometry", "images", "none"] = "statistics"
     threshold: float | Literal["auto"] = _bounded(2 / 3, above=0, at_most=1)
     blur: float = _bounded(10.0, above=0)
     geometry: Path | None = None
     height_map: Path | None = None
+    images: tuple[Path, ...] = ()
     limit_deg: float | None = _bounded(None, above=0, below=180)
 
     def _check(self) -> None:
@@ -264,6 +269,10 @@ class WeightSettings(_Checked):
         _require(
             geometric == (self.geometry is not None),
             'weights.method = "geometry" and weights.geometry = "SCENE.toml" go together',
+        )
+        _require(
+            (self.method == "images") == bool(self.images),
+            'weights.method = "images" and weights.images = ["MASK.png", ...] go together',
         )
         for key in ("height_map", "limit_deg"):
             _require(geometric or getattr(self, key) is None, f'weights.{key} is for weights.method = "geometry"')
@@ -445,7 +454,7 @@ class TestSettings(_Checked):
     frames, region, illumination, weights, solver, scale, setup, probes
         The sections of the same name.
     calibration_file
-        ``file`` in ``[calibration]``; needed for colour frames.
+        ``file`` in ``[calibration]``; needed for colour frames, unless a script gives its own separation.
     accept
         ``accept`` in ``[calibration]``: checks of the reference frame against the calibration whose contradictions are
         accepted (`rgbmidic.illumination.frame_check`).
@@ -476,11 +485,6 @@ class TestSettings(_Checked):
     def _check(self) -> None:
         for number, crack in enumerate(self.cracks):
             _require_corners(f"mesh.cracks[{number}]", crack, 2, "two")
-        _require(
-            self.frames.kind not in ("bayer", "rgb") or self.calibration_file is not None,
-            f'frames.kind = "{self.frames.kind}" needs the lights\' crosstalk: state calibration.file, a file that '
-            "rgbmidic-calibrate writes",
-        )
 
     @classmethod
     def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:
@@ -562,7 +566,11 @@ def read_section(kind: type[_Section], name: str, content: Mapping[str, Any], ba
 
 def _from(base: Path, value: Any, hint: Any) -> Any:
     """A value of the file; where it names a file, from the folder that relative paths start from."""
-    return base / value if Path in (hint, *get_args(hint)) and isinstance(value, str | PurePath) else value
+    if Path not in (hint, *get_args(hint)):
+        return value
+    if isinstance(value, list | tuple):
+        return [_from(base, entry, Path) for entry in value]
+    return base / value if isinstance(value, str | PurePath) else value
 
 
 def regular(path: Path) -> Path:

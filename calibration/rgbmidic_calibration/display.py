@@ -12,7 +12,7 @@ from rich.table import Table
 
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import CameraNoise, Quantity
+from rgbmidic.illumination.linear import CameraNoise, Quantity
 from rgbmidic.illumination.registration import Registration
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design

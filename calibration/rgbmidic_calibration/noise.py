@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.linearise import CameraNoise, Quantity
+from rgbmidic.illumination.linear import CameraNoise, Quantity
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
 from rgbmidic_calibration.plausibility import fixed_pattern

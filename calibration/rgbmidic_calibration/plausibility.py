@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.linearise import Quantity
+from rgbmidic.illumination.linear import Quantity
 from rgbmidic.typing import BoolArray
 from rgbmidic_calibration.captures import TemporalStack
 from rgbmidic_calibration.ratio import BlockMeans

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import QUANTISATION, NoiseModel
+from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means

@@ -20,7 +20,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["as_weights", "correlate", "initial_displacement"]
+__all__ = ["as_weights", "correlate", "initial_displacement", "solver_settings"]
 
 
 def correlate(
@@ -83,11 +83,7 @@ def correlate(
     if not isinstance(region, Region):
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
-    try:
-        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
-        solver = SolverSettings(**options)
-    except ConfigurationError as error:
-        raise InputError(str(error)) from None
+    solver = solver_settings(options)
     if normalise is not None:
         f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
     first = Reference.prepare(f, region, as_weights(weights, f.shape, "weights"), mesh=mesh, prefilter=solver.prefilter)
@@ -98,6 +94,21 @@ def correlate(
     else:
         solution = solve(first, second, start, solver, statistics=statistics)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
+
+
+def solver_settings(options: dict[str, Any]) -> SolverSettings:
+    """The settings of the solve that options of a function state.
+
+    Raises
+    ------
+    InputError
+        An option is unknown or out of range.
+    """
+    try:
+        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
+        return SolverSettings(**options)
+    except ConfigurationError as error:
+        raise InputError(str(error)) from None
 
 
 def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str) -> FloatImage | None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -21,7 +24,19 @@ from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.frames.tiff_stack import TiffStack, is_tiff_stack
 from rgbmidic.settings import FrameKind, FrameSettings
 
-__all__ = ["FORMATS", "FRAME_ENDINGS", "FrameFormat", "advice", "open_source", "read_frame", "reader_name"]
+__all__ = [
+    "ENTRY_POINTS",
+    "FORMATS",
+    "FrameFormat",
+    "advice",
+    "frame_endings",
+    "known_formats",
+    "open_source",
+    "read_frame",
+    "reader_name",
+]
+
+logger = logging.getLogger(__name__)
 
 SampleType = Literal["uint8", "uint16", ">u2"]
 
@@ -98,8 +113,34 @@ FORMATS = (
 )
 """The first that recognises a file reads it."""
 
-FRAME_ENDINGS = tuple(ending for known in FORMATS for ending in known.endings)
-"""Endings (lower case) of the files that count as frames when a folder is listed."""
+ENTRY_POINTS = "rgbmidic.frame_formats"
+"""Group of the entry points by which other packages add formats; each names a `FrameFormat`."""
+
+
+@cache
+def _added_formats() -> tuple[FrameFormat, ...]:
+    """Formats of other packages; one that cannot be loaded is left out with a warning."""
+    found = list[FrameFormat]()
+    for point in entry_points(group=ENTRY_POINTS):
+        try:
+            known = point.load()
+            if not isinstance(known, FrameFormat):
+                raise TypeError(f"it is a {type(known).__name__}, not a rgbmidic.frames.FrameFormat")
+            found.append(known)
+        except Exception as error:  # of whatever package it is
+            logger.warning("the frame format %s (%s) is left out: %s", point.name, point.value, error)
+    return tuple(found)
+
+
+def known_formats() -> tuple[FrameFormat, ...]:
+    """All formats, the package's own first: the first that recognises a file reads it."""
+    return (*FORMATS, *_added_formats())
+
+
+def frame_endings() -> tuple[str, ...]:
+    """Endings (lower case) of the files that count as frames when a folder is listed."""
+    return tuple(ending for known in known_formats() for ending in known.endings)
+
 
 _ADVICE = (
     (
@@ -136,7 +177,7 @@ class _UnknownFile(FrameSource):
         if text := advice(self.path):
             raise FrameError(f"{self.path} is {text}")
         with self.path.open("rb"):  # one that cannot be opened is told as that
-            allowed = ", ".join(known.name for known in FORMATS)
+            allowed = ", ".join(known.name for known in known_formats())
         raise FrameError(f"{self.path} is not a frame that rgbmidic reads; allowed are {allowed}")
 
     def _stored(self, index: int) -> NoReturn:
@@ -161,13 +202,13 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
         Of the first of `FORMATS` that recognises the file.
     """
     path = Path(path)
-    source = next((known.source for known in FORMATS if known.recognises(path, stated)), _UnknownFile)
+    source = next((known.source for known in known_formats() if known.recognises(path, stated)), _UnknownFile)
     return source(path=path, stated=stated, camera=camera)
 
 
 def reader_name(source: FrameSource) -> str:
     """Name of the format that a source is read as."""
-    return next((known.name for known in FORMATS if known.source is type(source)), "unknown")
+    return next((known.name for known in known_formats() if known.source is type(source)), "unknown")
 
 
 def read_frame(

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 
-from rgbmidic.errors import FrameError, disk_reason, legible
+from rgbmidic.errors import ConfigurationError, FrameError, disk_reason, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.formats import FRAME_ENDINGS, advice, open_source
+from rgbmidic.frames.formats import advice, frame_endings, open_source
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
@@ -25,7 +25,7 @@ from rgbmidic.settings import FrameSettings
 
 logger = logging.getLogger(__name__)
 
-__all__ = ["FrameSeries", "list_frames", "open_series"]
+__all__ = ["FrameSeries", "chosen_frames", "list_frames", "open_series"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +66,10 @@ class FrameSeries:
     def __len__(self) -> int:
         """Return the number of mechanical states."""
         return len(self.begins)
+
+    def __getitem__(self, index: int) -> tuple[Mosaic | ChannelFrame, ...]:
+        """State `index`, as `read` gives it: a series of files is a frame source as any other."""
+        return self.read(index)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -192,11 +196,18 @@ def open_series(
 
     Raises
     ------
+    ConfigurationError
+        `frames.path` is empty.
     FrameError
         No file matches, a movie's header is damaged, a frame has another size than the first, the lights have different
         frames, or a reference frame or the first or last frame does not exist. A damaged file of one frame is left for
         `FrameSeries.read` to report.
     """
+    if not settings.path:
+        raise ConfigurationError(
+            "frames.path must name the frame files; it is empty, which is for a frame source that a script gives "
+            "(rgbmidic.measure(settings, out, source=...))"
+        )
     files = [list_frames(text, base) for text in settings.path]
     opened = [[open_source(path, settings, camera) for path in paths] for paths in files]
     # a movie in two files, samples and header, is one source where a pattern matches both
@@ -212,7 +223,7 @@ def open_series(
     else:
         series = FrameSeries(lights=lights, numbers=numbers)
     _check_sizes(series)
-    return replace(series, chosen=_chosen(settings, len(series)))
+    return replace(series, chosen=chosen_frames(settings, len(series)))
 
 
 def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -229,7 +240,7 @@ def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[
     return begins, tuple(state - states[0] for state in states)
 
 
-def _chosen(settings: FrameSettings, count: int) -> range:
+def chosen_frames(settings: FrameSettings, count: int) -> range:
     """The states that the settings choose.
 
     Raises
@@ -320,7 +331,7 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     try:
         if place.is_dir():
             found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-            files = [file for file in found if file.suffix.lower() in FRAME_ENDINGS]
+            files = [file for file in found if file.suffix.lower() in frame_endings()]
         else:
             found = files = _matching(Path(text), Path(base))
         files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read

@@ -64,6 +64,10 @@ class FrameSource(ABC):
         """Return the number of frames."""
         return self.recording.count
 
+    def __getitem__(self, index: int) -> Mosaic | ChannelFrame:
+        """Frame `index`, as `read` gives it."""
+        return self.read(index)
+
     def name(self, index: int) -> str:
         """Return the name of a frame in messages and results: the file's name."""
         return legible(self.path.name)

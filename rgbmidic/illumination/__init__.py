@@ -3,17 +3,28 @@
 The names below are imported on first use: spectra and calibration files are read without the kernels.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rgbmidic.illumination.images import REFLECTING, IlluminationImages
+    from rgbmidic.illumination.linear import linearise
+    from rgbmidic.illumination.separation import demosaic, separate
+    from rgbmidic.illumination.unmixing import unmix
 
-__all__ = ["REFLECTING", "IlluminationImages"]
+__all__ = ["REFLECTING", "IlluminationImages", "demosaic", "linearise", "separate", "unmix"]
+
+_HOMES = {
+    "REFLECTING": "images",
+    "IlluminationImages": "images",
+    "demosaic": "separation",
+    "linearise": "linear",
+    "separate": "separation",
+    "unmix": "unmixing",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:
-        from rgbmidic.illumination import images
-
-        return getattr(images, name)
+    if name in _HOMES:
+        return getattr(import_module(f"rgbmidic.illumination.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

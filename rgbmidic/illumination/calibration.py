@@ -17,7 +17,7 @@ from typing import Any
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
-from rgbmidic.illumination.linearise import CameraNoise, NoiseModel
+from rgbmidic.illumination.linear import CameraNoise, NoiseModel
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.settings import FrameKind, regular
 from rgbmidic.typing import FloatArray

@@ -21,7 +21,7 @@ from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.settings import FrameCheck
 from rgbmidic.typing import BoolArray, FloatArray
 

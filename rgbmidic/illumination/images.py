@@ -14,7 +14,7 @@ import numpy as np
 
 from rgbmidic._kernels.texture import divide_by_mean
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.linearise import LinearChannels
+from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

@@ -3,6 +3,18 @@
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan, read_region
 from rgbmidic.pipeline.run import measure
-from rgbmidic.pipeline.separation import Separation, correlated
+from rgbmidic.pipeline.separation import LightSeparation, Separation, correlated
+from rgbmidic.pipeline.sequence import measure_sequence
+from rgbmidic.pipeline.source import FrameSequence
 
-__all__ = ["Plan", "Separation", "correlated", "measure", "measure_frame", "read_region"]
+__all__ = [
+    "FrameSequence",
+    "LightSeparation",
+    "Plan",
+    "Separation",
+    "correlated",
+    "measure",
+    "measure_frame",
+    "measure_sequence",
+    "read_region",
+]

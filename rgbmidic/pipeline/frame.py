@@ -19,7 +19,7 @@ from rgbmidic.correlation import Deformed, Solution, Start, Status, fill
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
-from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
+from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.pipeline.plan import Plan, exposure_fault, too_small
 from rgbmidic.pipeline.separation import RawState, correlated
@@ -27,7 +27,7 @@ from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["failed_frame", "measure_frame", "read_state"]
+__all__ = ["failed_frame", "measure_frame", "next_reference", "read_state", "solve_frame"]
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
     """
     try:
         with timed(plan.timings) as seconds:
-            values = _measure(plan, index, start, _renewal(plan, updated))
+            values = solve_frame(plan, index, start, _renewal(plan, updated))
         return FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
@@ -86,9 +86,7 @@ class _UnreadError(FrameError):
     """A frame that cannot be read, at least now."""
 
 
-def read_state(
-    plan: Plan, index: int, window: Window | None = None
-) -> tuple[tuple[Mosaic | ChannelFrame, ...], dict[str, str]]:
+def read_state(plan: Plan, index: int, window: Window | None = None) -> tuple[RawState, dict[str, str]]:
     """The raw frames of a state, or the part of them in a `window`, and path and fingerprint of their files.
 
     Raises
@@ -102,8 +100,21 @@ def read_state(
         raise _UnreadError(str(error)) from error
 
 
-def _measure(plan: Plan, index: int, start: Start, reference_update: ReferenceUpdate) -> dict[str, Any]:
-    """What `FrameRecord.from_solution` is given."""
+def solve_frame(plan: Plan, index: int, start: Start, reference_update: ReferenceUpdate) -> dict[str, Any]:
+    """What `FrameRecord.from_solution` is given: the ``solution`` of a frame, and what else its record holds.
+
+    Parameters
+    ----------
+    plan, index, start
+        As `measure_frame`.
+    reference_update
+        The reference that ``start.reference_updates`` make.
+
+    Raises
+    ------
+    RgbmidicError
+        The frame cannot be read or is not what the settings say.
+    """
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
@@ -112,16 +123,18 @@ def _measure(plan: Plan, index: int, start: Start, reference_update: ReferenceUp
     with stage("reading"):
         state, inputs = read_state(plan, index, window)
     with stage("separation"):
-        images = plan.separation(state, window)
+        images = plan.lights(state, window)
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
-        weights, ready = plan.weights.deformed(images, index), correlated(images, settings.illumination)
+        weights, ready = plan.frame_weights(images, index), correlated(images, settings.illumination)
         deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter, origin=window.origin)
     statistics = settings.weights.method == "statistics"
     solution = reference_update.track(deformed, start, settings.solver, statistics=statistics)
     if solution.status is not Status.CONVERGED:
-        there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
+        there = state
+        if not isinstance(state, IlluminationImages):
+            there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
         causes = _causes(plan, there, images, reference.offset(deformed), solution)
         solution = replace(solution, reason="; ".join([solution.reason, *causes]))
         end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
@@ -162,13 +175,27 @@ def _causes(
         for light, gain in zip(images.names, gains, strict=True)
         if gain < _DARK and not fault
     ]
-    if small := too_small(plan.settings.element_size, plan.speckle):
+    if small := too_small(plan.element_size, plan.speckle):
         causes.append(small)
     if not causes and solution.status is Status.NOT_CONVERGED:
-        causes = [f"larger elements (mesh.element_size, {plan.settings.element_size:g} px) hold such nodes"]
+        causes = [f"larger elements (mesh.element_size, {plan.element_size:g} px) hold such nodes"]
         if solution.iterations >= plan.settings.solver.max_iterations:
             causes = [f"solver.max_iterations is {plan.settings.solver.max_iterations}: allow more, or {causes[0]}"]
     return causes
+
+
+def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: Solution) -> ReferenceUpdate:
+    """The reference that frame `index` becomes, measured with `solution` on the reference `before`.
+
+    Raises
+    ------
+    RgbmidicError
+        The frame cannot be read, or no element of it is measured.
+    """
+    window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
+    images = plan.lights(read_state(plan, index, window)[0], window)
+    ready = correlated(images, plan.settings.illumination)
+    return before.updated(solution, ready, plan.frame_weights(images, index), window.origin)
 
 
 def _renewal(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUpdate:
@@ -177,11 +204,7 @@ def _renewal(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUp
     def make() -> ReferenceUpdate:
         reference_update = ReferenceUpdate.none(plan.reference)
         for index, solution in updated:
-            window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
-            images = plan.separation(read_state(plan, index, window)[0], window)
-            weights = plan.weights.deformed(images, index)
-            ready = correlated(images, plan.settings.illumination)
-            reference_update = reference_update.updated(solution, ready, weights, window.origin)
+            reference_update = next_reference(plan, reference_update, index, solution)
         return reference_update
 
     return plan.updates.get(tuple(index for index, _ in updated), make)

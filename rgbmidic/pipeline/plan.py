@@ -12,26 +12,35 @@ import logging
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import chain, combinations
 from threading import Lock
 
 import numpy as np
 
 from rgbmidic.correlation import Reference
+from rgbmidic.correlation.correlate import as_weights
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
-from rgbmidic.errors import FrameError, RegionError
-from rgbmidic.frames import FrameSeries, Window, open_series, read_frame
+from rgbmidic.errors import ConfigurationError, FrameError, RegionError
+from rgbmidic.frames import Window, open_series, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
-from rgbmidic.illumination.linearise import QUANTISATION
+from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.separation import RawState, Separation, correlated
+from rgbmidic.pipeline.separation import (
+    LightSeparation,
+    RawState,
+    Separation,
+    correlated,
+    light_images,
+    reference_images,
+)
+from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
 from rgbmidic.settings import RegionSettings, TestSettings
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, prepare_weights
 
 __all__ = [
@@ -105,6 +114,8 @@ class Plan:
         The reference state as the solve needs it, with the mesh.
     speckle
         Size of the speckle in the reference's region, px; None where it is not known.
+    element_size
+        Side of the elements, px.
     window
         Part of the reference frames that is read; all positions (region, mesh, images) count from where it begins.
     timings
@@ -114,75 +125,135 @@ class Plan:
     """
 
     settings: TestSettings
-    series: FrameSeries
-    separation: Separation
+    series: Series
+    separation: LightSeparation
     region: Region
     weights: LightWeights
     images: IlluminationImages
     reference: Reference
     speckle: float | None
     window: Window
+    element_size: float
     timings: bool = False
     updates: UpdatedReferences = field(default_factory=UpdatedReferences, repr=False, compare=False)
 
     @classmethod
-    def from_settings(cls, settings: TestSettings) -> Plan:
+    def from_settings(
+        cls,
+        settings: TestSettings,
+        *,
+        source: FrameSequence | None = None,
+        separation: LightSeparation | None = None,
+        weights: LightWeights | None = None,
+        mesh: Tri3Mesh | None = None,
+        region: Region | None = None,
+    ) -> Plan:
         """Read all that the settings name, except the deformed frames.
+
+        Objects take the place of what the settings name; with any of them frames are read whole.
+
+        Parameters
+        ----------
+        settings
+            What TEST.toml says.
+        source
+            The frames; `frames.path` of the settings is then empty.
+        separation
+            From a raw frame to one image per light.
+        weights
+            How much each light counts; ``weights.method`` is then ``"statistics"`` (both count) or ``"none"``.
+        mesh
+            In px of the frame.
+        region
+            What is measured, in px of the frame.
 
         Raises
         ------
         RgbmidicError
-            The settings, the calibration, the region or the reference frames are not usable.
+            The settings, the calibration, the region or the reference frames are not usable, or an object contradicts
+            the settings.
         """
+        _check_given(settings, source, separation, weights, mesh)
         calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
-        start, *others = settings.frames.reference
-        series = open_series(settings.frames, settings.base, calibration)
-        region, window = _region_and_window(settings, series.shape)
-        first = series.read(start, window)
+        series: Series
+        if source is None:
+            series = open_series(settings.frames, settings.base, calibration)
+        else:
+            series = open_sequence(source, settings.frames, calibration)
+        if any(one is not None for one in (source, separation, weights, mesh, region)):
+            region = region or read_region(settings.region, series.shape)
+            window = Window.whole(series.shape)
+        else:
+            region, window = _region_and_window(settings, series.shape)
+        first, others = series.read(settings.frames.reference[0], window), settings.frames.reference[1:]
+        if separation is not None and isinstance(first, IlluminationImages):
+            raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
         if calibration is not None:
             calibration = calibration.cropped(settings.frames.crop_origin, window.frame)
-        separation = Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        images, separation = separation.reference(first, (series.read(index, window) for index in others), window)
+        separation = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
+        states = chain([first], (series.read(index, window) for index in others))
+        images, learnt = reference_images(separation, states, window)
         names = ", ".join(map(series.name, settings.frames.reference))
-        if calibration is not None:
+        if calibration is not None and not isinstance(first, IlluminationImages):
             again = series.read(others[0], window) if others else None
             here = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
             for found in check_state(first, here, region.mask, names, accept=settings.accept, repeat=again):
                 if not found.certain:
                     logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration_file, found.text)
-        cracks = [np.subtract(path, window.origin) for path in settings.cracks]
-        mesh = Tri3Mesh.from_region(region, settings.element_size, cracks)
-        weights = prepare_weights(
+        if mesh is None:
+            cracks = [np.subtract(path, window.origin) for path in settings.cracks]
+            mesh = Tri3Mesh.from_region(region, settings.element_size, cracks)
+            size = settings.element_size
+        else:
+            size = mesh.size
+        weights = weights or prepare_weights(
             settings,
             images,
             region,
             shape=window.frame,
             frames=len(series),
-            images_of=lambda index: separation(series.read(index, window), window),
+            images_of=lambda index: light_images(learnt, series.read(index, window), window),
         )
         reference = Reference.prepare(
             correlated(images, settings.illumination),
             region,
-            weights.reference(images),
+            as_weights(weights.reference(images), images.values.shape, "weights of the reference"),
             mesh=mesh,
             prefilter=settings.solver.prefilter,
             origin=window.origin,
         )
         speckle = _speckle(images, region)
-        if small := too_small(settings.element_size, speckle, HARDLY_ENOUGH):
+        if small := too_small(size, speckle, HARDLY_ENOUGH):
             logger.warning("%s", small)
         _check_seen(reference, first, region, names)
         return cls(
             settings=settings,
             series=series,
-            separation=separation,
+            separation=learnt,
             region=region,
             weights=weights,
             images=images,
             reference=reference,
             speckle=speckle,
             window=window,
+            element_size=size,
         )
+
+    def lights(self, state: RawState, window: Window) -> IlluminationImages:
+        """One image per light of a state, or of a `window` of it."""
+        return light_images(self.separation, state, window)
+
+    def frame_weights(self, images: IlluminationImages, index: int) -> FloatImage:
+        """Weights (k, H, W) of the images of frame `index`.
+
+        Raises
+        ------
+        InputError
+            Weights of the user's have another shape, or are negative or not finite.
+        """
+        given = as_weights(self.weights.deformed(images, index), images.values.shape, f"weights of frame {index}")
+        assert given is not None
+        return given
 
     def window_of(self, *displacements: FloatArray | None) -> Window:
         """The part of a frame that is read where its displacement is looked for at rest and at nodal `displacements`
@@ -192,6 +263,36 @@ class Plan:
         nodes = self.reference.mesh.nodes + self.window.origin
         places = [nodes, *(nodes + moved for moved in displacements if moved is not None)]
         return _window(np.concatenate(places), search_reach(nodes), self.settings, self.window.frame)
+
+
+def _check_given(
+    settings: TestSettings,
+    source: FrameSequence | None,
+    separation: LightSeparation | None,
+    weights: LightWeights | None,
+    mesh: Tri3Mesh | None,
+) -> None:
+    """Refuse an object that contradicts what the settings name."""
+    if source is not None and settings.frames.path:
+        raise ConfigurationError(
+            f"frames.path names {', '.join(settings.frames.path)}, and a frame source is given: leave the path empty "
+            "(path = [])"
+        )
+    if source is not None and settings.frames.lights > 1:
+        raise ConfigurationError("frames.lights is for files; a frame source gives all lights of a state by one index")
+    if weights is not None and settings.weights.method not in ("statistics", "none"):
+        raise ConfigurationError(
+            f'weights.method = "{settings.weights.method}", and weights are given: state "statistics", with which both '
+            'count, or "none"'
+        )
+    if mesh is not None and settings.cracks:
+        raise ConfigurationError("mesh.cracks splits a mesh that is made here; the mesh that is given has its own")
+    kind = settings.frames.kind
+    if kind in ("bayer", "rgb") and separation is None and settings.calibration_file is None:
+        raise ConfigurationError(
+            f'frames.kind = "{kind}" needs the lights\' crosstalk: state calibration.file, a file that '
+            "rgbmidic-calibrate writes"
+        )
 
 
 def _region_and_window(settings: TestSettings, frame: tuple[int, int]) -> tuple[Region, Window]:
@@ -285,7 +386,9 @@ def check_texture(state: RawState, inside: BoolArray, name: str) -> None:
     FrameError
         No frame shows anything in the region that noise would not.
     """
-    shown = [neighbour_correlation(frame, inside) for frame in state]
+    shown = [
+        neighbour_correlation(frame, inside) for frame in ([state] if isinstance(state, IlluminationImages) else state)
+    ]
     told = f"neighbouring samples of the reference ({name}) correlate by {min(shown):.2f} in the region"
     if max(shown) < NO_TEXTURE:
         raise FrameError(
@@ -295,25 +398,28 @@ def check_texture(state: RawState, inside: BoolArray, name: str) -> None:
         logger.warning("%s, where speckle gives .4 or more: its contrast is hardly above the noise", told)
 
 
-def neighbour_correlation(frame: Mosaic | ChannelFrame, inside: BoolArray) -> float:
+def neighbour_correlation(frame: Mosaic | ChannelFrame | IlluminationImages, inside: BoolArray) -> float:
     """Correlation of neighbouring raw samples less their local mean: 0 for camera noise, towards 1 for texture.
 
     The noise of a raw sample is its own, so what neighbours have in common is texture. Neighbours are samples of one
     channel or of two, whichever agree better: lights may show different textures, and a mosaic samples a channel only
-    at every other pixel. Variance below that of rounding to grey levels counts as noise.
+    at every other pixel. Variance below that of rounding to grey levels counts as noise. Noise of separated lights may
+    have been smoothed: what is certain of raw frames is less so there.
     """
     planes = _planes(frame, inside)
-    energy = [max(float((plane**2).sum()), QUANTISATION * plane.size) for plane in planes]
+    rounding = float(np.finfo(np.float32).tiny) if isinstance(frame, IlluminationImages) else QUANTISATION
+    energy = [max(float((plane**2).sum()), rounding * plane.size) for plane in planes]
     own = sum(float((p[:, 1:] * p[:, :-1]).sum() + (p[1:] * p[:-1]).sum()) / 2 for p in planes) / sum(energy)
     pairs = list(combinations(range(len(planes)), 2))
     total = sum(float(np.sqrt(energy[a] * energy[b])) for a, b in pairs)
     return max(own, sum(float((planes[a] * planes[b]).sum()) for a, b in pairs) / total if pairs else 0.0)
 
 
-def _planes(frame: Mosaic | ChannelFrame, inside: BoolArray) -> list[FloatArray]:
+def _planes(frame: Mosaic | ChannelFrame | IlluminationImages, inside: BoolArray) -> list[FloatArray]:
     """Samples of each channel on their own lattice, less their local mean; 0 outside and where saturated."""
     step = 2 if isinstance(frame, Mosaic) else 1
-    usable = inside & (frame.values < frame.white_level)
+    seen = frame.valid if isinstance(frame, IlluminationImages) else frame.values < frame.white_level
+    usable = inside & seen
     known = np.where(usable, frame.values, np.nan).astype(np.float32).reshape(-1, *inside.shape)
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     # a cell of a mosaic is any 2 x 2 samples, wherever the region begins
@@ -325,6 +431,8 @@ def _planes(frame: Mosaic | ChannelFrame, inside: BoolArray) -> list[FloatArray]
 
 def exposure_fault(state: RawState, inside: BoolArray) -> str | None:
     """What is wrong with the exposure or the stated levels of raw frames in a region (H, W); None: nothing evident."""
+    if isinstance(state, IlluminationImages):  # no samples of a camera
+        return None
     faults = [_fault(frame, inside) for frame in state]
     told = [f"light {i + 1}: {fault}" if len(state) > 1 else fault for i, fault in enumerate(faults) if fault]
     return "; ".join(told) or None

@@ -12,14 +12,18 @@ import numpy as np
 from rgbmidic._kernels import are_compiled
 from rgbmidic.correlation import Status
 from rgbmidic.errors import FrameError, InputError, ResultError
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import read_state
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.schedule import Schedule, dependants
+from rgbmidic.pipeline.separation import LightSeparation
+from rgbmidic.pipeline.source import FrameSequence, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.store import listed
 from rgbmidic.settings import TestSettings
+from rgbmidic.weights import LightWeights
 
 __all__ = ["measure"]
 
@@ -35,6 +39,10 @@ def measure(
     settings: TestSettings,
     out: Path | str,
     *,
+    source: FrameSequence | None = None,
+    separation: LightSeparation | None = None,
+    weights: LightWeights | None = None,
+    mesh: Tri3Mesh | None = None,
     overwrite: bool = False,
     resume: bool = False,
     retry_failed: bool = False,
@@ -55,10 +63,21 @@ def measure(
         What `rgbmidic.settings.read_test` reads from TEST.toml.
     out
         Result folder; nothing is written to it before settings, calibration, region and reference are found good.
+    source
+        The frames, in place of files: whatever has a length and a frame by index (`FrameSequence`), such as a numpy
+        stack (T, H, W); the settings then have ``frames.path = []``.
+    separation
+        From a raw frame to one image per light, in place of the package's (`LightSeparation`).
+    weights
+        How much each light counts at each pixel (`rgbmidic.weights.LightWeights`), in place of what ``[weights]``
+        names; with ``weights.method = "statistics"`` they are multiplied by those, with ``"none"`` they count alone.
+    mesh
+        In px of the frame, in place of the one made from region and ``[mesh]``.
     overwrite
         Replace a result that is already there.
     resume
-        Go on with a result that is already there: its settings, calibration and frames must be the same. Frames that
+        Go on with a result that is already there: its settings, calibration and frames must be the same, and the
+        objects must describe themselves as then. Frames that
         are damaged there are measured again; so are those that could not be read and now can, with all that started
         from them.
     retry_failed
@@ -90,11 +109,16 @@ def measure(
     """
     if retry_failed and not resume:
         raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
-    plan = replace(Plan.from_settings(settings), timings=timings)
+    given = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
+    plan = Plan.from_settings(settings, source=source, separation=separation, weights=weights, mesh=mesh)
+    plan = replace(plan, timings=timings)
+    objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
+    if settings.weights.method == "images":  # the masks, whatever their files are called
+        objects["weights"] = describe(plan.weights)
     places = _places(plan.series.chosen, frames)
     if workers is None:
         workers = max(min(available_cores(), len(places) // FRAMES_A_WORKER), 1)
-    with _store(plan, Path(out), places if frames else None, overwrite=overwrite, resume=resume) as store:
+    with _store(plan, Path(out), places if frames else None, objects, overwrite=overwrite, resume=resume) as store:
         if resume and frames is None:
             _take_back(plan, store, retry_failed=retry_failed)
         schedule = Schedule(plan, store, places)
@@ -167,7 +191,9 @@ def _places(chosen: range, frames: range | None) -> range:
     return range(places[0], places[-1] + 1)
 
 
-def _store(plan: Plan, out: Path, part: range | None, *, overwrite: bool, resume: bool) -> ResultStore:
+def _store(
+    plan: Plan, out: Path, part: range | None, objects: dict[str, str], *, overwrite: bool, resume: bool
+) -> ResultStore:
     series = plan.series
     recording = series.recording
     begun = (resume or part is not None) and (out / PROVENANCE).exists()
@@ -178,11 +204,11 @@ def _store(plan: Plan, out: Path, part: range | None, *, overwrite: bool, resume
         names=[series.name(index) for index in series.chosen],
         lights=plan.images.names,
         settings=plan.settings,
-        inputs={" + ".join(plan.settings.frames.path): fingerprint},
+        inputs={" + ".join(plan.settings.frames.path) or "source": fingerprint, **objects},
         references=[place for place, index in enumerate(series.chosen) if index in plan.settings.frames.reference],
         reference=plan.images.values,
         notes={
-            **plan.weights.notes,
+            **getattr(plan.weights, "notes", {}),
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
             "lost_frames": series.lost,

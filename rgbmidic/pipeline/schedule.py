@@ -27,7 +27,7 @@ from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Updated, Workers
 from rgbmidic.results import FrameRecord, ResultStore
 from rgbmidic.typing import FloatArray
 
-__all__ = ["STRIDE", "Schedule", "children", "dependants", "is_key", "lineage", "parent"]
+__all__ = ["STRIDE", "Schedule", "children", "dependants", "is_key", "lineage", "loses", "parent", "rank"]
 
 logger = logging.getLogger("rgbmidic.pipeline.frame")
 
@@ -139,12 +139,12 @@ class Schedule:
         if record.unread and (gone := self._plan.series.gone()):
             raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
         first = self._first_tries.pop(position, None)
-        if first is None and is_key(position) and _loses(record, start):
+        if first is None and is_key(position) and loses(record, start):
             self._first_tries[position] = record
             self._measure_after(position - 1, position)
             return
         if first is not None:
-            better = first if _rank(first) <= _rank(record) else record
+            better = first if rank(first) <= rank(record) else record
             record = replace(better, values={**better.values, "tries": 2})
         self._store.write_frame(position, record)
         self._finished[position] = True
@@ -233,13 +233,14 @@ def _error(future: Future[Measured]) -> BaseException | None:
         raise RgbmidicError(LOST_CLUSTER) from None
 
 
-def _rank(record: FrameRecord) -> tuple[int, float]:
+def rank(record: FrameRecord | Solution) -> tuple[int, float]:
     """The smaller, the better a frame is measured."""
     return int(record.status), float((record.node_status != NodeStatus.MEASURED).mean())
 
 
-def _loses(record: FrameRecord, start: Start) -> bool:
-    status, unmeasured = _rank(record)
+def loses(record: FrameRecord | Solution, start: Start) -> bool:
+    """Whether a key frame is measured worse than the one it starts from."""
+    status, unmeasured = rank(record)
     return status != Status.CONVERGED or unmeasured > start.unmeasured + _LOSS
 
 

@@ -4,24 +4,51 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
-from rgbmidic.errors import ConfigurationError, FrameError
+from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.images import IlluminationImages, normalise
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, linearise
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.linear import LinearChannels, linearise
+from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmix import align, unmix
+from rgbmidic.illumination.unmixing import align
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import FloatImage
 
-__all__ = ["RawState", "Separation", "correlated"]
+__all__ = ["LightSeparation", "RawState", "Separation", "correlated", "light_images", "reference_images"]
 
-RawState = tuple[Mosaic | ChannelFrame, ...]
-"""What the camera recorded of one state: a frame, or one per light fired in succession."""
+RawState = tuple[Mosaic | ChannelFrame, ...] | IlluminationImages
+"""What a series gives of one state: a raw frame, or one per light fired in succession; or the lights' images already,
+which are not separated any more."""
+
+
+class LightSeparation(Protocol):
+    """From what the camera recorded of one state to one image per light: `Separation`, or a function of one's own.
+
+    It may also have
+
+    - ``learnt(images)``: the separation of all other frames, which knows the images of the reference's first frame;
+    - ``describe()``: a text that says what it does; another text is another test, which `resume` refuses.
+    """
+
+    def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...], /) -> IlluminationImages:
+        """Separate the lights of one state.
+
+        Parameters
+        ----------
+        frames
+            The raw frame, or one per light fired in succession.
+
+        Returns
+        -------
+        IlluminationImages
+            Images (k, H, W) of the size of the frame, of the same lights in every state.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +69,7 @@ class Separation:
     demosaic: str = "auto"
     texture: TextureModel | None = None
 
-    def __call__(self, frames: RawState, window: Window | None = None) -> IlluminationImages:
+    def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...], window: Window | None = None) -> IlluminationImages:
         """Illumination images of one state from its frame, or its frames if lights fired in succession.
 
         Parameters
@@ -67,40 +94,69 @@ class Separation:
             images = IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)], names)
         elif len(linear) > 1:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
-        elif isinstance(only := linear[0], LinearMosaic):
-            images = separate(only, self._crosstalk(), self.demosaic, texture=self.texture)
         else:
-            images = unmix(only, self._crosstalk())
+            images = separate(linear[0], self._crosstalk(), self.demosaic, texture=self.texture)
         return images if known.registration is None else align(images, known.registration)
 
-    def reference(
-        self, first: RawState, others: Iterable[RawState] = (), window: Window | None = None
-    ) -> tuple[IlluminationImages, Separation]:
-        """Mean image of each light over the states of the reference, and the separation that knows the first's texture.
-
-        A pixel is valid where it is valid in all of them. The others are taken one by one.
-
-        Raises
-        ------
-        FrameError
-            The frames have different shapes.
-        ConfigurationError
-            As above.
-        """
-        mean = self(first, window)
-        learnt = replace(self, texture=mean.texture)
-        total, valid, count = mean.values.astype(np.float64), mean.valid, 1
-        for images in (learnt(state, window) for state in others):
-            if images.values.shape != total.shape:
-                raise FrameError(f"the reference frames have different shapes: {total.shape}, {images.values.shape}")
-            total, valid, count = total + images.values, valid & images.valid, count + 1
-        return replace(mean, values=(total / count).astype(np.float32), valid=valid), learnt
+    def learnt(self, images: IlluminationImages) -> Separation:
+        """The separation that takes the speckle's texture from the images of one state for all others."""
+        return replace(self, texture=images.texture)
 
     def _crosstalk(self) -> Crosstalk:
         if self.calibration is None or self.calibration.crosstalk is None:
             what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
             raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
         return self.calibration.crosstalk
+
+
+def light_images(separation: LightSeparation, state: RawState, window: Window) -> IlluminationImages:
+    """One image per light of a state, or of a `window` of it; a state that has them already gives them as they are.
+
+    Raises
+    ------
+    InputError
+        A separation of the user's gives something else than images of the size of the frame.
+    RgbmidicError
+        What the separation raises.
+    """
+    if isinstance(state, IlluminationImages):
+        return state
+    if isinstance(separation, Separation):  # which knows windows
+        return separation(state, window)
+    images = separation(state)
+    if not isinstance(images, IlluminationImages) or images.shape != state[0].values.shape[-2:]:
+        told = f"of shape {images.values.shape}" if isinstance(images, IlluminationImages) else ""
+        raise InputError(
+            f"the separation must give IlluminationImages of the size of the frame {state[0].values.shape[-2:]}; it "
+            f"gives {type(images).__name__} {told}".rstrip()
+        )
+    return images
+
+
+def reference_images(
+    separation: LightSeparation, states: Iterable[RawState], window: Window
+) -> tuple[IlluminationImages, LightSeparation]:
+    """Mean image of each light over the states of the reference, and the separation that has learnt from the first.
+
+    A pixel is valid where it is valid in all of them. They are taken one by one.
+
+    Raises
+    ------
+    FrameError
+        The frames have different shapes.
+    RgbmidicError
+        As `light_images`.
+    """
+    others = iter(states)
+    mean = light_images(separation, next(others), window)
+    if (learn := getattr(separation, "learnt", None)) is not None:
+        separation = learn(mean)
+    total, valid, count = mean.values.astype(np.float64), mean.valid, 1
+    for images in (light_images(separation, state, window) for state in others):
+        if images.values.shape != total.shape:
+            raise FrameError(f"the reference frames have different shapes: {total.shape}, {images.values.shape}")
+        total, valid, count = total + images.values, valid & images.valid, count + 1
+    return replace(mean, values=(total / count).astype(np.float32), valid=valid), separation
 
 
 def correlated(images: IlluminationImages, settings: IlluminationSettings) -> FloatImage:

@@ -90,7 +90,7 @@ class Processes(Workers):
 
     def __init__(self, plan: Plan, count: int) -> None:
         self.slots = count
-        self._plan = pickle.dumps(plan, protocol=pickle.HIGHEST_PROTOCOL)
+        self._plan = _pickled(plan)
         self._processes: set[BaseProcess] = set()
         self._executor: Executor = self._begin()
 
@@ -133,6 +133,31 @@ class Processes(Workers):
     def close(self) -> None:
         """Stop, without waiting for what is not finished."""
         _end(self._executor, self._processes)
+
+
+def _pickled(plan: Plan) -> bytes:
+    """The plan for another process.
+
+    Raises
+    ------
+    ConfigurationError
+        An object that a script gave cannot be sent; it is named.
+    """
+    try:
+        return pickle.dumps(plan, protocol=pickle.HIGHEST_PROTOCOL)
+    except Exception as error:  # objects raise what they like
+        given = {"frame source": getattr(plan.series, "source", None)}
+        given |= {"separation": plan.separation, "weights": plan.weights}
+        for what, one in given.items():
+            try:
+                pickle.dumps(one, protocol=pickle.HIGHEST_PROTOCOL)
+            except Exception as reason:
+                raise ConfigurationError(
+                    f"the {what} ({type(one).__name__}) cannot be sent to another process: {reason}; measure with "
+                    "workers=1, or give one that can be pickled, such as a class of a module that opens its file where "
+                    "it reads"
+                ) from None
+        raise ConfigurationError(f"the test cannot be sent to another process: {error}") from None
 
 
 class Cluster(Workers):

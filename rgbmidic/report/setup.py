@@ -38,6 +38,7 @@ _WEIGHTS = {
     "statistics": "by the statistics of each light's residual, robust",
     "threshold": "a light is excluded where it is brighter than a threshold",
     "geometry": "by the geometry of lamps, camera and specimen",
+    "images": "by masks made by hand, one per light",
     "none": "none: every light counts everywhere",
 }
 

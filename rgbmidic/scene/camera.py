@@ -17,7 +17,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.crosstalk import Led, Sensitivities, spectral_response
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.typing import FloatArray
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 The spectrum is that of a Boolean model of discs seen through pixel aperture, lens and prefilter. The rendered piece
 gives the droplets' domes and, taken through the real demosaicing and unmixing, what a Bayer mosaic does to the lights'
-images: the noise that it passes and the trace that it leaves. So any method of `rgbmidic.illumination.separate` is
+images: the noise that it passes and the trace that it leaves. So any method of `rgbmidic.illumination.separation` is
 described, linear or not.
 """
 
@@ -19,8 +19,8 @@ from rgbmidic._kernels.render import PLATE
 from rgbmidic.correlation.images import PREFILTERS
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import sampled_channels, shift_cfa
-from rgbmidic.illumination.linearise import LinearMosaic
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.linear import LinearMosaic
+from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.scene.camera import Floating, mosaic_samples
 from rgbmidic.scene.scene import Scene
@@ -96,7 +96,7 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
     texture : ndarray, shape (n, n)
         Of a `SpecklePatch`.
     demosaic
-        Method of `rgbmidic.illumination.separate`.
+        Method of `rgbmidic.illumination.separation`.
 
     Returns
     -------

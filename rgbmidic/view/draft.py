@@ -22,7 +22,13 @@ from rgbmidic.view.canvas import Canvas
 
 __all__ = ["HOLES", "OUTLINES", "Draft", "RegionDrawing", "arranged", "marks_of", "region_of", "rings"]
 
-_FILES = (("calibration", "file"), ("region", "mask"), ("weights", "geometry"), ("weights", "height_map"))
+_FILES = (
+    ("calibration", "file"),
+    ("region", "mask"),
+    ("weights", "geometry"),
+    ("weights", "height_map"),
+    ("weights", "images"),
+)
 """Keys that name files, beside the frames."""
 
 
@@ -156,9 +162,8 @@ class Draft:
         file = self.file.parent / file
         if file.suffix.lower() != ".toml":
             raise ConfigurationError(f"{file} must end in .toml")
-        frames = self.section("frames").get("path", [])
-        named = [frames] if isinstance(frames, str) else list(frames)
-        named += [text for section, key in _FILES if (text := self.section(section).get(key)) is not None]
+        given = [self.section(section).get(key, []) for section, key in (("frames", "path"), *_FILES)]
+        named = [text for one in given for text in ([one] if isinstance(one, str) else one)]
         if file.parent != self.file.parent and any(not Path(text).is_absolute() for text in named):
             raise ConfigurationError(
                 f"{file} must stay in {self.file.parent}: what it names is relative to that folder"

@@ -1,6 +1,6 @@
 """How much each light counts at each pixel."""
 
-from rgbmidic.weights.light_weights import LightWeights, prepare_weights
+from rgbmidic.weights.light_weights import LightWeights, MaskWeights, prepare_weights
 from rgbmidic.weights.threshold import (
     DisturbedZone,
     SetUpThreshold,
@@ -13,6 +13,7 @@ from rgbmidic.weights.threshold import (
 __all__ = [
     "DisturbedZone",
     "LightWeights",
+    "MaskWeights",
     "SetUpThreshold",
     "blurred",
     "disturbed_zone",

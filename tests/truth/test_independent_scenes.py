@@ -10,8 +10,8 @@ import pytest
 from rgbmidic import Tri3Mesh, correlate, read_frame
 from rgbmidic.fields import at_nodes, at_pixels
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import NoiseModel, linearise
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.linear import NoiseModel, linearise
+from rgbmidic.illumination.separation import separate
 
 MARGIN = 25
 """px: one element."""

@@ -27,7 +27,7 @@ from rgbmidic.errors import (
 )
 from rgbmidic.frames import FrameSeries, file_hash
 from rgbmidic.frames.images import write_dng, write_tiff
-from rgbmidic.illumination import demosaic as reflection_aware
+from rgbmidic.illumination import demosaicing as reflection_aware
 from rgbmidic.pipeline import Plan, measure_frame, separation
 
 BAYER_RMS = 0.015

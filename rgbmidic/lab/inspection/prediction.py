@@ -22,10 +22,10 @@ from scipy.ndimage import median_filter
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.colour_factors import BLOCK, LEAST, MEAN_BLOCK, enlarged
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.demosaic import SPARKLE_VARIANCE, Reconstruction
+from rgbmidic.illumination.demosaicing import SPARKLE_VARIANCE, Reconstruction
 from rgbmidic.illumination.images import IlluminationImages, local_mean
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.scene.camera import mosaic_samples
@@ -80,7 +80,7 @@ class SeparationErrors:
         model
             Model of the frame that the reflection-aware method fitted.
         crosstalk, method
-            How the test separates its frames (`rgbmidic.illumination.separate`).
+            How the test separates its frames (`rgbmidic.illumination.separation`).
         noise
             Camera noise to draw.
         random

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rgbmidic.illumination.frame_check import Mismatch
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

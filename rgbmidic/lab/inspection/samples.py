@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from rgbmidic.frames.data import Window, sampled_channels
 from rgbmidic.illumination.images import local_mean
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.mesh import Region
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage

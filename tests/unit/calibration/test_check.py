@@ -10,7 +10,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import NoiseModel
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.ratio import block_means

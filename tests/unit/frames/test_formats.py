@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import tracemalloc
 import zlib
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ from frames import noisy_mosaic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rgbmidic import cli
+from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError
-from rgbmidic.frames import open_source, read_frame
+from rgbmidic.frames import FrameFormat, FrameSource, StoredFrame, formats, open_series, open_source, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.frames.formats import FORMATS
 from rgbmidic.settings import FrameSettings
@@ -384,3 +387,48 @@ def test_what_opencv_would_turn_round_is_refused(tmp_path: Path) -> None:
         read_frame(path, kind="monochrome")
     with pytest.raises(FrameError, match=r"not read \(.*\); save it as"):
         read_frame(_one_strip(path, (31, 45), bytes(100), 50000), kind="monochrome")
+
+
+class _Level(FrameSource):
+    """A format of another package: a frame of one grey level, the number in the file."""
+
+    def _shape(self) -> tuple[int, int]:
+        return 24, 30
+
+    def _stored(self, index: int) -> StoredFrame:
+        return StoredFrame(values=np.full((24, 30), int(self.path.read_text()), dtype=np.uint16))
+
+
+level = FrameFormat(
+    name="level files", endings=(".level",), recognises=lambda path, _: path.suffix == ".level", source=_Level
+)
+
+
+def test_formats_of_other_packages_join_by_an_entry_point(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    points = [
+        EntryPoint(name=name, value=f"{__name__}:{what}", group=formats.ENTRY_POINTS)
+        for name, what in (("level", "level"), ("gone", "not_there"), ("other", "FORMATS"))
+    ]
+    monkeypatch.setattr(formats, "entry_points", lambda group: [one for one in points if one.group == group])
+    formats._added_formats.cache_clear()
+    try:
+        for number in (7, 8):
+            (tmp_path / f"{number}.level").write_text(str(number))
+        series = open_series(FrameSettings(path=(str(tmp_path),), kind="monochrome"))
+        assert [int(series.read(index)[0].values[0, 0, 0]) for index in (0, 1)] == [7, 8]
+        assert execute(cli.app, ["frames", "--formats"]) == 0
+        listed = capsys.readouterr().out.splitlines()
+        assert listed[-1] == "level files: .level"
+        assert len(listed) == len(FORMATS) + 1
+        warnings = [record.message for record in caplog.records]
+        assert len(warnings) == 2
+        assert "gone" in warnings[0]
+        assert "not_there" in warnings[0]
+        assert "it is a tuple, not a rgbmidic.frames.FrameFormat" in warnings[1]
+    finally:
+        formats._added_formats.cache_clear()

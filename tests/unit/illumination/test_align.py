@@ -6,7 +6,7 @@ import pytest
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.registration import Registration
-from rgbmidic.illumination.unmix import align
+from rgbmidic.illumination.unmixing import align
 
 SHAPE = (120, 140)
 LIMIT = 2e-3  # of the contrast; cubic splines on waves of 16 px or longer

@@ -6,8 +6,8 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import BAYER_PATTERNS
-from rgbmidic.illumination.demosaic import Demosaicer, MalvarDemosaicer, NormalisedMosaic
-from rgbmidic.illumination.linearise import LinearMosaic
+from rgbmidic.illumination.demosaicing import Demosaicer, MalvarDemosaicer, NormalisedMosaic
+from rgbmidic.illumination.linear import LinearMosaic
 
 MALVAR = MalvarDemosaicer()
 

@@ -10,8 +10,8 @@ import pytest
 from naive_demosaic import site_channels
 
 from rgbmidic.frames.data import shift_cfa
-from rgbmidic.illumination.demosaic import MalvarDemosaicer, NormalisedMosaic, ReflectionAwareDemosaicer
-from rgbmidic.illumination.separate import DEMOSAICERS, separate
+from rgbmidic.illumination.demosaicing import MalvarDemosaicer, NormalisedMosaic, ReflectionAwareDemosaicer
+from rgbmidic.illumination.separation import DEMOSAICERS, separate
 from rgbmidic.illumination.texture import TextureModel
 
 SHAPE = (128, 144)

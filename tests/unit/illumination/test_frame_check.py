@@ -17,7 +17,7 @@ from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.frame_check import check_state, mismatches, unevenness
-from rgbmidic.illumination.linearise import QUANTISATION, NoiseModel
+from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.pipeline import measure
 
 BLACK, WHITE, SHAPE = 64, 4095, (288, 288)

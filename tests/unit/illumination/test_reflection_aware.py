@@ -8,8 +8,8 @@ from naive_demosaic import site_channels
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.colour_factors import colour_factors, gather_moments, learn_texture
-from rgbmidic.illumination.demosaic import Demosaicer, ReflectionAwareDemosaicer, prediction_filters
-from rgbmidic.illumination.separate import separate
+from rgbmidic.illumination.demosaicing import Demosaicer, ReflectionAwareDemosaicer, prediction_filters
+from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 
 SHAPE = (160, 176)

@@ -8,7 +8,7 @@ from rgbmidic._kernels import mesh as kriging
 from rgbmidic._kernels import texture
 from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.colour_factors import colour_moments, of_mosaic, widened
-from rgbmidic.illumination.demosaic import red_position
+from rgbmidic.illumination.demosaicing import red_position
 
 SHAPES = [(16, 24), (19, 21), (33, 18), (9, 531)]
 

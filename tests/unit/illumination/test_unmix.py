@@ -5,11 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rgbmidic import illumination
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.calibration import Crosstalk
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
-from rgbmidic.illumination.separate import DEMOSAICERS, separate
-from rgbmidic.illumination.unmix import NEGLIGIBLE, unmix
+from rgbmidic.frames import ChannelFrame, Mosaic
+from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
+from rgbmidic.illumination.separation import DEMOSAICERS, separate
+from rgbmidic.illumination.unmixing import NEGLIGIBLE, unmix
 
 A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 LIGHTS = ("red", "green", "blue")
@@ -87,3 +89,19 @@ def test_unknown_method_names_the_allowed_ones():
         separate(mosaic, Crosstalk(matrix=A, lights=LIGHTS), "nearest")
     with pytest.raises(InputError, match="3 camera channels"):
         separate(mosaic, Crosstalk.identity(("one",)), "malvar")
+
+
+def test_raw_frames_are_separated_by_one_public_call():
+    values = np.random.default_rng(0).integers(100, 4000, (64, 64)).astype(np.uint16)
+    mosaic = Mosaic(values=values, cfa="RGGB", black_level=64, white_level=4095)
+    crosstalk = Crosstalk(matrix=A, lights=LIGHTS)
+    linear = illumination.linearise(mosaic)
+    known = illumination.separate(linear, crosstalk, "malvar")
+    by_steps = illumination.unmix(illumination.demosaic(mosaic, "malvar"), crosstalk)
+    for images in (illumination.separate(mosaic, Calibration(crosstalk=crosstalk), "malvar"), by_steps):
+        np.testing.assert_array_equal(images.values, known.values)
+    frame = ChannelFrame(values=np.stack([values] * 3), black_level=64, white_level=4095)
+    direct = illumination.separate(frame, crosstalk)
+    np.testing.assert_array_equal(direct.values, illumination.unmix(illumination.linearise(frame), crosstalk).values)
+    with pytest.raises(InputError, match="the calibration has no crosstalk"):
+        illumination.separate(mosaic, Calibration())

@@ -10,7 +10,7 @@ import pytest
 
 from bench import lamp_for_reflection
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.linearise import linearise
+from rgbmidic.illumination.linear import linearise
 from rgbmidic.lab.virtual import Finish, Light, Scene, Sphere, State, Surface, expose, record, render
 from rgbmidic.mesh import Region
 from rgbmidic.scene.camera import reference_camera

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 import pickle
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from rgbmidic.errors import FrameError
+from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
-from rgbmidic.weights import prepare_weights
+from rgbmidic.weights import MaskWeights, prepare_weights
 from rgbmidic.weights.threshold import FALLBACK
 
 SHAPE = (60, 80)
@@ -80,3 +82,44 @@ def test_weights_can_be_pickled(method):
     weights = prepared(method=method)
     again = pickle.loads(pickle.dumps(weights))
     np.testing.assert_array_equal(again.deformed(images(), 1), weights.deformed(images(), 1))
+
+
+def test_masks_made_by_hand_count_where_they_are_not_zero_or_by_their_fraction(tmp_path):
+    plain, grey = np.zeros(SHAPE, dtype=np.uint8), np.full(SHAPE, 51, dtype=np.uint8)
+    plain[:, 20:], grey[:30] = 1, 255
+    for name, mask in (("plain", plain), ("grey", grey)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), mask)
+    files = [str(tmp_path / "plain.png"), str(tmp_path / "grey.png")]
+    weights = prepared(method="images", images=files)
+    for found in (weights.reference(images()), weights.deformed(images(), 1)):
+        np.testing.assert_array_equal(found[0], plain)
+        np.testing.assert_array_equal(found[1, :10], 0)
+        np.testing.assert_array_equal(found[1, 10:30], 1)
+        np.testing.assert_allclose(found[1, 30:], 0.2)
+    part = replace(images(), values=images().values[:, 8:40, 16:48], valid=images().valid[:, 8:40, 16:48])
+    np.testing.assert_array_equal(weights.reference(replace(part, origin=(16, 8)))[0], plain[8:40, 16:48])
+    with pytest.raises(ConfigurationError, match=r"weights.images must name one mask per light \(a, b\).*given are 1"):
+        prepared(method="images", images=files[:1])
+    cv2.imwrite(str(tmp_path / "grey.png"), grey[:-1])
+    with pytest.raises(InputError, match="need one size"):
+        prepared(method="images", images=files)
+    with pytest.raises(ConfigurationError, match="go together"):
+        prepared(method="images")
+
+
+def test_masks_by_a_function_of_the_frame():
+    weights = MaskWeights(lambda images: images.values < 500)
+    np.testing.assert_array_equal(weights.reference(images())[0, :, :40], 0)
+    np.testing.assert_array_equal(weights.deformed(images(), 1)[0, :, 40:], 1)
+    with pytest.raises(InputError, match="one mask per light"):
+        MaskWeights(np.ones((1, *SHAPE))).reference(images())
+    with pytest.raises(InputError, match="from 0 to 1; given are 0 to 255"):
+        MaskWeights(np.arange(256.0).reshape(1, 16, 16))
+
+
+def test_masks_are_found_beside_the_file_that_names_them(tmp_path):
+    document = {"frames": {"path": "x"}, "region": {"rectangle": [0, 0, 9, 9]}}
+    document["weights"] = {"method": "images", "images": ["a.png", "b.png"]}
+    found = TestSettings.from_mapping(document, tmp_path)
+    assert found.weights.images == (tmp_path / "a.png", tmp_path / "b.png")
+    assert TestSettings.from_mapping(found.to_mapping(), found.base) == found

@@ -44,9 +44,9 @@ from rgbmidic.illumination.colour_factors import (
     widened,
 )
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.linearise import LinearChannels, LinearMosaic
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmix import needed
+from rgbmidic.illumination.unmixing import needed
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = [
@@ -288,7 +288,7 @@ class ReflectionAwareDemosaicer:
             The linearised frame.
         mixing : (n, 3), or None
             Mixtures of the channels to give instead of them; not valid where a channel that matters in one
-            (`rgbmidic.illumination.unmix.needed`) is not.
+            (`rgbmidic.illumination.unmixing.needed`) is not.
 
         Returns
         -------

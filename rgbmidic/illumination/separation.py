@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.demosaic import (
+from rgbmidic.illumination.demosaicing import (
     SMALLEST_FRAME,
     Demosaicer,
     MalvarDemosaicer,
@@ -18,12 +20,12 @@ from rgbmidic.illumination.demosaic import (
     ReflectionAwareDemosaicer,
 )
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.linearise import LinearMosaic
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmix import unmix
+from rgbmidic.illumination.unmixing import align, unmix
 from rgbmidic.typing import FloatArray
 
-__all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "reconstructed_lights", "separate"]
+__all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "demosaic", "reconstructed_lights", "separate"]
 
 
 DEFAULT_METHOD = "reflection-aware"
@@ -34,46 +36,97 @@ DEMOSAICERS = (DEFAULT_METHOD, *_BY_CHANNEL)
 
 
 def separate(
-    mosaic: LinearMosaic,
-    crosstalk: Crosstalk,
+    frame: Mosaic | ChannelFrame | LinearMosaic | LinearChannels,
+    calibration: Calibration | Crosstalk,
     method: str = DEFAULT_METHOD,
     *,
     texture: TextureModel | None = None,
 ) -> IlluminationImages:
-    """One image per light from one raw frame.
+    """One image per light from one raw colour frame: linearised, demosaiced, unmixed and, where calibrated, registered.
 
     Parameters
     ----------
-    mosaic
-        The linearised frame.
-    crosstalk
-        Which camera channel sees how much of which light, shape (3, k).
+    frame
+        As it was recorded, or linearised (`linearise`) already.
+    calibration
+        Of camera and lights; or their crosstalk alone, shape (3, k).
     method
-        One of `DEMOSAICERS`, or ``"auto"``: reflection-aware where the frame is large enough, else Malvar.
+        How a mosaic is demosaiced: one of `DEMOSAICERS`, or ``"auto"``: reflection-aware where the frame is large
+        enough, else Malvar.
     texture
         The speckle's autocorrelation for the methods that use it; None: they learn it from the frame.
+
+    Returns
+    -------
+    IlluminationImages
+        Shape (k, H, W), DN above black.
 
     Raises
     ------
     InputError
-        Unknown method, a frame too small for it, or a crosstalk matrix that is not for three camera channels.
+        Unknown method, a frame too small for it, no crosstalk, or one that is not for the frame's channels.
     """
-    method = _chosen(method, mosaic)
+    crosstalk = calibration if isinstance(calibration, Crosstalk) else calibration.crosstalk
+    if crosstalk is None:
+        raise InputError("the calibration has no crosstalk, which colour frames need (rgbmidic-calibrate crosstalk)")
+    if isinstance(calibration, Calibration):
+        linear = linearise(frame, calibration.noise) if isinstance(frame, Mosaic | ChannelFrame) else frame
+        images = separate(linear, crosstalk, method, texture=texture)
+        return images if calibration.registration is None else align(images, calibration.registration)
+    linear = linearise(frame) if isinstance(frame, Mosaic | ChannelFrame) else frame
+    if isinstance(linear, LinearChannels):
+        return unmix(linear, crosstalk)
+    method = _chosen(method, linear)
     _check_channels(crosstalk)
     if method != DEFAULT_METHOD:
-        return unmix(_BY_CHANNEL[method](mosaic), crosstalk)
+        return unmix(_BY_CHANNEL[method](linear), crosstalk)
     demosaicer = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)
     if crosstalk.field is not None:
-        return reconstructed_lights(demosaicer.reconstruct(mosaic), crosstalk)
-    model = demosaicer.reconstruct(mosaic, crosstalk.unmixing)
+        return reconstructed_lights(demosaicer.reconstruct(linear), crosstalk)
+    model = demosaicer.reconstruct(linear, crosstalk.unmixing)
     return IlluminationImages(
         values=model.channels.values,
         valid=model.channels.valid,
         names=crosstalk.lights,
-        full_scale=mosaic.full_scale,
+        full_scale=linear.full_scale,
         reflection=_reflection(model, crosstalk),
         texture=model.texture,
     )
+
+
+def demosaic(
+    mosaic: Mosaic | LinearMosaic,
+    method: str = DEFAULT_METHOD,
+    *,
+    crosstalk: Crosstalk | None = None,
+    texture: TextureModel | None = None,
+) -> LinearChannels:
+    """All three camera channels at every pixel of a mosaic.
+
+    Parameters
+    ----------
+    mosaic
+        As it was recorded, or linearised.
+    method
+        As in `separate`.
+    crosstalk, texture
+        For the reflection-aware method: see `rgbmidic.illumination.demosaicing.ReflectionAwareDemosaicer`.
+
+    Returns
+    -------
+    LinearChannels
+        Shape (3, H, W) in the order R, G, B, DN above black.
+
+    Raises
+    ------
+    InputError
+        Unknown method, or a frame too small for it.
+    """
+    linear = linearise(mosaic) if isinstance(mosaic, Mosaic) else mosaic
+    assert isinstance(linear, LinearMosaic)
+    if (chosen := _chosen(method, linear)) != DEFAULT_METHOD:
+        return _BY_CHANNEL[chosen](linear)
+    return ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)(linear)
 
 
 def reconstructed_lights(reconstruction: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:

@@ -17,7 +17,7 @@ from rgbmidic._kernels.lights import unmix as unmix_kernel
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.calibration import Crosstalk
 from rgbmidic.illumination.images import IlluminationImages, local_mean
-from rgbmidic.illumination.linearise import LinearChannels
+from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

@@ -1,0 +1,316 @@
+"""Frames that a script gives: whatever has a length and a frame by index is read as a series of files is.
+
+`FrameSequence` is the protocol; a numpy stack, an HDF5 dataset, a camera maker's library and the series of files that
+`rgbmidic.frames.open_series` makes are implementations of it. `SourceSeries` is what the pipeline reads it through.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Collection, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from rgbmidic.errors import FrameError, InputError, RgbmidicError
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
+from rgbmidic.frames.series import FrameSeries, chosen_frames
+from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
+from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.pipeline.separation import RawState
+from rgbmidic.settings import FrameSettings
+from rgbmidic.typing import AnyArray
+
+__all__ = ["FrameSequence", "Series", "SourceSeries", "describe", "open_sequence"]
+
+_LONGEST_NAME = 120
+"""Characters of a description that are kept as they are; a longer one is cut and gets its checksum. Chosen; not
+sensitive: it is read by people, the checksum by the comparison."""
+
+
+class FrameSequence(Protocol):
+    """Frames by index, from 0: a numpy stack (T, H, W), an HDF5 dataset, a camera maker's library, a `FrameSeries`.
+
+    It may also have
+
+    - ``names``: what messages and results call each frame, one text a frame;
+    - ``times_ns``: when each frame was taken, whole ns, one a frame;
+    - ``lights``: names of the lights, where its frames are arrays of light images;
+    - ``describe()``: a text that says what is measured; another text is another test, which `resume` refuses. Without
+      it the class, the number of frames and the content of the first and the last frame say it.
+
+    More than one worker sends it to other processes: it must then be picklable, and one that holds an open file opens
+    it where it is used.
+    """
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def __getitem__(self, index: int, /) -> Any:
+        """One state.
+
+        Returns
+        -------
+        ndarray of whole numbers, shape (H, W) or (C, H, W)
+            A raw frame, of which ``[frames]`` says kind, pattern and levels as for files.
+        Mosaic or ChannelFrame, or a tuple of one per light fired in succession
+            A raw frame that says so itself.
+        IlluminationImages, or ndarray of floats, shape (H, W) or (k, H, W)
+            One image per light, which needs no separation; NaN where not valid.
+        """
+        ...
+
+
+class Series(Protocol):
+    """What the pipeline reads frames from: a `FrameSeries` of files, or a `SourceSeries`."""
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """Number of each frame, with gaps where frames are missing."""
+        ...
+
+    @property
+    def chosen(self) -> range:
+        """The frames that are to be measured."""
+        ...
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of every frame."""
+        ...
+
+    @property
+    def recording(self) -> Recording:
+        """How the frames were recorded."""
+        ...
+
+    @property
+    def lost(self) -> int:
+        """Number of frames missing between the first and the last chosen."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of states."""
+        ...
+
+    def read(self, index: int, window: Window | None = None) -> Any:
+        """State `index` or a `window` of it: raw frames, or one image per light."""
+        ...
+
+    def gone(self) -> str:
+        """What exists no more and all frames are read from; empty where all is there."""
+        ...
+
+    def name(self, index: int) -> str:
+        """Name of state `index`."""
+        ...
+
+    def time_ns(self, index: int) -> int | None:
+        """When state `index` was taken, in ns; None where that is not known."""
+        ...
+
+    def inputs(self, index: int, window: Window | None = None) -> dict[str, str]:
+        """Path and fingerprint of every file that state `index` comes from."""
+        ...
+
+    def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
+        """A text that changes with the frames, and the names of those whose content it leaves out."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceSeries:
+    """A `FrameSequence` as the pipeline reads it; frames are read whole.
+
+    Attributes
+    ----------
+    source
+        The frames.
+    stated
+        What ``[frames]`` says of them.
+    camera
+        What a calibration knows of them.
+    chosen
+        The frames that are to be measured.
+    shape
+        Rows and columns, of the reference's first frame.
+    full_scale
+        Grey level of a just saturated sample where the frames are arrays of light images: the stated levels', else the
+        largest grey level of the first frame of the reference.
+    """
+
+    source: FrameSequence
+    stated: FrameSettings
+    camera: Camera | None = field(default=None, compare=False, repr=False)
+    chosen: range = range(0)
+    shape: tuple[int, int] = (0, 0)
+    full_scale: float = 1.0
+
+    def __len__(self) -> int:
+        """Number of states."""
+        return len(self.source)
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """The frames are numbered through."""
+        return range(len(self))
+
+    @property
+    def recording(self) -> Recording:
+        """When the frames were taken, where the source knows it."""
+        times = getattr(self.source, "times_ns", None)
+        return Recording(count=len(self), times_ns=None if times is None else np.asarray(times, dtype=np.int64))
+
+    @property
+    def lost(self) -> int:
+        """A source has all the frames that it counts."""
+        return 0
+
+    def read(self, index: int, window: Window | None = None) -> RawState:
+        """State `index`: raw frames, or one image per light.
+
+        Raises
+        ------
+        FrameError
+            The source raises an error, gives something that is no frame, or contradicts ``[frames]``.
+        """
+        assert window is None or window.is_whole, "frames of a source are read whole"
+        try:
+            state = self.source[index]
+        except RgbmidicError:
+            raise
+        except Exception as error:  # of whatever library it is
+            told = f"{type(error).__name__}: {error}"
+            raise FrameError(f"{self.name(index)} cannot be read from {_class(self.source)}: {told}") from error
+        return self._state(state, self.name(index))
+
+    def gone(self) -> str:
+        """A source that is there stays there."""
+        return ""
+
+    def name(self, index: int) -> str:
+        """What the source calls the frame, else its number."""
+        names = getattr(self.source, "names", None)
+        return f"frame {index}" if names is None else str(names[index])
+
+    def time_ns(self, index: int) -> int | None:
+        """When the frame was taken, where the source knows it."""
+        times = getattr(self.source, "times_ns", None)
+        return None if times is None else int(times[index])
+
+    def inputs(self, index: int, window: Window | None = None) -> dict[str, str]:
+        """No file is known."""
+        return {}
+
+    def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
+        """What `describe` says of the source; without a description of its own also the content of the first frame of
+        the reference and of the last frame chosen."""
+        told, without = describe(self.source), []
+        if not hasattr(self.source, "describe"):
+            told = f"{_class(self.source)} of {len(self)} frames"
+            for index in (self.stated.reference[0], self.chosen[-1]):
+                name = self.name(index)
+                content = "unread"
+                if name not in unread:
+                    with suppress(FrameError):
+                        state = self.read(index)
+                        parts = [state] if isinstance(state, IlluminationImages) else list(state)
+                        content = hashlib.sha256(b"".join(part.values.tobytes() for part in parts)).hexdigest()
+                if content == "unread":
+                    without.append(name)
+                told += f", {content[:16]}"
+        return told, tuple(without)
+
+    def _state(self, state: Any, name: str) -> RawState:
+        """What the source gives, as the pipeline takes it."""
+        if isinstance(state, IlluminationImages):
+            return state
+        if isinstance(state, Mosaic | ChannelFrame):
+            return (state,)
+        if isinstance(state, tuple | list) and state and all(isinstance(one, Mosaic | ChannelFrame) for one in state):
+            return tuple(state)
+        values = np.asarray(state)
+        if values.dtype.kind == "f" and values.ndim in (2, 3):
+            values = values if values.ndim == 3 else values[None]
+            lights = getattr(self.source, "lights", None) or [f"light {light + 1}" for light in range(len(values))]
+            return IlluminationImages(
+                values=values, valid=np.isfinite(values), names=tuple(lights), full_scale=self.full_scale
+            )
+        return (self._raw(values, name),)
+
+    def _raw(self, values: AnyArray, name: str) -> Mosaic | ChannelFrame:
+        """Whole numbers (H, W) or (C, H, W) as the raw frame that ``[frames]`` says they are."""
+        if values.dtype == np.bool_ or values.dtype.kind not in "ui" or values.ndim not in (2, 3):
+            raise FrameError(
+                f"{name} of {_class(self.source)} is {values.dtype} of shape {values.shape}; allowed are whole numbers "
+                "(H, W) or (C, H, W), floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"
+            )
+        if values.dtype not in (np.uint8, np.uint16):
+            if values.min() < 0 or values.max() > np.iinfo(np.uint16).max:
+                raise FrameError(f"{name} of {_class(self.source)} has grey levels outside 0 to 65535")
+            values = values.astype(np.uint16)
+        if values.ndim == 3:
+            values = np.moveaxis(values, 0, -1)
+        path = Path(name)
+        return raw_frame(StoredFrame.plain(np.ascontiguousarray(values), path), self.stated, path, self.camera)
+
+
+def open_sequence(source: FrameSequence | FrameSeries, stated: FrameSettings, camera: Camera | None) -> Series:
+    """The series that the pipeline reads from a source, checked on the first frame of the reference.
+
+    Raises
+    ------
+    InputError
+        The source has no length or no frame by index, or its names or times are not one a frame.
+    FrameError
+        A reference frame, or the first or last frame, does not exist or cannot be read.
+    """
+    if isinstance(source, FrameSeries):  # it reads in windows
+        return source
+    if not (hasattr(source, "__len__") and hasattr(source, "__getitem__")):
+        raise InputError(
+            f"a frame source has a length and a frame by index (__len__ and __getitem__); {_class(source)} has not. "
+            "Frames that come one after the other are for rgbmidic.measure_sequence"
+        )
+    for name in ("names", "times_ns"):
+        told = getattr(source, name, None)
+        if told is not None and len(told) != len(source):
+            raise InputError(f"{name} of {_class(source)} has {len(told)} entries for {len(source)} frames")
+    chosen, start = chosen_frames(stated, len(source)), stated.reference[0]
+    series = SourceSeries(source=source, stated=stated, camera=camera, chosen=chosen)
+    state = series.read(start)
+    if not isinstance(state, IlluminationImages):
+        return replace(series, shape=state[0].values.shape[-2:])
+    white = float(np.nanmax(state.values, initial=0.0)) if stated.white_level is None else stated.white_level
+    return replace(series, shape=state.shape, full_scale=white - (stated.black_level or 0.0))
+
+
+def describe(given: Any) -> str:
+    """What a result keeps of an object that a script gave: its ``describe()`` where it has one, else what it shows.
+
+    Functions and objects without a representation of their own give their name only: two of one name cannot be told
+    apart.
+    """
+    if callable(told := getattr(given, "describe", None)):
+        text = f"{_class(given)}: {told()}"
+    elif callable(given) and hasattr(given, "__qualname__"):
+        text = f"{given.__module__}.{given.__qualname__}"
+    elif isinstance(given, np.ndarray):
+        digest = hashlib.sha256(np.ascontiguousarray(given).tobytes()).hexdigest()
+        text = f"{given.dtype} array of shape {given.shape}, {digest[:16]}"
+    elif repr(given) == object.__repr__(given):
+        text = _class(given)
+    else:
+        text = f"{_class(given)}: " + re.sub(r" at 0x[0-9a-fA-F]+", "", repr(given))
+    if len(text) > _LONGEST_NAME:
+        return f"{text[:_LONGEST_NAME]} ... {hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    return text
+
+
+def _class(given: object) -> str:
+    return f"{type(given).__module__}.{type(given).__qualname__}"
