@@ -256,8 +256,10 @@ class Plan:
         return given
 
     def window_of(self, *displacements: FloatArray | None) -> Window:
-        """The part of a frame that is read where its displacement is looked for at rest and at nodal `displacements`
-        (N, 2): what a search looks at, and what the separation of that depends on. It holds the reference's."""
+        """Part of a frame that is read to find its displacement from rest and from nodal `displacements` (N, 2).
+
+        It holds what a search looks at, what the separation of that depends on, and the reference's window.
+        """
         if self.window.is_whole:
             return self.window
         nodes = self.reference.mesh.nodes + self.window.origin
@@ -377,9 +379,11 @@ def check_texture(state: RawState, inside: BoolArray, name: str) -> None:
     Parameters
     ----------
     state
-        Raw frames of the reference; its name in messages is `name`.
+        Raw frames of the reference.
     inside : ndarray, shape (H, W)
         The region.
+    name
+        Name of the reference in messages.
 
     Raises
     ------

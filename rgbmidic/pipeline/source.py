@@ -208,8 +208,11 @@ class SourceSeries:
         return {}
 
     def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
-        """What `describe` says of the source; without a description of its own also the content of the first frame of
-        the reference and of the last frame chosen."""
+        """What `describe` gives for the source.
+
+        Without a description of its own, the content of the first frame of the reference and of the last frame chosen
+        belongs to it.
+        """
         told, without = describe(self.source), []
         if not hasattr(self.source, "describe"):
             told = f"{_class(self.source)} of {len(self)} frames"

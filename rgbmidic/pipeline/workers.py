@@ -71,7 +71,7 @@ class Workers(ABC):
 
 
 class Here(Workers):
-    """This process, one frame after the other, each on all its threads."""
+    """The present process, one frame after the other, each on all its threads."""
 
     slots = 1
 

@@ -165,7 +165,7 @@ def disturbed_zone(high_passed: FloatArray, centre: tuple[float, float]) -> Dist
     Parameters
     ----------
     high_passed
-        `rgbmidic.fields.history` of a displacement measured without weights, shape (H, W); NaN where not measured.
+        `rgbmidic.fields.high_pass` of a displacement measured without weights, shape (H, W); NaN where not measured.
     centre
         Middle of the reflection, (x, y) in px.
 
@@ -203,9 +203,11 @@ def set_up_threshold(
     Parameters
     ----------
     high_passed
-        `rgbmidic.fields.history` of its displacement at a small motion, shape (H, W).
+        `rgbmidic.fields.high_pass` of its displacement at a small motion, shape (H, W).
     images
-        The reference images; `light` is the one that was used.
+        The reference images.
+    light
+        Index of the light that was used.
     blur
         Standard deviation (px) of the blur that the weights will use.
 
@@ -345,7 +347,7 @@ def _displacement(
     element_size: float,
     prefilter: str,
 ) -> list[tuple[str, FloatImage]]:
-    """u and v (H, W) of one light alone, without weights; the smaller of the two shows a disturbance best."""
+    """Displacement u and v (H, W) of one light alone, without weights; the smaller shows a disturbance best."""
     solution = correlate(
         reference.values[light],
         deformed.values[light],

@@ -113,7 +113,7 @@ def perturbation(field: npt.ArrayLike, areas: Sequence[Area], *, sigma: float = 
     areas
         Where P is assessed.
     sigma
-        Standard deviation in px of the Gaussian of `rgbmidic.fields.history`.
+        Standard deviation in px of the Gaussian of `rgbmidic.fields.high_pass`.
 
     Returns
     -------
@@ -179,7 +179,7 @@ def area_stds(high_passed: FloatArray, areas: Sequence[Area]) -> FloatArray:
     Parameters
     ----------
     high_passed : ndarray, shape (H, W)
-        For P: `rgbmidic.fields.history` of a displacement in px; NaN where not measured.
+        For P: `rgbmidic.fields.high_pass` of a displacement in px; NaN where not measured.
     areas
         n areas.
 
