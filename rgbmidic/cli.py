@@ -403,8 +403,7 @@ def plan(
     """Predict where each lamp reflects, the uncertainty to expect, and better places for the lamps."""
     from rgbmidic.lab import check_folder
     from rgbmidic.lab.planning import report as planning
-    from rgbmidic.lab.planning.lamps import propose_colours, propose_lamps
-    from rgbmidic.lab.planning.plan import make_plan
+    from rgbmidic.lab.planning.plan import make_plan, propose_colours, propose_lamps
     from rgbmidic.scene.scene import read_scene
 
     check_folder(out, planning.FILES, overwrite=overwrite)

@@ -10,9 +10,8 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.formats import reader_name
-from rgbmidic.frames.images import write_tiff
+from rgbmidic.frames.images import TIFF_ENDINGS, write_tiff
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.frames.tiff import TIFF_ENDINGS
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import FloatArray
 

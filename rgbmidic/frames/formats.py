@@ -14,12 +14,11 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
 from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.images import HeaderlessFile, PngFile, is_headerless
+from rgbmidic.frames.images import TIFF_ENDINGS, HeaderlessFile, PngFile, TiffFile, is_headerless
 from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
 from rgbmidic.frames.stored import Camera
-from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.frames.tiff_stack import TiffStack, is_tiff_stack
 from rgbmidic.settings import FrameKind, FrameSettings

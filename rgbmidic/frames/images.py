@@ -1,11 +1,13 @@
-"""Files of one picture: PNG and headerless samples in, plain 16-bit TIFF and raw Bayer DNG out.
+"""Files of one picture: PNG, TIFF and headerless samples in, plain 16-bit TIFF and raw Bayer DNG out.
 
 PNG is decoded by OpenCV, with every checksum verified. The DNG tags follow the Adobe DNG specification 1.4, chapter 4;
 LibRaw reads the frames back bit by bit.
+TIFF images are grey or RGB, 8 or 16 bit; the reading of a page serves files of several, too.
 """
 
 from __future__ import annotations
 
+import lzma
 import math
 import re
 import struct
@@ -14,18 +16,35 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
+from rgbmidic.frames.stored import CHECKED_FROM, StoredFrame, check_size, complaints, damaged
+from rgbmidic.frames.tiff_pages import UNCOMPRESSED, cfa_pattern, is_stored_as_is, missing_data, tag, tiff_pages
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import AnyArray
 
-__all__ = ["MINIMUM_DNG_SIZE", "HeaderlessFile", "PngFile", "decode", "is_headerless", "write_dng", "write_tiff"]
+if TYPE_CHECKING:
+    from tifffile import TiffPage
+
+__all__ = [
+    "MINIMUM_DNG_SIZE",
+    "TIFF_ENDINGS",
+    "HeaderlessFile",
+    "PngFile",
+    "TiffFile",
+    "checked_page",
+    "decode",
+    "is_headerless",
+    "page_frame",
+    "page_rows",
+    "write_dng",
+    "write_tiff",
+]
 
 _PLACE = re.compile(r"^\[ERROR\S*\] global \S+ \S+ ")
 """Where in OpenCV a line of its log comes from."""
@@ -250,3 +269,142 @@ def _whole(level: float, name: str, path: Path | str) -> int:
     if level != int(level) or level > 65535:
         raise InputError(f"a DNG holds a {name} level that is a whole number up to 65535, not {level}: {path}")
     return int(level)
+
+
+TIFF_ENDINGS = (".tif", ".tiff")
+
+_BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+"""Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
+_BY_OPENCV = (5, 7, 32773)
+"""LZW, JPEG, PackBits."""
+_MIN_IS_WHITE, _PALETTE = 0, 3
+_COLOUR_MAP, _ORIENTATION = 320, 274
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TiffFile(FrameSource):
+    """A TIFF file of one image with 1 or 3 channels; a table of colours is refused."""
+
+    def _shape(self) -> tuple[int, int]:
+        with tiff_pages(self.path) as pages:
+            page = _single_page(pages, self.path)
+            return int(page.imagelength), int(page.imagewidth)
+
+    def _stored(self, index: int) -> StoredFrame:
+        with tiff_pages(self.path) as pages:
+            page = _single_page(pages, self.path)
+            if page.compression in _BY_OPENCV:
+                return page_frame(page, self.path, _by_opencv(page, self.path))
+            return page_frame(page, self.path)
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        with tiff_pages(self.path) as pages:
+            page = _single_page(pages, self.path)
+            if (samples := page_rows(page, self.path, rows)) is not None:
+                return page_frame(page, self.path, samples)
+        return FrameSource._rows(self, index, rows)
+
+
+def page_rows(page: TiffPage, path: Path, rows: range) -> AnyArray | None:
+    """Read the samples (n, W, C) of some rows of a checked page; None where it must be unpacked as a whole."""
+    in_planes = page.planarconfig == 2 and page.samplesperpixel > 1
+    if not is_stored_as_is(page) or not page.is_contiguous or in_planes:
+        return None
+    shape = len(rows), page.imagewidth, page.samplesperpixel
+    dtype = np.dtype(page.dtype)
+    start = page.dataoffsets[0] + rows.start * math.prod(shape[1:]) * dtype.itemsize
+    stored = dtype.newbyteorder(page.parent.byteorder)
+    samples = np.fromfile(path, dtype=stored, count=math.prod(shape), offset=start)
+    return samples.astype(dtype, copy=False).reshape(shape)
+
+
+def page_frame(page: TiffPage, path: Path, samples: AnyArray | None = None) -> StoredFrame:
+    """Return the frame of a checked page, from its `samples` where they were read already.
+
+    Raises
+    ------
+    FrameError
+        They are damaged, or stored in a way that is not read.
+    """
+    values = _samples(page, path) if samples is None else samples
+    if page.photometric == _PALETTE:
+        table = np.asarray(page.tags[_COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
+        # some cameras' software writes grey images with a table that changes nothing, of 257 i or of 256 i
+        if values.dtype != np.uint8 or not (table // 256 == np.arange(table.shape[1])).all():
+            raise FrameError(f"{path} shows its grey levels through a colour table; save it as a plain grey image")
+    elif page.photometric == _MIN_IS_WHITE:
+        values = np.iinfo(values.dtype).max - values
+    return StoredFrame.plain(values, path, cfa_pattern(page))
+
+
+def _single_page(pages: list[TiffPage], path: Path) -> TiffPage:
+    if not pages:
+        raise damaged(path, "its header leads to no image")
+    if len(pages) > 1:
+        raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
+    checked_page(pages[0], path)
+    return pages[0]
+
+
+def checked_page(page: TiffPage, path: Path) -> None:
+    """Refuse a page whose samples are no raw frame's or not all there, before anything is unpacked.
+
+    Raises
+    ------
+    FrameError
+        So they are.
+    """
+    if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
+        kind = page.dtype or f"{page.bitspersample}-bit"
+        raise FrameError(f"{path} has {kind} samples; allowed are unsigned 8 or 16 bit")
+    if not (page.imagelength and page.imagewidth and page.samplesperpixel):  # an entry that is damaged counts as 0
+        told = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
+        raise damaged(path, f"its header announces {told}")
+    size = path.stat().st_size
+    if reason := missing_data(page, size):
+        raise damaged(path, reason)
+    stored = sum(page.databytecounts)
+    if page.compression == UNCOMPRESSED and not is_stored_as_is(page):
+        raise damaged(path, f"its header announces {stored} bytes of image data, too few for its size")
+    check_size(path, needed=page.nbytes, stored=min(stored, size))
+
+
+def _samples(page: TiffPage, path: Path) -> AnyArray:
+    """Read the samples of a page as they are stored, (H, W) or (H, W, C)."""
+    if page.compression not in (UNCOMPRESSED, *_BY_TIFFFILE):
+        raise _not_read(page, path)
+    if page.compression in _BY_TIFFFILE:
+        _check_unpacked(page, path)
+    values = np.asarray(page.asarray())
+    one_plane_after_the_other = values.ndim == 3 and page.planarconfig == 2
+    return np.moveaxis(values, 0, -1) if one_plane_after_the_other else values
+
+
+def _by_opencv(page: TiffPage, path: Path) -> AnyArray:
+    """Read the samples of the only page of a file."""
+    turned = (tag(page, _ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
+    if turned:  # OpenCV turns such samples, some more than others
+        raise _not_read(page, path)
+    values = decode(path.read_bytes(), path)
+    if (*values.shape[:2], values.dtype) != (page.imagelength, page.imagewidth, page.dtype):
+        raise damaged(path, f"its header announces another image than its data hold, {values.shape} {values.dtype}")
+    return values
+
+
+def _not_read(page: TiffPage, path: Path) -> FrameError:
+    name = getattr(page.compression, "name", page.compression)
+    return FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
+
+
+def _check_unpacked(page: TiffPage, path: Path) -> None:
+    """Refuse parts that unpack to more than the whole image, and all of them to less: tifffile fills up with zeros."""
+    limit, total = max(page.nbytes, CHECKED_FROM), 0
+    with path.open("rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            unpacked = len(_BY_TIFFFILE[page.compression]().decompress(file.read(count), limit + 1))
+            if unpacked > limit:
+                raise damaged(path, f"a part of its image data unpacks to more than {limit} bytes")
+            total += unpacked
+    if total < page.nbytes:
+        raise damaged(path, f"its image data unpack to {total} bytes, too few for its size")

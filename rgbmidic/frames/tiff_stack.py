@@ -16,9 +16,9 @@ import numpy as np
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import Integers, Recording, even_times
+from rgbmidic.frames.images import checked_page, page_frame, page_rows
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import Layout, StoredFrame, check_count, damaged
-from rgbmidic.frames.tiff import checked_page, page_frame, page_rows
 from rgbmidic.frames.tiff_pages import HEADERS, is_stored_as_is, tiff_page
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray

@@ -2,9 +2,8 @@
 
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan, read_region
-from rgbmidic.pipeline.run import measure
+from rgbmidic.pipeline.run import measure, measure_sequence
 from rgbmidic.pipeline.separation import LightSeparation, Separation, correlated
-from rgbmidic.pipeline.sequence import measure_sequence
 from rgbmidic.pipeline.source import FrameSequence
 
 __all__ = [

@@ -10,8 +10,7 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.lab import check_folder, number_or_none, write_document
-from rgbmidic.lab.planning.lamps import Proposal
-from rgbmidic.lab.planning.plan import Outlook, Plan
+from rgbmidic.lab.planning.plan import Outlook, Plan, Proposal
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal, save_figure
 from rgbmidic.scene.camera import Light
 from rgbmidic.scene.scene import Scene

@@ -400,7 +400,7 @@ def test_command(command: Run, tmp_path: Path) -> None:
         (["frame.dng", "--cfa", "BGGR"], "BGGR"),
         (["frame.tif", "--cfa", "RGGB", "--calibration", "none.json"], "none.json"),
         (["frame.tif", "--cfa", "RGGB", "--test", "none.toml"], "none.toml"),
-        (["frame.tif", "--cfa", "RGGB", "--region", "1,2,3"], "x0, y0"),
+        (["frame.tif", "--cfa", "RGGB", "--region", "1,2,3"], "X0,Y0,X1,Y1"),
         (["frame.tif", "--cfa", "RGGB", "--region", "a"], "--region"),
         (["frame.tif", "--cfa", "RGGB", "--element-size", "2"], "4 px"),
         (["frame.tif", "--cfa", "RGGB", "--region", "500,500,600,600"], "overlap"),
