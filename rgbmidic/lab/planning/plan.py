@@ -3,8 +3,9 @@
 Everything follows from a SCENE.toml: its reflection zones (`rgbmidic.scene.zones`) and the uncertainty in closed form
 (`rgbmidic.scene.forecast`). Nothing is rendered.
 
-Better places: the directions of the lamps are chosen anew, each at its own distance from the specimen. The reflection zones should not overlap in any state and should lie outside the field as far as the light can afford to
-fall obliquely; the colour that measures best (of a Bayer camera green, with two samples in four) deserves the light
+Better places: the directions of the lamps are chosen anew, each at its own distance from the specimen. The reflection
+zones should not overlap in any state and should lie outside the field as far as the light can afford to fall
+obliquely; the colour that measures best (of a Bayer camera green, with two samples in four) deserves the light
 that reflects least. All three follow from one cost: the uncertainty over field and states if every light counted by
 the fourth power of its diffuse fraction, the weighting of a user who trusts no reflection.
 """
