@@ -31,6 +31,8 @@ def _write(out: Path, started: Event | None = None) -> None:
             started.set()
         for index in np.flatnonzero(~store.finished())[::-1]:
             store.write_frame(index, RECORDS[index])
+            if started is not None:
+                time.sleep(3e-4)  # a fast disk would be done before it is killed
 
 
 @forking
