@@ -56,7 +56,7 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
     """
     try:
         with timed(plan.timings) as seconds:
-            values = solve_frame(plan, index, start, _renewal(plan, updated))
+            values = solve_frame(plan, index, start, _updated_reference(plan, updated))
         return FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
@@ -198,7 +198,7 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
     return before.updated(solution, ready, plan.frame_weights(images, index), window.origin)
 
 
-def _renewal(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUpdate:
+def _updated_reference(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUpdate:
     """The reference that the frames `updated` make in turn."""
 
     def make() -> ReferenceUpdate:

@@ -56,8 +56,8 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-_LOOKED_AT = 512
-"""Largest side (px) of the part of the region in which the speckle is measured: thousands of speckles, .1 s."""
+_LOOKED_AT = 256
+"""Largest side (px) of the part of the region in which the speckle is measured: a thousand speckles of 8 px."""
 _KEPT_UPDATES = 2
 """Updated references that a process keeps: frames measured side by side follow this one or the last."""
 

@@ -94,9 +94,8 @@ def measure(
         Replace a result that is already there.
     resume
         Go on with a result that is already there: its settings, calibration and frames must be the same, and the
-        objects must describe themselves as then. Frames that
-        are damaged there are measured again; so are those that could not be read and now can, with all that started
-        from them.
+        objects must describe themselves as then. Frames that are damaged there are measured again; so are those that
+        could not be read and now can, with all that started from them.
     retry_failed
         With `resume`, measure again all frames that failed, and all that started from them.
     frames
