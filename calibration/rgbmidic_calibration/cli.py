@@ -125,6 +125,60 @@ def registration(
 
 @app.command()
 @command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+def camera(
+    statement: dict[str, Any],
+    target: Annotated[
+        str | None,
+        typer.Option(
+            help="KIND:COLUMNSxROWS:SPACINGmm, such as chessboard:9x6:2.5mm (inner corners), circles:9x6:2.5mm, "
+            "acircles:4x11:2mm, charuco:8x6:10mm:7.5mm:DICT_5X5_100."
+        ),
+    ] = None,
+    views: Annotated[
+        str | None, typer.Option(help="Photographs of the target under different angles: they calibrate the lens.")
+    ] = None,
+    plane: Annotated[
+        str | None, typer.Option(help="Photograph of the target where the specimen's surface will be.")
+    ] = None,
+    lens: Annotated[Path | None, typer.Option(help="Earlier camera.json whose lens is taken.")] = None,
+    corners: Annotated[
+        str | None,
+        typer.Option(help="In place of --plane: X0,Y0:X1,Y1:X2,Y2:X3,Y3 in px of a rectangle on the specimen."),
+    ] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHTmm of that rectangle.")] = None,
+    corner_std: Annotated[float, typer.Option(help="Standard uncertainty of such a corner, px.")] = 0.5,
+    out: Annotated[Path, typer.Option(help="Camera file to write (JSON).")] = Path("camera.json"),
+    picture: Annotated[Path | None, typer.Option(help="Picture of residuals, distortion and scale.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Calibrate lens distortion and the plane of the specimen, from photographs of a target: px to mm."""
+    from rgbmidic.errors import ConfigurationError
+    from rgbmidic.fields.plane import CameraCalibration
+    from rgbmidic_calibration import camera as cameras
+    from rgbmidic_calibration import display, jobs
+    from rgbmidic_calibration.captures import check_output
+
+    check_output(out, overwrite=overwrite)
+    if picture is not None:
+        check_output(picture, overwrite=overwrite, option="--picture")
+    if (corners is None) != (size is None):
+        raise ConfigurationError("--corners and --size belong together: state both")
+    estimate = cameras.calibrate_camera(
+        jobs.captures_as_stated(statement),
+        None if target is None else cameras.Target.parse(target),
+        views=views,
+        plane=plane,
+        lens=None if lens is None else CameraCalibration.read(lens),
+        corners=None if corners is None or size is None else (corners, size, corner_std),
+    )
+    estimate.camera.write(out)
+    display.camera(estimate, out)
+    if picture is not None:
+        cameras.draw_camera(estimate, picture)
+
+
+@app.command()
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def check(
     file: Annotated[Path, typer.Argument(help="Calibration file.")],
     light: Light,

@@ -10,17 +10,29 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from rgbmidic.fields.plane import LENS_PARAMETERS
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import CameraNoise, Quantity
 from rgbmidic.illumination.registration import Registration
+from rgbmidic_calibration.camera import CameraEstimate
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design
 from rgbmidic_calibration.noise import NoiseEstimate
 from rgbmidic_calibration.registration import RegistrationEstimate
 from rgbmidic_calibration.verdict import Verdict
 
-__all__ = ["calibration", "crosstalk", "designs", "merged", "noise", "registration", "registration_table", "verdict"]
+__all__ = [
+    "calibration",
+    "camera",
+    "crosstalk",
+    "designs",
+    "merged",
+    "noise",
+    "registration",
+    "registration_table",
+    "verdict",
+]
 
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
@@ -56,6 +68,35 @@ def registration(estimate: RegistrationEstimate, out: Path) -> None:
     for match in estimate.matches:
         used = 100 * float(match.used.mean())
         console.print(f"{escape(match.name)}: residual {match.rms:.3f} px rms per node, {used:.0f} % of the nodes used")
+    _written(console, out)
+
+
+def camera(estimate: CameraEstimate, out: Path) -> None:
+    """Print the parameters of lens and plane with their standard uncertainty, and the warnings."""
+    console = Console(highlight=False)
+    _warnings(console, estimate.warnings)
+    found, lens, plane = estimate.camera, estimate.lens, estimate.plane
+    if found.lens is not None:
+        table = Table(title="Lens", title_justify="left")
+        for head in ("parameter", "value", "standard uncertainty"):
+            table.add_column(head, justify="right")
+        for name, value, variance in zip(LENS_PARAMETERS, found.lens, np.diag(found.covariance), strict=False):
+            unit = " px" if name in ("f", "cx", "cy") else ""
+            table.add_row(name, f"{value:.6g}{unit}", f"{np.sqrt(variance):.2g}{unit}" if variance else "not taken up")
+        console.print(table)
+    if lens is not None:
+        console.print(
+            f"{len(estimate.views)} views, up to {lens.angle:.0f} degrees apart, over {lens.covered:.0%} of the frame; "
+            f"residual {lens.rms:.3f} px rms; "
+            + ", ".join(f"{name}: p = {value:.2g}" for name, value in lens.tests.items())
+        )
+    if plane is not None:
+        (scale, scale_std), (tilt, tilt_std) = found.scale(found.centre), found.tilt_deg
+        known = f"tilt {tilt:.2f} ± {tilt_std:.2f} degrees" if np.isfinite(tilt) else "tilt not known without a lens"
+        console.print(
+            f"plane: {scale:.6g} ± {scale_std:.2g} mm per px in the middle of the frame, {known}; residual "
+            f"{plane.rms:.3f} px rms"
+        )
     _written(console, out)
 
 
