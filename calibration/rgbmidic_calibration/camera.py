@@ -144,8 +144,12 @@ class Target:
                 return None
             return self.points[np.ravel(numbers)], np.asarray(corners, dtype=np.float64).reshape(-1, 2)
         if self.kind == "chessboard":
-            flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE  # its normalisation costs .2 px (measured)
-            there, points = cv2.findChessboardCornersSB(image, size, flags=flags)
+            # normalised images (CALIB_CB_NORMALIZE_IMAGE) cost .2 px
+            there, points = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
+            if not there:
+                there, points = cv2.findChessboardCornersSB(
+                    image, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
+                )
         else:
             grid = cv2.CALIB_CB_ASYMMETRIC_GRID if self.kind == "acircles" else cv2.CALIB_CB_SYMMETRIC_GRID
             there, points = cv2.findCirclesGrid(image, size, flags=grid)

@@ -1,0 +1,327 @@
+"""Lens and plane from photographs of a target: truths of a virtual camera, and refusals."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from rgbmidic import command
+from rgbmidic.errors import CalibrationError, ConfigurationError
+from rgbmidic.fields.plane import CameraCalibration, distorted, undistorted
+from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.settings import FrameSettings
+from rgbmidic_calibration.camera import (
+    Target,
+    View,
+    calibrate_camera,
+    estimate_lens,
+    estimate_plane,
+    find_view,
+    photograph,
+)
+from rgbmidic_calibration.cli import app
+
+SHAPE = (480, 640)
+TARGET = Target.parse("chessboard:9x7:5mm")
+LENS = np.array([2400.0, 327.0, 232.0, -0.5, 0, 0, 0, 0])
+DISTANCE = 2400 * 60 / 640
+"""mm at which 60 mm fill the frame's width."""
+NOISE = 0.03
+
+
+def pose(tilt_x: float, tilt_y: float = 0.0, turn: float = 0.0, shift: tuple[float, float] = (0, 0), far: float = 1.0):
+    """Rotation (3, 3) and translation (3,) of the target's middle."""
+    return cv2.Rodrigues(np.radians([tilt_x, tilt_y, turn]))[0], np.array([*shift, DISTANCE * far])
+
+
+def imaged(points, where, lens=LENS):
+    """Points (n, 2) of the target, from its middle, in px."""
+    rotation, shift = where
+    there = np.c_[points, np.zeros(len(points))] @ rotation.T + shift
+    return distorted(lens, lens[0] * there[:, :2] / there[:, 2:] + lens[1:3])
+
+
+def on_plane(pixels, where, lens=LENS):
+    """The inverse of `imaged`."""
+    rotation, shift = where
+    rays = np.c_[(undistorted(lens, pixels) - lens[1:3]) / lens[0], np.ones(len(pixels))]
+    normal = rotation[:, 2]
+    return ((rays * ((normal @ shift) / (rays @ normal))[:, None] - shift) @ rotation)[:, :2]
+
+
+def view_of(where, random, target=TARGET, lens=LENS, noise=NOISE, name="view"):
+    points = target.points - target.points.mean(axis=0)
+    pixels = imaged(points, where, lens)
+    return View(name=name, points=target.points, pixels=pixels + random.normal(0, noise, pixels.shape), shape=SHAPE)
+
+
+def random_views(random, count=10, lens=LENS, tilt=25.0):
+    views = []
+    while len(views) < count:
+        where = pose(
+            *random.uniform(-tilt, tilt, 2), random.uniform(-20, 20), random.uniform(-8, 8, 2), 1.2 * lens[0] / LENS[0]
+        )
+        view = view_of(where, random, lens=lens, name=f"view {len(views)}")
+        if (view.pixels > 2).all() and (view.pixels < np.array(SHAPE[::-1]) - 3).all():
+            views.append(view)
+    return views
+
+
+def photo(where, random=None, blur=0.9, level=180.0, lens=LENS, target=TARGET):
+    """Photograph of a chessboard, its edges blurred by `blur` px, with noise of one grey level."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    places = on_plane(np.stack([x.ravel(), y.ravel()], axis=1).astype(float), where, lens)
+    places += target.points.mean(axis=0)
+    width = blur * DISTANCE / lens[0] * np.sqrt(2)
+
+    def wave(place):
+        number = np.floor(place / target.spacing + 0.5)
+        return np.where(number % 2 == 0, 1, -1) * erf((place - number * target.spacing) / width)
+
+    size = np.array([target.columns, target.rows]) * target.spacing
+    inside = ((places > -target.spacing) & (places < size)).all(axis=1)
+    values = np.where(inside, -wave(places[:, 0]) * wave(places[:, 1]), 1.0).reshape(SHAPE)
+    image = 20 + level * (0.55 + 0.45 * values)
+    return image + (0 if random is None else random.normal(0, 1, SHAPE))
+
+
+def frame_of(image):
+    values = np.clip(np.round(image), 0, 255).astype(np.uint16)[None]
+    return ChannelFrame(values=values, black_level=0.0, white_level=255.0)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        LENS,
+        np.array([2400.0, 327, 232, 0, 0, 0, 0, 0]),
+        np.array([2400.0, 327, 232, -0.5, 12.0, 2e-3, -1e-3, 0]),
+        np.array([12000.0, 327, 232, -12.0, 0, 0, 0, 0]),
+    ],
+    ids=["one term", "no distortion", "two radial and tangential", "long lens"],
+)
+def test_parameters_are_within_their_stated_uncertainty(lens: np.ndarray) -> None:
+    random = np.random.default_rng(3)
+    off = []
+    for _ in range(20):
+        found = estimate_lens(random_views(random, 8, lens=lens))
+        std = np.sqrt(np.diag(found.covariance))
+        off.append(((found.lens - lens)[:3] / std[:3]).tolist())
+        camera = CameraCalibration(shape=SHAPE, lens=found.lens, covariance=np.pad(found.covariance, (0, 8)))
+        where = pose(1.5, 0.7, 3.0, far=lens[0] / LENS[0])
+        plane = estimate_plane(view_of(where, random, lens=lens), camera).camera
+        corners = np.array([[30.0, 40], [600, 50], [300, 440]])
+        true, seen = on_plane(corners, where, lens), plane.to_mm(corners)
+        slopes = plane.sensitivity(corners)
+        for a, b in itertools.combinations(range(3), 2):
+            length = np.linalg.norm(seen[b] - seen[a])
+            slope = (seen[b] - seen[a]) / length @ (slopes[b] - slopes[a])
+            error = length - np.linalg.norm(true[b] - true[a])
+            off.append([error / np.sqrt(slope @ plane.correlation @ slope)])
+        tilt, tilt_std = plane.tilt_deg
+        off.append([(tilt - np.degrees(np.arccos(where[0][2, 2]))) / tilt_std])
+    figures = np.concatenate([np.ravel(part) for part in off])
+    assert 0.90 <= (np.abs(figures) < 1.96).mean() <= 0.99
+    assert 0.75 <= np.sqrt((figures**2).mean()) <= 1.15
+
+
+def test_the_test_takes_up_the_terms_there_are() -> None:
+    random = np.random.default_rng(5)
+    straight = [tuple(estimate_lens(random_views(random, lens=np.r_[LENS[:3], np.zeros(5)])).lens[3:] != 0)]
+    assert straight.count((False,) * 5) >= 1
+    curved = estimate_lens(random_views(random, lens=np.r_[LENS[:3], -0.5, 0, 3e-3, -2e-3, 0])).lens
+    assert curved[3] != 0
+    assert curved[5] != 0
+    assert curved[6] != 0
+
+
+def test_corners_of_a_photograph_are_found_to_a_two_hundredth_of_a_pixel() -> None:
+    where = pose(8, -5, 3)
+    found = find_view(frame_of(photo(where, np.random.default_rng(1))), TARGET, "photo")
+    true = imaged(found.points - TARGET.points.mean(axis=0), where)
+    if np.abs(true - found.pixels).max() > 5:  # the board may be found turned by 180 degrees
+        true = true[::-1]
+    assert np.sqrt(((found.pixels - true) ** 2).mean()) < 0.006
+
+
+def test_a_mosaic_shows_the_target_without_a_lattice_nor_a_shift() -> None:
+    image = photo(pose(0, 0, 3), blur=1.5)
+    rows, columns = np.indices(SHAPE)
+    gains = np.where((rows % 2 == 0) & (columns % 2 == 0), 0.5, np.where((rows + columns) % 2 == 1, 1.0, 0.3))
+    mosaic = Mosaic(
+        values=np.round(image * gains * 100).astype(np.uint16), cfa="RGGB", black_level=0.0, white_level=30000.0
+    )
+    mean, clipped = photograph(mosaic)
+    assert not clipped.any()
+    plain = cv2.sepFilter2D(image, -1, np.array([0.25, 0.5, 0.25]), np.array([0.25, 0.5, 0.25]))
+    assert np.corrcoef(mean[5:-5, 5:-5].ravel(), plain[5:-5, 5:-5].ravel())[0, 1] > 0.999
+    found = find_view(mosaic, TARGET, "mosaic")
+    true = imaged(found.points - TARGET.points.mean(axis=0), pose(0, 0, 3))
+    off = np.minimum(np.abs(true - found.pixels).max(), np.abs(true[::-1] - found.pixels).max())
+    assert off < 0.05
+
+
+def test_axes_of_the_plane_are_those_of_the_image() -> None:
+    random = np.random.default_rng(2)
+    plain = np.r_[LENS[:3], np.zeros(5)]
+    for turn in (0, 40, 180):
+        camera = estimate_plane(view_of(pose(2, 1, turn), random, lens=plain), CameraCalibration(shape=SHAPE)).camera
+        assert np.abs(camera.to_mm(np.zeros((1, 2)))).max() < 0.01
+        slope = camera.jacobian(camera.centre[None])[0]
+        assert abs(slope[1, 0]) < 1e-4 * slope[0, 0]
+        assert slope[0, 0] > 0
+        assert slope[1, 1] > 0
+        assert np.isnan(camera.tilt_deg).all()
+
+
+def test_four_corners_of_the_specimen_make_a_plane() -> None:
+    corners = "100,80:540,90:530,400:110,390"
+    found = calibrate_camera(FrameSettings(path=("x",), shape=SHAPE), None, corners=(corners, "44x31mm", 0.5))
+    places = found.camera.to_mm(np.array([[100.0, 80], [540, 90], [530, 400], [110, 390]]))
+    sides = np.linalg.norm(np.roll(places, -1, axis=0) - places, axis=1)
+    assert sides == pytest.approx([44, 31, 44, 31], abs=1e-6)
+    scale, std = found.camera.scale(found.camera.centre)
+    assert scale == pytest.approx(0.1, rel=0.03)
+    assert 1e-4 < std / scale < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("corners", "size"),
+    [
+        ("1,2:3,4", "44x31mm"),
+        ("100,80:540,90:530,400:110,390", "44x31"),
+        ("100,80:110,390:530,400:540,90", "44x31mm"),
+        ("100,80:5400,90:530,400:110,390", "44x31mm"),
+    ],
+)
+def test_corners_that_are_no_rectangle_are_refused(corners: str, size: str) -> None:
+    with pytest.raises(ConfigurationError, match="--corners"):
+        calibrate_camera(FrameSettings(path=("x",), shape=SHAPE), None, corners=(corners, size, 0.5))
+
+
+@pytest.mark.parametrize(
+    "text", ["board:9x6:2mm", "chessboard:9x6", "chessboard:1x6:2mm", "charuco:8x6:10mm", "charuco:8x6:10mm:12mm",
+             "chessboard:9x6:2mm:1mm", "charuco:8x6:10mm:7mm:DICT_X", "chessboard:9x6:2.5.1mm"]
+)  # fmt: skip
+def test_targets_that_cannot_be_are_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match="--target"):
+        Target.parse(text)
+
+
+@pytest.mark.parametrize("text", ["charuco:9x7:6mm:4.5mm", "circles:9x7:5mm", "acircles:4x9:4mm"])
+def test_other_targets_are_found(text: str) -> None:
+    target = Target.parse(text)
+    scale = 10.0
+    if target.kind == "charuco":
+        image = target._board().generateImage((560, 440), marginSize=10) * 0.8 + 10.0
+        there = None
+    else:
+        image = np.full(SHAPE, 220.0)
+        there = target.points * scale + (60, 60)
+        y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+        for point in there:
+            away = np.hypot(x - point[0], y - point[1])
+            image -= 180 * np.clip((0.27 * target.spacing * scale - away) + 0.5, 0, 1)
+    found = find_view(frame_of(cv2.GaussianBlur(image, (0, 0), 0.7)), target, "photo")
+    assert len(found.points) == len(target.points)
+    if there is not None:
+        order = found.pixels if np.abs(found.pixels - there).max() < 5 else found.pixels[::-1]
+        assert np.abs(order - there).max() < 0.1
+    fit = estimate_plane(found, CameraCalibration(shape=found.shape))
+    assert fit.rms < 0.05
+
+
+def written(folder: Path, name: str, image: np.ndarray) -> Path:
+    path = folder / name
+    cv2.imwrite(str(path), np.clip(np.round(image), 0, 255).astype(np.uint8))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"blur": 12.0}, "wide|not found"),
+        ({"level": 330.0}, "saturated|not found"),
+        ({"target": Target.parse("chessboard:5x4:8mm")}, "not found"),
+    ],
+)
+def test_photographs_that_say_nothing_are_refused(change: dict[str, object], reason: str) -> None:
+    with pytest.raises(CalibrationError, match=rf"shot: .*({reason})"):
+        find_view(frame_of(photo(pose(3, 2), **change)), TARGET, "shot")  # type: ignore[arg-type]
+
+
+def test_too_few_parallel_and_bent_views_are_refused() -> None:
+    random = np.random.default_rng(0)
+    with pytest.raises(CalibrationError, match=r"5 photographs .* found in 4; shot 3: not found"):
+        estimate_lens(random_views(random, 4), ["shot 3: not found"])
+    with pytest.raises(CalibrationError, match="parallel"):
+        estimate_lens(random_views(random, 8, tilt=1.0))
+    bent = random_views(random, 8)
+    bent[2] = View(
+        name="bent", points=bent[2].points, pixels=bent[2].pixels + random.normal(0, 4, (63, 2)), shape=SHAPE
+    )
+    with pytest.raises(CalibrationError, match="most in bent"):
+        estimate_lens(bent)
+    with pytest.raises(CalibrationError, match="640 x 480 px, the lens was calibrated with 600 x 480"):
+        estimate_plane(bent[0], CameraCalibration(shape=(480, 600)))
+
+
+def test_the_command_writes_what_the_library_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    random = np.random.default_rng(4)
+    tilts = ((20, 0), (-20, 5), (5, 22), (0, -22), (15, 15), (-14, -16))
+    for number, tilt in enumerate(tilts):
+        written(tmp_path, f"view{number}.png", photo(pose(*tilt, turn=4.0 * number, far=1.15), random))
+    written(tmp_path, "plane.png", photo(pose(2.0), random))
+    out = tmp_path / "camera.json"
+    options = ["camera", "--target", "chessboard:9x7:5mm", "--kind", "monochrome", "--out", str(out)]
+    picture = tmp_path / "camera.png"
+    views, plane = str(tmp_path / "view*.png"), str(tmp_path / "plane.png")
+    assert command.execute(app, [*options, "--views", views, "--plane", plane, "--picture", str(picture)]) == 0
+    assert picture.stat().st_size > 10_000
+    read = CameraCalibration.read(out)
+    assert read.lens is not None
+    std = np.sqrt(np.diag(read.covariance))
+    assert (np.abs(read.lens - LENS)[:4] < 4 * std[:4]).all()
+    tilt, tilt_std = read.tilt_deg
+    assert tilt == pytest.approx(2.0, abs=4 * tilt_std + 0.005)
+    assert "tilt 2.0" in capsys.readouterr().out
+    # the lens of this file with another photograph of the plane
+    again = tmp_path / "again.json"
+    assert command.execute(app, [*options[:-1], str(again), "--lens", str(out), "--plane", plane]) == 0
+    assert CameraCalibration.read(again).homography == pytest.approx(read.homography)
+    before = out.read_text()
+    for wrong, reason in (
+        ((), "exists already"),
+        (("--overwrite",), "nothing to calibrate"),
+        (("--overwrite", "--views", views, "--lens", str(out)), "state one of them"),
+        (("--overwrite", "--plane", str(tmp_path / "no.png")), "no.png"),
+        (("--overwrite", "--corners", "1,1:2,1:2,2:1,2"), "belong together"),
+    ):
+        assert command.execute(app, [*options, *wrong]) == 2
+        assert reason in capsys.readouterr().err
+    assert out.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda text: text.replace("rgbmidic-camera", "other"), "schema"),
+        (lambda text: text.replace('"schema_version": 1', '"schema_version": 9'), "version 9"),
+        (lambda text: text[:-30], "not a readable"),
+        (lambda text: text.replace('"covariance"', '"cov"'), "covariance"),
+        (lambda text: text.replace('"shape"', '"size"'), "shape"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path: Path, change, reason: str) -> None:
+    path = tmp_path / "camera.json"
+    CameraCalibration(shape=SHAPE, lens=LENS).write(path)
+    assert CameraCalibration.read(path).lens == pytest.approx(LENS)
+    path.write_text(change(path.read_text()))
+    with pytest.raises(CalibrationError, match=reason) as caught:
+        CameraCalibration.read(path)
+    assert str(path) in str(caught.value)
