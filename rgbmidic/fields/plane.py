@@ -126,7 +126,7 @@ class CameraCalibration:
         lens = np.r_[1.0, self.centre, np.zeros(5)] if self.lens is None else self.lens
         if self.homography is None:
             raise InputError(f"{self.name} holds no plane: calibrate with --plane, a photograph of the target on it")
-        return np.r_[lens, self.homography.ravel()[:8]]
+        return np.asarray(np.r_[lens, self.homography.ravel()[:8]])
 
     def to_mm(self, points: FloatArray, parameters: FloatArray | None = None) -> FloatArray:
         """Return where points of the image lie on the plane.
