@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.settings import bounded
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["QUANTISATION", "CameraNoise", "LinearChannels", "LinearMosaic", "NoiseModel", "Quantity", "linearise"]
@@ -32,8 +33,8 @@ class NoiseModel:
         Standard deviation of the signal-independent noise in grey levels (DN).
     """
 
-    gain: float
-    read_noise: float
+    gain: float = bounded(above=0)
+    read_noise: float = bounded(above=0)
 
     def variance(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
         """Return the variance (DN squared) of samples whose linearised values (DN above black) are `values`."""
