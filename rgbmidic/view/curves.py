@@ -13,7 +13,6 @@ import bokeh.models as bk
 import numpy as np
 import numpy.typing as npt
 from bokeh.document import Document
-from bokeh.plotting import figure
 
 from rgbmidic.errors import ResultError
 from rgbmidic.report.style import OKABE_ITO, time_axis
@@ -22,7 +21,7 @@ from rgbmidic.results.histories import history_csv, read_histories
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import KINDS, Mark, probe_marks
-from rgbmidic.view.canvas import small
+from rgbmidic.view.canvas import columns, plain_plot
 
 __all__ = ["CurvePanel", "Progress", "TimeLine", "as_csv", "band", "groups", "places", "probes", "read"]
 
@@ -83,6 +82,7 @@ def _probe(name: str) -> str:
     return "_".join(parts[: next(place for place, part in enumerate(parts) if part.isdecimal()) + 1])
 
 
+_LINES, _BANDS = "xs ys colour name", "xs ys colour"
 _AT_ONCE = 100
 """Frames that are read before the page is served again. Measured: 10 ms."""
 _NOT_YET, _DAMAGED = -1, 3
@@ -171,19 +171,11 @@ class TimeLine:
 
     def __init__(self, frames: int, now: int) -> None:
         self._drawn = -1
-        self._fractions = bk.ColumnDataSource({"x": [], "y": []})
-        self._faults = bk.ColumnDataSource({"x": [], "colour": []}, name="faults")
-        self.plot = figure(
-            sizing_mode="stretch_both",
-            x_range=bk.Range1d(-0.5, max(frames - 0.5, 0.5)),
-            y_range=bk.Range1d(0, 105),
-            y_axis_label="nodes (%)",
-            tools=[],
-            toolbar_location=None,
-            min_border=2,
-        )
+        self._fractions = bk.ColumnDataSource(columns("x y"))
+        self._faults = bk.ColumnDataSource(columns("x colour"), name="faults")
+        ranges = {"x_range": bk.Range1d(-0.5, max(frames - 0.5, 0.5)), "y_range": bk.Range1d(0, 105)}
+        self.plot = plain_plot(y_axis_label="nodes (%)", min_border=2, **ranges)
         self.plot.yaxis.ticker = [0, 50, 100]
-        small(self.plot)
         self.plot.varea("x", 0, "y", source=self._fractions, fill_color="#6baed6", fill_alpha=0.6)
         self.plot.segment("x", 0, "x", 100, source=self._faults, line_color="colour", line_width=2)
         self.now = bk.Span(location=now, **NOW)
@@ -195,8 +187,10 @@ class TimeLine:
             return
         self._drawn, known = progress.changes, np.flatnonzero(np.isfinite(progress.fraction))
         self._fractions.data = {"x": known, "y": 100 * progress.fraction[known]}
-        bad = [(frame, colour) for code, colour in _FAULTS.items() for frame in np.flatnonzero(progress.status == code)]
-        self._faults.data = {"x": [int(frame) for frame, _ in bad], "colour": [colour for _, colour in bad]}
+        faults = {code: np.flatnonzero(progress.status == code).tolist() for code in _FAULTS}
+        self._faults.data = columns(
+            "x colour", [(at, _FAULTS[code]) for code, frames in faults.items() for at in frames]
+        )
 
 
 class CurvePanel:
@@ -227,11 +221,26 @@ class CurvePanel:
         self.colours: Mapping[str, str] = {}
         self._document, self._select, self._message, self._hint, self._chosen = document, select, message, hint, chosen
         self._reader, self._number, self._task = ThreadPoolExecutor(1), 0, Future[Histories | None]()
-        self.plot, self._lines, self._bands = _plot()
-        self.now = bk.Span(**NOW)
+        self._lines = bk.ColumnDataSource(columns(_LINES), name="lines")
+        self._bands = bk.ColumnDataSource(columns(_BANDS), name="bands")
+        self.plot, self.now = self._new_plot(), bk.Span(**NOW)
         self.plot.add_layout(self.now)
         select.on_change("value", lambda attr, old, new: self.draw())
         document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
+
+    def _new_plot(self) -> Any:
+        wheel, hover = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False)
+        tools = [bk.PanTool(), wheel, bk.BoxZoomTool(), bk.ResetTool(), hover]
+        plot = plain_plot(tools=tools, title="Curves", toolbar_location="above")
+        plot.toolbar.logo, plot.toolbar.active_scroll = None, wheel
+        plot.patches("xs", "ys", source=self._bands, fill_color="colour", fill_alpha=0.25, line_alpha=0)
+        style = {"line_color": "colour", "line_width": 1.5, "legend_field": "name"}
+        drawn = plot.multi_line("xs", "ys", source=self._lines, **style)
+        plot.x_range.renderers = plot.y_range.renderers = [drawn]  # the values rule, not the widest band
+        hover.renderers, hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
+        plot.legend.visible, plot.legend.label_text_font_size, plot.legend.ncols = False, "11px", 2
+        plot.add_layout(plot.legend[0], "below")
+        return plot
 
     def read(self, result: Result, marks: Sequence[Mark], gauge: float, shown: Callable[[], None]) -> None:
         """Read the probes off all frames in another thread, then call `shown`; only the last request counts."""
@@ -250,7 +259,7 @@ class CurvePanel:
         if number != self._number:
             return
         self.reading = False
-        before = _names(self.histories)
+        before = set() if self.histories is None else {_probe(each.name) for each in self.histories.quantities}
         try:
             self.histories = None if task is None else task.result()
             remarks = () if self.histories is None else self.histories.remarks
@@ -270,7 +279,7 @@ class CurvePanel:
     def draw(self) -> None:
         """Draw the chosen curve of all probes."""
         if self.histories is None:
-            self._bands.data, self._lines.data = _columns([], "xs ys colour"), _columns([], "xs ys colour name")
+            self._bands.data, self._lines.data = columns(_BANDS), columns(_LINES)
             self.plot.legend.visible = False
             self.plot.xaxis.axis_label = self.plot.yaxis.axis_label = None
             return
@@ -281,7 +290,7 @@ class CurvePanel:
             colour = self.colours.get(_probe(quantity.name), OKABE_ITO["grey"])
             bands += [(xs, ys, colour) for xs, ys in zip(*band(x, quantity), strict=True)]
             lines.append((x, quantity.values, colour, quantity.name.replace("_", " ")))
-        self._bands.data, self._lines.data = _columns(bands, "xs ys colour"), _columns(lines, "xs ys colour name")
+        self._bands.data, self._lines.data = columns(_BANDS, bands), columns(_LINES, lines)
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = axis, self._select.value
         self.plot.legend.visible = True
 
@@ -298,34 +307,3 @@ class CurvePanel:
     @property
     def _times(self) -> FloatArray:
         return np.zeros(0) if self.histories is None else time_axis(self.histories.times, self.histories.frames)[0]
-
-
-def _names(histories: Histories | None) -> set[str]:
-    """Return the names of the probes that were read."""
-    return set() if histories is None else {_probe(quantity.name) for quantity in histories.quantities}
-
-
-def _columns(rows: Sequence[Sequence[Any]], names: str) -> dict[str, list[Any]]:
-    return {name: [row[place] for row in rows] for place, name in enumerate(names.split())}
-
-
-def _plot() -> tuple[Any, bk.ColumnDataSource, bk.ColumnDataSource]:
-    wheel, hover = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False)
-    plot = figure(
-        sizing_mode="stretch_both",
-        min_border=4,
-        tools=[bk.PanTool(), wheel, bk.BoxZoomTool(), bk.ResetTool(), hover],
-        title="Curves",
-        toolbar_location="above",
-    )
-    plot.toolbar.logo, plot.toolbar.active_scroll = None, wheel
-    small(plot)
-    lines = bk.ColumnDataSource(_columns([], "xs ys colour name"), name="lines")
-    bands = bk.ColumnDataSource(_columns([], "xs ys colour"), name="bands")
-    plot.patches("xs", "ys", source=bands, fill_color="colour", fill_alpha=0.25, line_alpha=0)
-    drawn = plot.multi_line("xs", "ys", source=lines, line_color="colour", line_width=1.5, legend_field="name")
-    plot.x_range.renderers = plot.y_range.renderers = [drawn]  # the values rule, not the widest band
-    hover.renderers, hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
-    plot.legend.visible, plot.legend.label_text_font_size, plot.legend.ncols = False, "11px", 2
-    plot.add_layout(plot.legend[0], "below")
-    return plot, lines, bands

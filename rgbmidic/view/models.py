@@ -15,7 +15,7 @@ from bokeh.model import DataModel
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import Mark, probe_marks
-from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.canvas import Canvas, columns
 from rgbmidic.view.picture import element_at
 
 __all__ = ["TOOL", "Controls", "MarkLayer", "ResultControls", "SharedState"]
@@ -154,6 +154,7 @@ class ResultControls(Controls):
 
 
 _COLOURS = tuple(OKABE_ITO.values())
+_PROBE = "xs ys colour x y text"
 _LETTERS = {
     "x_offset": 8,
     "y_offset": -4,
@@ -183,7 +184,7 @@ class MarkLayer:
     def __init__(self, canvas: Canvas, elements: npt.NDArray[np.int32]) -> None:
         self.colours: dict[str, str] = {}
         self._canvas, self._elements, self._shown = canvas, elements, dict[Mark, Mark]()
-        self._joined = bk.ColumnDataSource({name: [] for name in ("xs", "ys", "colour", "x", "y", "text")})
+        self._joined = bk.ColumnDataSource(columns(_PROBE))
         canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
         canvas.plot.text("x", "y", "text", source=self._joined, text_color="colour", **_LETTERS)
 
@@ -197,14 +198,13 @@ class MarkLayer:
         self._canvas.place(at)
         probes = probe_marks(at)
         self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
-        self._joined.data = {
-            "xs": [[mark.x for mark in own] for own in probes.values()],
-            "ys": [[mark.y for mark in own] for own in probes.values()],
-            "colour": list(self.colours.values()),
-            "x": [own[0].x for own in probes.values()],
-            "y": [own[0].y for own in probes.values()],
-            "text": [name.replace("_", " ") for name in probes],
-        }
+        self._joined.data = columns(
+            _PROBE,
+            [
+                ([mark.x for mark in own], [mark.y for mark in own], colour, own[0].x, own[0].y, name.replace("_", " "))
+                for (name, own), colour in zip(probes.items(), self.colours.values(), strict=True)
+            ],
+        )
 
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""
