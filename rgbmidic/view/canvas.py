@@ -236,20 +236,13 @@ class Tiles:
         tall, across = height / width, max(map(len, rows))
         size = (_WIDE, max(1, round(_WIDE * tall)))
         self._drawn.glyph.dh = tall
-        self._shown.data = columns(
-            _TILE,
-            [
-                (
-                    cv2.resize(picture, size, interpolation=cv2.INTER_AREA),
-                    x * _STEP,
-                    y * (tall + _GAP) + _GAP,
-                    1.0,
-                    name,
-                )
-                for y, row in enumerate(rows)
-                for x, (name, picture) in enumerate(row.items(), start=across - len(row))
-            ],
-        )
+        tiles = [
+            (picture, x * _STEP, y * (tall + _GAP) + _GAP, 1.0, name)
+            for y, row in enumerate(rows)
+            for x, (name, picture) in enumerate(row.items(), start=across - len(row))
+        ]
+        small = [(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), *place) for picture, *place in tiles]
+        self._shown.data = columns(_TILE, small)
         down = len(rows) * (tall + _GAP)
         self.plot.x_range.end, self.plot.y_range.start = across * _STEP, down
         self.plot.update(visible=True, aspect_ratio=across * _STEP / down)

@@ -187,10 +187,8 @@ class TimeLine:
             return
         self._drawn, known = progress.changes, np.flatnonzero(np.isfinite(progress.fraction))
         self._fractions.data = {"x": known, "y": 100 * progress.fraction[known]}
-        faults = {code: np.flatnonzero(progress.status == code).tolist() for code in _FAULTS}
-        self._faults.data = columns(
-            "x colour", [(at, _FAULTS[code]) for code, frames in faults.items() for at in frames]
-        )
+        bad = [(at, colour) for code, colour in _FAULTS.items() for at in np.flatnonzero(progress.status == code)]
+        self._faults.data = columns("x colour", [(int(at), colour) for at, colour in bad])
 
 
 class CurvePanel:

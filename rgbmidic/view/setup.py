@@ -13,7 +13,7 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, CustomJS
+from bokeh.models import ColumnDataSource
 
 from rgbmidic.lab.inspection import Inspection
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -23,7 +23,7 @@ from rgbmidic.settings import RegionSettings, read_section
 from rgbmidic.view.canvas import Canvas, Tiles
 from rgbmidic.view.draft import HOLES, OUTLINES, Draft, RegionDrawing, marks_of
 from rgbmidic.view.fields import guarded, warning, watched
-from rgbmidic.view.models import TOOL, SharedState
+from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, paint, palette
 from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, inspected, pictures, side_by_side
 
@@ -35,7 +35,6 @@ _TICK = 500
 """Ms between two reports of the run."""
 _EXPECTED = "expected uncertainty"
 _GLARE = np.uint32(0xFF2030FF)
-_OTHER = f"if (cb_obj.active === null) return; {TOOL}; other.active = null"
 _HELP = (
     "1. Choose a shape and click on the frame: Rectangle (two opposite corners), Polygon, Circle (centre, then "
     "a place on it); holes likewise. Marks can be dragged; Backspace removes a chosen one.<br>2. Choose the element "
@@ -97,8 +96,8 @@ class SetupPage:
         ):  # fmt: skip
             button.on_click(partial(self._guarded, act))
         p.ask(self.state)
-        p.mode.js_on_change("active", CustomJS(args={"tools": tools[:4], "other": p.hole}, code=_OTHER))
-        p.hole.js_on_change("active", CustomJS(args={"tools": tools[4:], "other": p.mode}, code=_OTHER))
+        p.mode.js_on_change("active", script("choose", group=p.mode, tools=tools[:4], other=p.hole))
+        p.hole.js_on_change("active", script("choose", group=p.hole, tools=tools[4:], other=p.mode))
         self.document.on_event(DocumentReady, lambda event: self._ready())
         self.document.add_periodic_callback(lambda: self._tick() if watched(self.document) else None, _TICK)
         self.document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
