@@ -24,7 +24,7 @@ from rgbmidic.view.canvas import Canvas, Tiles
 from rgbmidic.view.draft import HOLES, OUTLINES, Draft, RegionDrawing, marks_of
 from rgbmidic.view.fields import guarded, warning, watched
 from rgbmidic.view.models import SharedState, script
-from rgbmidic.view.picture import AROUND, paint, palette
+from rgbmidic.view.picture import AROUND, Overlay, paint, palette
 from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, inspected, pictures, side_by_side
 
 __all__ = ["SetupPage"]
@@ -122,21 +122,21 @@ class SetupPage:
         raw, full = self.source.raw(index)
         chosen = self.parts.picture.value
         picture = self.pictures.get(chosen, raw)
-        field, ends = None, (0.0, 1.0)
-        if chosen == _EXPECTED and self.inspection is not None:
-            ends = colour_range(self.inspection.std[np.isfinite(self.inspection.std)])
-            field = (self.inspection.nodes, self.inspection.elements, self.inspection.std)
-        colours, window = palette("plasma"), self.canvas.window
-        image = paint(window, picture, field, ends, colours, opacity=0.8, around=AROUND[self.dark])
+        over, ends, colours, window = None, (0.0, 1.0), palette("plasma"), self.canvas.window
+        if chosen == _EXPECTED and (found := self.inspection) is not None:
+            ends = colour_range(found.std[np.isfinite(found.std)])
+            mesh: dict[str, Any] = {"nodes": found.nodes, "elements": found.elements, "values": found.std}
+            over = Overlay(**mesh, ends=ends, colours=colours, opacity=0.8)
+        image = paint(window, picture, over, AROUND[self.dark])
         if self.parts.glare.active:
-            over = paint(window, full.astype(np.uint8) * 255, None, ends, colours, opacity=0, around=0)
-            image = np.where((over & 0xFF) > 64, _GLARE, image)
+            saturated = paint(window, full.astype(np.uint8) * 255, around=0)
+            image = np.where((saturated & 0xFF) > 64, _GLARE, image)
         self.canvas.show(image)
-        title = f"{chosen} (px)" if field else chosen
+        title = f"{chosen} (px)" if over else chosen
         if chosen != RAW and index != self._inspected:  # what was inspected stays while other frames are looked at
             title += f", of frame {self._inspected}: {self.source.series.name(self._inspected)}"
         self.canvas.colour(ends, colours, title)
-        self.canvas.bar.visible = field is not None
+        self.canvas.bar.visible = over is not None
 
     def _remesh(self) -> None:
         """Draw the mesh of the region; drop the inspection, of another region, element size or calibration."""
