@@ -187,7 +187,7 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     finest, coarsest = (energies[:, 1] / energies[:, 0])[[0, -1]]
     ratio = float(np.clip(agreement, finest, coarsest))
     fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
-    model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, unit=unit, fine=fine)
+    model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, band=(unit, fine))
     return replace(model, private=_coarse_fraction(model, sums, counts, correlations))
 
 
@@ -197,21 +197,21 @@ def _mixture(
     correlation: float,
     *,
     widths: FloatArray = WIDTHS,
-    unit: FloatArray | None = None,
-    fine: FloatArray | None = None,
+    band: tuple[FloatArray, FloatArray] | None = None,
     private: float = 0.0,
 ) -> TextureModel:
     """Fit weights w >= 0 and offset c <= 0 of a texture by least squares.
 
-    ``sum w g(r) + c = product`` up to a factor, or, with `unit` (R, M) and `fine` (M + 1,),
+    ``sum w g(r) + c = product`` up to a factor, or, with unit (R, M) and fine (M + 1,) of the `band`,
     ``sum w (g(r) - product unit) + c (1 - product) = 0`` with ``sum w + c = 1`` and ``fine . (w, -c) = 0``.
     """
     gaussians = np.exp(-0.5 * (r[:, None] / widths) ** 2)
     importance = 1 / (1 + r)
-    if unit is None or fine is None:
+    if band is None:
         system = np.column_stack([gaussians, -np.ones(r.size)]) * importance[:, None]
         wanted = product * importance
     else:
+        unit, fine = band
         system = np.column_stack([gaussians - product[:, None] * unit, product - 1]) * importance[:, None]
         sum_to_one = np.append(np.ones(len(widths)), -1.0)
         # short distances hardly distinguish a constant from a wide Gaussian
