@@ -192,12 +192,8 @@ def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> I
     def begun() -> bytes:
         return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""
 
-    def interrupt(*_: object) -> None:
-        """Act as Ctrl-C, which a command in the background of a script ignores."""
-        raise KeyboardInterrupt
-
     before_it = begun()
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which a background job ignores
     try:
         yield
     except KeyboardInterrupt:

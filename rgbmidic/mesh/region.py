@@ -19,17 +19,7 @@ from scipy.spatial import cKDTree
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = [
-    "Region",
-    "crack_paths",
-    "distance_to",
-    "edge_keys",
-    "halved",
-    "outline_mesh",
-    "sharp_corners",
-    "split_along",
-    "uncrowded",
-]
+__all__ = ["Region", "edge_keys", "outline_mesh"]
 
 logger = logging.getLogger(__name__)
 

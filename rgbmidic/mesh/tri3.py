@@ -111,8 +111,8 @@ class Tri3Mesh:
             )
         if region.rectangle is not None and not len(cracks):
             nodes, elements = _rectangle_mesh(region.rectangle, element_size)
-            return cls(nodes=nodes, elements=elements)
-        nodes, elements = outline_mesh(region.mask, element_size, cracks, region.origin)
+        else:
+            nodes, elements = outline_mesh(region.mask, element_size, cracks, region.origin)
         return cls(nodes=nodes, elements=elements)
 
     @property

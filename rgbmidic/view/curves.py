@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import io
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -22,6 +21,7 @@ from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import KINDS, Mark, probe_marks
 from rgbmidic.view.canvas import columns, plain_plot
+from rgbmidic.view.fields import Background
 
 __all__ = ["CurvePanel", "Progress", "TimeLine", "as_csv", "band", "groups", "places", "probes", "read"]
 
@@ -217,14 +217,13 @@ class CurvePanel:
         self.histories: Histories | None = None
         self.reading = False
         self.colours: Mapping[str, str] = {}
-        self._document, self._select, self._message, self._hint, self._chosen = document, select, message, hint, chosen
-        self._reader, self._number, self._task = ThreadPoolExecutor(1), 0, Future[Histories | None]()
+        self._select, self._message, self._hint, self._chosen = select, message, hint, chosen
+        self._reader = Background(document)
         self._lines = bk.ColumnDataSource(columns(_LINES), name="lines")
         self._bands = bk.ColumnDataSource(columns(_BANDS), name="bands")
         self.plot, self.now = self._new_plot(), bk.Span(**NOW)
         self.plot.add_layout(self.now)
         select.on_change("value", lambda attr, old, new: self.draw())
-        document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
 
     def _new_plot(self) -> Any:
         wheel, hover = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False)
@@ -242,24 +241,19 @@ class CurvePanel:
 
     def read(self, result: Result, marks: Sequence[Mark], gauge: float, shown: Callable[[], None]) -> None:
         """Read the probes off all frames in another thread, then call `shown`; only the last request counts."""
-        self._number += 1
-        self._task.cancel()
         self.reading = bool(marks)
-        if not marks:
-            self._have(self._number, None, shown)
-            return
-        self._message.text = "reading all frames …"
-        self._task = self._reader.submit(read, result, tuple(marks), gauge)
-        done = partial(self._have, self._number, self._task, shown)
-        self._task.add_done_callback(lambda _: self._document.add_next_tick_callback(done))
+        if marks:
+            self._message.text = "reading all frames …"
+            self._reader.ask(partial(read, result, tuple(marks), gauge), partial(self._have, shown))
+        else:
+            self._reader.drop()
+            self._have(shown, lambda: None)
 
-    def _have(self, number: int, task: Future[Histories | None] | None, shown: Callable[[], None]) -> None:
-        if number != self._number:
-            return
+    def _have(self, shown: Callable[[], None], read: Callable[[], Histories | None]) -> None:
         self.reading = False
         before = set() if self.histories is None else {_probe(each.name) for each in self.histories.quantities}
         try:
-            self.histories = None if task is None else task.result()
+            self.histories = read()
             remarks = () if self.histories is None else self.histories.remarks
             self._message.text = "<br>".join(map(html.escape, remarks)) or self._hint
         except Exception as error:  # a probe outside the region and the like: reported where the probes are

@@ -5,9 +5,10 @@ from __future__ import annotations
 import html
 import logging
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,10 +25,12 @@ from rgbmidic.typing import FloatArray
 from rgbmidic.view.picture import Picture, element_at, grey_picture
 
 __all__ = [
+    "Background",
     "Field",
     "Fields",
     "Pictures",
     "Values",
+    "every",
     "frame_text",
     "guarded",
     "pointer_text",
@@ -36,13 +39,15 @@ __all__ = [
     "watched",
 ]
 
+T = TypeVar("T")
+
 logger = logging.getLogger(__name__)
 
 Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
 
 _MOVED = ("u", "v", "u_std", "v_std")
 _SPREAD = 24
-"""Frames, evenly spread, whose values set the colour range of a whole test. Chosen: they are read within a second."""
+"""Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second."""
 _ORDER = ("u", "v", "magnitude", "exx", "eyy", "exy", "e1", "e2", "direction", "equivalent")
 """Fields that stand first."""
 _KINDS: dict[str, Kind] = {
@@ -280,6 +285,37 @@ def watched(document: Document) -> bool:
     """Return whether a browser shows the page: one that was left exists for a while, and shall do nothing more."""
     session = document.session_context.session if document.session_context else None
     return session is None or session.connection_count > 0
+
+
+def every(milliseconds: int, document: Document, act: Callable[[], None], complain: Callable[[str], None]) -> None:
+    """Call `act`, as `guarded`, again and again while a browser shows the page."""
+    document.add_periodic_callback(lambda: guarded(act, complain) if watched(document) else None, milliseconds)
+
+
+class Background:
+    """Work for a page in another thread, one task after the other, of which only the last that was asked for counts.
+
+    Parameters
+    ----------
+    document
+        Document of the page.
+    """
+
+    def __init__(self, document: Document) -> None:
+        self._document, self._thread, self._task = document, ThreadPoolExecutor(1), Future[Any]()
+        document.on_session_destroyed(lambda context: self._thread.shutdown(wait=False, cancel_futures=True))
+
+    def drop(self) -> None:
+        """Forget the task that was asked for."""
+        self._task.cancel()
+        self._task = Future()
+
+    def ask(self, work: Callable[[], T], take: Callable[[Callable[[], T]], None]) -> None:
+        """Start a task; `take` gets the function that returns its result or raises its error, in the page's thread."""
+        self.drop()
+        task = self._task = self._thread.submit(work)
+        taken = lambda: take(task.result) if task is self._task else None  # noqa: E731
+        task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
 
 
 def frame_text(result: Result, place: int, field: Field, values: Values, remark: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
@@ -23,12 +22,12 @@ from rgbmidic.view.fields import (
     Fields,
     Pictures,
     Values,
+    every,
     frame_text,
     guarded,
     pointer_text,
     robust_range,
     warning,
-    watched,
 )
 from rgbmidic.view.models import MarkLayer, ResultControls, SharedState
 from rgbmidic.view.picture import AROUND, Overlay, paint, palette, palette_name
@@ -124,14 +123,9 @@ class ResultPage:
         self.show()
         if self.view.marks:
             self._read_curves()
-        advance = partial(self._while_watched, lambda: self.progress.advance(self.result))
-        self.document.add_periodic_callback(advance, _TICK)
+        every(_TICK, self.document, lambda: self.progress.advance(self.result), self.complain)
         for act in (self._grow, self._draw_progress):
-            self.document.add_periodic_callback(partial(self._while_watched, act), _IDLE)
-
-    def _while_watched(self, act: Callable[[], None]) -> None:
-        if watched(self.document):
-            guarded(act, self.complain)
+            every(_IDLE, self.document, act, self.complain)
 
     def complain(self, text: str) -> None:
         """Report an error; the page goes on."""

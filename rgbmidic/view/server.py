@@ -41,7 +41,7 @@ __all__ = ["serve", "start"]
 
 _HOST = "127.0.0.1"
 _FORGOTTEN = 15_000
-"""Ms after which the data of a closed page are freed. Chosen: a page that is loaded anew takes less."""
+"""Ms after which the data of a closed page are freed: a page that is loaded anew takes less."""
 _BREATH = 0.05
 """Seconds for other pages after each page that is freed: an answer takes as long."""
 _THEMES = {"dark": "dark_minimal"}

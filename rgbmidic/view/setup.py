@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,10 +21,10 @@ from rgbmidic.report.style import colour_range
 from rgbmidic.settings import RegionSettings, read_section
 from rgbmidic.view.canvas import Canvas, Tiles
 from rgbmidic.view.draft import HOLES, OUTLINES, Draft, RegionDrawing, marks_of
-from rgbmidic.view.fields import guarded, warning, watched
+from rgbmidic.view.fields import Background, every, guarded, warning
 from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, Overlay, paint, palette
-from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, inspected, pictures, side_by_side
+from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, pictures, side_by_side
 
 __all__ = ["SetupPage"]
 
@@ -62,17 +61,15 @@ class SetupPage:
         self.source = DraftFrames.of(draft)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
-        self._inspected = self._number = 0
+        self._inspected = 0
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.state = SharedState(name="state", asked=reference, shown=reference)
         self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
-        self.tiles, self._reader = Tiles(), ThreadPoolExecutor(1)
+        self.tiles, self._reader = Tiles(), Background(document)
         rows, columns = self.source.shape
         self.canvas = Canvas(document, (*OUTLINES, *HOLES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
-        self._edges = ColumnDataSource({"xs": [], "ys": []})
-        self.canvas.plot.multi_line(
-            "xs", "ys", source=self._edges, line_color="#ffd166", line_width=0.7, line_alpha=0.7
-        )
+        self._edges, thin = ColumnDataSource({"xs": [], "ys": []}), {"line_width": 0.7, "line_alpha": 0.7}
+        self.canvas.plot.multi_line("xs", "ys", source=self._edges, line_color="#ffd166", **thin)
         marks = () if draft.region is None else marks_of(draft.region)
         self.drawing = RegionDrawing(document, self.canvas, marks, self._remesh)
         self._listen()
@@ -99,16 +96,18 @@ class SetupPage:
         p.mode.js_on_change("active", script("choose", group=p.mode, tools=tools[:4], other=p.hole))
         p.hole.js_on_change("active", script("choose", group=p.hole, tools=tools[4:], other=p.mode))
         self.document.on_event(DocumentReady, lambda event: self._ready())
-        self.document.add_periodic_callback(lambda: self._tick() if watched(self.document) else None, _TICK)
-        self.document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
+        every(_TICK, self.document, self._tick, self._complain)
 
     def _ready(self) -> None:
         self.canvas.resize()
         self.show()
         self.drawing.draw()
 
+    def _complain(self, text: str) -> None:
+        self.parts.message.text = warning(text)
+
     def _guarded(self, act: Callable[[], None]) -> None:
-        guarded(act, lambda text: self.parts.message.update(text=warning(text)))
+        guarded(act, self._complain)
 
     def show(self) -> None:
         """Draw the picture."""
@@ -140,7 +139,7 @@ class SetupPage:
 
     def _remesh(self) -> None:
         """Draw the mesh of the region; drop the inspection, of another region, element size or calibration."""
-        self._number += 1
+        self._reader.drop()
         if self.inspection is not None:
             self.inspection, self.pictures = None, {}
             self.tiles.plot.visible = False
@@ -170,14 +169,11 @@ class SetupPage:
             return
         self.parts.message.text = "inspecting …"
         index, size = int(self.parts.frame.value), float(self.parts.size.value)
-        task = self._reader.submit(lambda: inspected(self.source, index, self._region(content), size))
-        have = partial(self._guarded, partial(self._have, task, index, self._number))
-        task.add_done_callback(lambda _: self.document.add_next_tick_callback(have))
+        work = partial(self.source.inspected, index, self._region(content), size)
+        self._reader.ask(work, lambda found: self._guarded(partial(self._have, found, index)))
 
-    def _have(self, task: Future[Inspection], index: int, number: int) -> None:
-        if number != self._number:
-            return
-        found, self._inspected = task.result(), index
+    def _have(self, inspected: Callable[[], Inspection], index: int) -> None:
+        found, self._inspected = inspected(), index
         self.inspection = found
         self.pictures = pictures(found, self.source.shape)
         self.tiles.show(side_by_side(found, self.pictures, self.source.raw(index)[0]))
@@ -229,8 +225,5 @@ class SetupPage:
 
     def _tick(self) -> None:
         if self.runs:
-            run = self.runs[-1]
-            link = (
-                '<br><a id="result" href="result">look at the result as it grows</a>' if run.result is not None else ""
-            )
-            self.parts.ran.text = html.escape(run.summary()) + link
+            run, link = self.runs[-1], '<br><a id="result" href="result">look at the result as it grows</a>'
+            self.parts.ran.text = html.escape(run.summary()) + (link if run.result is not None else "")
