@@ -421,7 +421,7 @@ def plan(
 
 
 @app.command()
-@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+@command.frame_options
 def frames(
     statement: dict[str, Any],
     path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
@@ -453,7 +453,7 @@ def frames(
 
 
 @app.command()
-@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+@command.frame_options
 def inspect(
     frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; one per light in succession.")],
     statement: dict[str, Any],

@@ -23,6 +23,7 @@ __all__ = [
     "FRAME_OPTIONS",
     "execute",
     "fail",
+    "frame_options",
     "gather",
     "help_where_alone",
     "main",
@@ -187,6 +188,10 @@ def read_statement(options: Mapping[str, Any]) -> dict[str, Any]:
     """
     values = {**options, "shape": read_shape(options["shape"])}
     return {key: value for key, value in values.items() if value is not None}
+
+
+frame_options = gather("statement", FRAME_OPTIONS, read_statement)
+"""Decorator of a command whose parameter `statement` holds what the `FRAME_OPTIONS` state."""
 
 
 def read_shape(text: str | None) -> tuple[int, int] | None:
