@@ -41,7 +41,7 @@ def _root(
 
 
 @app.command()
-@command.frame_options
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def crosstalk(
     light: Light,
     statement: dict[str, Any],
@@ -72,7 +72,7 @@ def crosstalk(
 
 
 @app.command()
-@command.frame_options
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def noise(
     dark: Annotated[str, typer.Option(help="Dark frames, two at least: lens capped, exposure time of the test.")],
     flat: Annotated[
@@ -97,7 +97,7 @@ def noise(
 
 
 @app.command()
-@command.frame_options
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def registration(
     light: Light,
     statement: dict[str, Any],
@@ -124,7 +124,7 @@ def registration(
 
 
 @app.command()
-@command.frame_options
+@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
 def check(
     file: Annotated[Path, typer.Argument(help="Calibration file.")],
     light: Light,
