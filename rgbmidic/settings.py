@@ -730,6 +730,8 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         if value in kinds:
             return value
         raise ConfigurationError(f"{where} must be one of {', '.join(map(_quoted, kinds))}, not {_quoted(value)}")
+    if is_dataclass(hint) and isinstance(value, Mapping):
+        return read_section(cast(Any, hint), where, value, base)
     if isinstance(value, str | PurePath) and hint in (str, Path):
         return str(value) if hint is str else Path(base) / value
     if isinstance(value, int) and abs(value) >= 2**63:
@@ -794,12 +796,14 @@ def _quoted(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Value as TOML and JSON hold it: an object of a dataclass as a dict, an array or a tuple as a list."""
+    """Value as TOML and JSON hold it: a dataclass as a dict, an array or a tuple as a list, NaN as None."""
     if is_dataclass(value):
         return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
     value = _python(value)
     if isinstance(value, tuple):
         return [plain(entry) for entry in value]
+    if isinstance(value, float) and math.isnan(value):
+        return None
     return str(value) if isinstance(value, Path) else value
 
 

@@ -15,10 +15,10 @@ from typing import Any, TypeVar, cast
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
-from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
 from rgbmidic.illumination.registration import Registration
-from rgbmidic.settings import FrameKind, plain, read_section, read_table, regular
+from rgbmidic.settings import FrameKind, convert_value, plain, read_section, read_table, regular
 
 __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk"]
 
@@ -195,7 +195,7 @@ class Calibration:
     @classmethod
     def _from_document(cls, document: dict[str, Any], name: str) -> Calibration:
         known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
-        camera, crosstalk, noise = (read_table(document, part) for part in ("camera", "crosstalk", "noise"))
+        camera, noise = read_table(document, "camera"), read_table(document, "noise")
         if (cfa := camera.get("cfa")) not in (None, *BAYER_PATTERNS):
             raise ValueError(f"camera.cfa is {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
         return read_section(
@@ -203,9 +203,9 @@ class Calibration:
             "camera",
             {key: camera[key] for key in _CAMERA if key in camera},
             name=name,
-            crosstalk=_read(Crosstalk, document, "crosstalk", field=_read(CrosstalkField, crosstalk, "field")),
+            crosstalk=_read(Crosstalk, document, "crosstalk"),
             noise=_read(NoiseModel, document, "noise"),
-            camera_noise=CameraNoise.from_document(noise["planes"]) if "planes" in noise else None,
+            camera_noise=convert_value(noise.get("planes"), CameraNoise | None, "noise.planes"),
             registration=_read(Registration, document, "registration"),
             provenance=read_table(document, "provenance"),
             extra={key: value for key, value in document.items() if key not in known},
@@ -223,7 +223,7 @@ class Calibration:
             document["crosstalk"]["condition_number"] = self.crosstalk.condition_number
             document["crosstalk"]["noise_amplification"] = plain(self.crosstalk.noise_amplification)
         if self.camera_noise is not None:
-            document["noise"]["planes"] = self.camera_noise.to_document()
+            document["noise"]["planes"] = plain(self.camera_noise)
         if self.registration is not None:
             document["registration"]["parameter_names"] = _PARAMETERS
         return {**document, **self.extra, "provenance": dict(self.provenance)}
@@ -261,12 +261,12 @@ def _read_json(path: Path) -> Any:
     )
 
 
-def _read(kind: type[_Section], document: dict[str, Any], name: str, **ready: Any) -> _Section | None:
+def _read(kind: type[_Section], document: dict[str, Any], name: str) -> _Section | None:
     """Object of a section of the file, None where it is not there; what is derived from other keys is not read."""
     if document.get(name) is None:
         return None
-    table, keys = read_table(document, name), {entry.name for entry in fields(cast(Any, kind))} - set(ready)
-    return read_section(kind, name, {key: table[key] for key in table if key in keys}, **ready)
+    table, keys = read_table(document, name), {entry.name for entry in fields(cast(Any, kind))}
+    return read_section(kind, name, {key: table[key] for key in table if key in keys})
 
 
 def _number(text: str) -> float:

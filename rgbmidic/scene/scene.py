@@ -17,7 +17,7 @@ from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
 from rgbmidic.scene.camera import PIXEL, Camera, Light, Vector, reference_camera, rotation, three_lights
-from rgbmidic.scene.surface import AffineField, Finish, InPlaneField, MeshField, Surface
+from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
 from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
 from rgbmidic.typing import FloatArray
 
@@ -292,15 +292,12 @@ def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
     table = read_table(document, "body")
     kind = convert_value(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
     body: Body = read_section(BODIES[kind], "body", table, base)
-    table, paints = read_table(document, "surface"), {}
-    for name, albedo in (("white", 0.80), ("black", 0.10)):
-        paint = {"albedo": albedo, **read_table(table, name)}
-        table.pop(name, None)
-        paints[name] = read_section(Finish, f"surface.{name}", paint, base)
+    table, albedos = read_table(document, "surface"), {"white": 0.80, "black": 0.10}
+    paints = {name: {"albedo": albedo, **read_table(table, name)} for name, albedo in albedos.items()}
     lights = _tables(document, "lights")
     scene = Scene(
         body=body,
-        surface=read_section(Surface, "surface", table, base, **paints),
+        surface=read_section(Surface, "surface", {**table, **paints}, base),
         lights=tuple(_light(table, body, base) for table in lights) if lights else three_lights(body.front),
         camera=_camera(read_table(document, "camera"), body, base),
     )
