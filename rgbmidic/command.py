@@ -1,4 +1,4 @@
-"""What both commands have in common: errors as one line and an exit status, and options that several commands take."""
+"""Parts of both commands: errors become one line and an exit status, and several commands take the same options."""
 
 from __future__ import annotations
 

@@ -668,7 +668,7 @@ def check_names(given: Iterable[str], allowed: Iterable[str], what: str, where: 
     given, allowed
         Names.
     what, where
-        What the names are of and where they stand, for the message.
+        Noun for the names, and the place where they stand, for the message.
 
     Raises
     ------

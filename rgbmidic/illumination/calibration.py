@@ -2,7 +2,7 @@
 
 `rgbmidic-calibrate` writes the file, the main job reads it. Camera channels = A . lights (rows of A: camera channels,
 columns: lights), every column divided by its largest entry, so that a light's image is in grey levels of the channel
-that sees it best. What reads a section raises KeyError, TypeError or ValueError where the file is damaged.
+that sees it best.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _PARAMETERS = ["shift_x_px", "shift_y_px", "rotation_rad", "scale", "radial_at_r
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """All that is known of camera and lights; a section that was not measured is None.
+    """Calibration of camera and lights; a section that was not measured is None.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Calibration:
     shape
         Rows and columns of the captures.
     name
-        What messages call it: its file.
+        Name in messages: its file.
     unevenness
         Of the grey levels' histogram in the captures (`rgbmidic.illumination.frame_check.unevenness`).
     provenance

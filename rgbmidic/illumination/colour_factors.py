@@ -1,7 +1,7 @@
-"""Slope of each colour on the common texture, and what is channel-specific, block by block, from a single mosaic.
+"""Slope of each colour on the common texture, and its channel-specific variance, block by block, from a single mosaic.
 
 A sample of camera channel c is ``m_c = mean_c + alpha_c a + e_c``. alpha_c, the slope on the common texture a, is
-smooth; e_c is what only this channel shows there, the erratic part of a reflection and camera noise. Low-passed to the
+smooth; e_c is the channel-specific component, the erratic part of a reflection and camera noise. Low-passed to the
 band that all colours resolve, two channels have the moment ``alpha_c alpha_c'`` in common and nothing else, so three
 channels give three slopes (``alpha_1^2 = M_12 M_13 / M_23``, a one-factor analysis), free of the bias that noise gives
 a regression; what a channel's own moment has beyond that is the variance of e_c.
@@ -53,7 +53,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
-    """What is gathered from the mosaic before the texture is known.
+    """Local means and moments of a mosaic, from which its texture is learnt.
 
     Attributes
     ----------
@@ -260,7 +260,7 @@ def colour_factors(
     moments
         See `gather_moments`.
     band
-        What the planes show of the texture (`TextureModel.band`).
+        Second moments of the low-passed planes for unit texture (`TextureModel.band`).
     crosstalk : (3, k)
         A in channels = A . lights: one light's sparkle is seen by all channels, which is taken out of their moments.
     coloured

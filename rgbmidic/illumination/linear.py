@@ -1,6 +1,6 @@
 """Grey levels proportional to light: black level subtracted, saturated samples marked.
 
-What the photon transfer method finds out about a camera, per colour plane, each figure with its uncertainty.
+The figures of a camera per colour plane, each with its uncertainty, come from the photon transfer method.
 
 Names and definitions follow EMVA standard 1288 (release 4.0): gain is 1/K, full well is the saturation capacity.
 """

@@ -73,7 +73,7 @@ class TextureModel:
     weights, widths : tuple of float
         w_m and s_m (px).
     offset : float
-        c: what the removal of the local mean has taken away; not positive.
+        c: the loss by the removal of the local mean; not positive.
     private : float
         Fraction (0 to 1) of the channel-specific component that is as coarse as the speckle: 0 for the sparkle of
         reflections, towards 1 for a coloured specimen.
@@ -129,7 +129,7 @@ class TextureModel:
 
     @cached_property
     def band(self) -> BandEnergy:
-        """What the low-passed planes of a Bayer mosaic show of this texture."""
+        """Second moments of the low-passed planes of a Bayer mosaic for this texture."""
         own, adjacent, diagonal = np.asarray(self.weights) @ _band_energies(self.widths) + self.offset
         return BandEnergy(own=float(own), adjacent=float(adjacent), diagonal=float(diagonal))
 
