@@ -95,11 +95,6 @@ class Draft:
         content = self.section("region")
         return read_section(RegionSettings, "region", content, self.file.parent) if content else None
 
-    @property
-    def settings(self) -> TestSettings:
-        """The settings of the test; errors as `TestSettings.from_mapping`."""
-        return TestSettings.from_mapping(self.document, self.file.parent)
-
     def changed(self, sections: Mapping[str, Mapping[str, Any]]) -> Self:
         """Return the draft with other values of some keys; comments and order stay.
 
@@ -175,7 +170,7 @@ class Draft:
         ResultError
             The file cannot be written.
         """
-        _ = self.settings
+        TestSettings.from_mapping(self.document, self.file.parent)
         write_complete(self.file, lambda file: file.write(self.text.encode("utf-8")))
 
 

@@ -62,7 +62,7 @@ class ResultPage:
         self.fields, self.pictures, self.progress = Fields.of(result), Pictures(result=result), progress
         self.values: Values | None = None
         self._pointer: tuple[float, float] | None = None
-        self._key = ("", -1, -1)
+        self._read = lru_cache(1)(lambda name, frame, changes: self.fields.read(name, frame))
         self._test_range = lru_cache(8)(lambda name, changes: self.fields.range_of_test(name))
         self._changes = self._size = 0
         self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
@@ -147,7 +147,7 @@ class ResultPage:
 
     def _blank(self, text: str) -> None:
         """Show an error and nothing of the view that cannot be drawn, nor of the one before it."""
-        self.values, self._key = None, ("", -1, -1)
+        self.values = None
         self.canvas.clear()
         self.directions.hide()
         self._read_out()
@@ -157,7 +157,7 @@ class ResultPage:
 
     def _draw(self) -> None:
         view, field = self.view, self.fields.all[self.view.field]
-        values = self.values = self._read()
+        values = self.values = self._read(view.field, view.frame, self._changes)
         picture, remark = self.pictures.frame(view.frame) if view.over == "deformed" else (self.pictures.reference, "")
         if view.range == "hand" and (self.parts.low.value, self.parts.high.value) != (view.low, view.high):
             remark = f"The colours go from {view.low:g} to {view.high:g}: the lowest number must be below the highest."
@@ -189,14 +189,6 @@ class ResultPage:
         """Draw another part of the image."""
         wanted = self.canvas.wanted
         self.show(window=() if wanted == Canvas.around(self.result.nodes) else wanted)
-
-    def _read(self) -> Values:
-        """Read the field in the frame, unless it was read and has not been measured since."""
-        key = (self.view.field, self.view.frame, self._changes)
-        if self.values is None or key != self._key:
-            read, self._key = self.fields.read(self.view.field, self.view.frame), key
-            return read
-        return self.values
 
     @property
     def _symmetric(self) -> bool:
