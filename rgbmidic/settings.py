@@ -77,7 +77,11 @@ class _Checked:
     section = ""
 
     def __post_init__(self) -> None:
-        _normalise(self, self.section)
+        hints = _hints(cast(Any, self.__class__))
+        for entry in fields(cast(Any, self)):
+            where = entry.metadata.get("key") or f"{self.section}.{entry.name}".lstrip(".")
+            value = _converted(entry, getattr(self, entry.name), hints[entry.name], where)
+            object.__setattr__(self, entry.name, value)
         self._check()
 
     def _check(self) -> None:
@@ -805,15 +809,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and math.isnan(value):
         return None
     return str(value) if isinstance(value, Path) else value
-
-
-def _normalise(settings: Any, section: str) -> None:
-    """Every field of settings in the type that it states and within its bounds; all settings begin with this."""
-    hints = _hints(settings.__class__)
-    for entry in fields(settings):
-        where = entry.metadata.get("key") or f"{section}.{entry.name}".lstrip(".")
-        value = _converted(entry, getattr(settings, entry.name), hints[entry.name], where)
-        object.__setattr__(settings, entry.name, value)
 
 
 _BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
