@@ -585,8 +585,11 @@ def read_section(
     check_names(content, hints, "key", f"[{name}]")
     for entry in fields(cast(Any, kind)):
         if entry.name in content:
-            value, where = content[entry.name], f"{name}.{entry.name}"
-            ready[entry.name] = _converted(entry, value, hints[entry.name], where, base)
+            value, hint, where = content[entry.name], hints[entry.name], f"{name}.{entry.name}"
+            inner = next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
+            if inner is not None and isinstance(value, Mapping):
+                value = read_section(cast(Any, inner), where, value, base)
+            ready[entry.name] = _converted(entry, value, hint, where, base)
         elif _is_required(entry) and entry.name not in ready:
             raise ConfigurationError(f"{name}.{entry.name} is missing")
     return kind(**ready)
@@ -734,8 +737,6 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         if value in kinds:
             return value
         raise ConfigurationError(f"{where} must be one of {', '.join(map(_quoted, kinds))}, not {_quoted(value)}")
-    if is_dataclass(hint) and isinstance(value, Mapping):
-        return read_section(cast(Any, hint), where, value, base)
     if isinstance(value, str | PurePath) and hint in (str, Path):
         return str(value) if hint is str else Path(base) / value
     if isinstance(value, int) and abs(value) >= 2**63:

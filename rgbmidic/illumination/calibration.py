@@ -18,7 +18,7 @@ from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
 from rgbmidic.illumination.registration import Registration
-from rgbmidic.settings import FrameKind, convert_value, plain, read_section, read_table, regular
+from rgbmidic.settings import FrameKind, plain, read_section, read_table, regular
 
 __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk"]
 
@@ -205,7 +205,7 @@ class Calibration:
             name=name,
             crosstalk=_read(Crosstalk, document, "crosstalk"),
             noise=_read(NoiseModel, document, "noise"),
-            camera_noise=convert_value(noise.get("planes"), CameraNoise | None, "noise.planes"),
+            camera_noise=_read(CameraNoise, noise, "planes"),
             registration=_read(Registration, document, "registration"),
             provenance=read_table(document, "provenance"),
             extra={key: value for key, value in document.items() if key not in known},

@@ -101,7 +101,7 @@ def test_picture_of_every_section(files, tmp_path):
         (lambda d: d["crosstalk"]["field"].update(order=3), "order 3 needs 9"),
         (lambda d: d["crosstalk"].update(matrix=[[1, 1, 1]] * 3), "cannot be inverted"),
         (lambda d: d["noise"].update(gain=-1), "noise.gain must be above 0, not -1"),
-        (lambda d: d["noise"]["planes"].pop("dsnu"), "noise.planes.dsnu is missing"),
+        (lambda d: d["noise"]["planes"].pop("dsnu"), "planes.dsnu is missing"),
         (lambda d: d["noise"]["planes"]["gain"].update(value=[1, 2]), "a figure per plane"),
         (lambda d: d["registration"].update(parameters=[[1, 2]]), "5 finite parameters"),
         (lambda d: d["registration"].update(radius=0), "radius of a registration must be positive, not 0"),
