@@ -85,8 +85,6 @@ class Draft:
     @property
     def frames(self) -> FrameSettings:
         """The settings of the frames; errors as `TestSettings.from_mapping`."""
-        if "path" not in self.section("frames"):
-            raise ConfigurationError("frames.path is missing")
         return read_section(FrameSettings, "frames", self.section("frames"), self.file.parent)
 
     @property
