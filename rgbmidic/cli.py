@@ -413,8 +413,8 @@ def plan(
     uncertainty = "standard uncertainty to expect over the field, px"
     _print_table(uncertainty, *planning.uncertainty_rows(made), planning.UNCERTAINTY_WORDS)
     better = {name: proposal.plan for name, proposal in proposals.items() if proposal.gain > 1}
-    for name, one in {"lamps as they are": made, **better}.items():
-        _print_table(f"{name}: {planning.summary(one)}", *planning.lamp_rows(one))
+    for name, lamps in {"lamps as they are": made, **better}.items():
+        _print_table(f"{name}: {planning.summary(lamps)}", *planning.lamp_rows(lamps))
     if not better:
         print("no better place was found for the lamps")
     print(f"plan: {out / 'plan.json'}   picture: {out / 'plan.png'}")
@@ -438,8 +438,8 @@ def frames(
     from rgbmidic.settings import FrameSettings
 
     if formats:
-        for known in known_formats():
-            print(f"{known.name}: {' '.join((*known.endings, *known.movies)) or 'by content'}")
+        for format_ in known_formats():
+            print(f"{format_.name}: {' '.join((*format_.endings, *format_.movies)) or 'by content'}")
         return
     if not path:
         raise InputError("PATH must name a movie, a frame, a folder or a pattern; --formats lists what is read")

@@ -199,12 +199,12 @@ class DirectionLayer:
         """Show the directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
         window = self._canvas.window
         cell = max(window.right - window.left, window.bottom - window.top) / _ACROSS
-        known = np.flatnonzero(np.isfinite(degrees) & np.isfinite(nodes).all(axis=1))
-        places = np.floor(nodes[known] / cell).astype(int)
-        kept = known[np.unique(places, axis=0, return_index=True)[1]]
-        angle = np.radians(degrees[kept])
+        measured = np.flatnonzero(np.isfinite(degrees) & np.isfinite(nodes).all(axis=1))
+        places = np.floor(nodes[measured] / cell).astype(int)
+        thinned = measured[np.unique(places, axis=0, return_index=True)[1]]
+        angle = np.radians(degrees[thinned])
         half = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        ends = np.concatenate([nodes[kept] - half, nodes[kept] + half], axis=1)
+        ends = np.concatenate([nodes[thinned] - half, nodes[thinned] + half], axis=1)
         self._lines.data = dict(zip(_ENDS.split(), ends.T, strict=True))
 
 

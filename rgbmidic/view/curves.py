@@ -32,9 +32,9 @@ def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings) -> ProbeS
     Strain gauges have the length `gauge` (px); strain measure and window are those `stated`.
     """
     places: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
-    for own in probe_marks(marks).values():
-        place = tuple(coordinate for mark in own for coordinate in (mark.x, mark.y))
-        places[f"{own[0].kind}s"] += ((*place, gauge) if own[0].kind == "strain_gauge" else place,)
+    for pair in probe_marks(marks).values():
+        place = tuple(coordinate for mark in pair for coordinate in (mark.x, mark.y))
+        places[f"{pair[0].kind}s"] += ((*place, gauge) if pair[0].kind == "strain_gauge" else place,)
     return ProbeSettings(measure=stated.measure, window=stated.window, **places)
 
 
@@ -262,7 +262,8 @@ class CurvePanel:
         found = {} if self.histories is None else groups(self.histories)
         self._select.options = list(found)
         # the chosen quantity stays unless a new probe does not have it
-        wanted = [name for name, own in found.items() if {_probe(one.name) for one in own} - before] or list(found)
+        new = [name for name, curves in found.items() if any(_probe(curve.name) not in before for curve in curves)]
+        wanted = new or list(found)
         current = self._select.value or self._chosen
         self._select.value = current if current in wanted or not wanted else wanted[0]
         self.draw()
@@ -275,10 +276,10 @@ class CurvePanel:
             self.plot.legend.visible = False
             self.plot.xaxis.axis_label = self.plot.yaxis.axis_label = None
             return
-        own = groups(self.histories).get(self._select.value, [])
+        quantities = groups(self.histories).get(self._select.value, [])
         x, axis = time_axis(self.histories.times, self.histories.frames)
         bands, lines = [], []
-        for quantity in own:
+        for quantity in quantities:
             colour = self.colours.get(_probe(quantity.name), OKABE_ITO["grey"])
             bands += [(xs, ys, colour) for xs, ys in zip(*band(x, quantity), strict=True)]
             lines.append((x, quantity.values, colour, quantity.name.replace("_", " ")))

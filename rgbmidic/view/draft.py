@@ -150,8 +150,8 @@ class Draft:
         file = self.file.parent / file
         if file.suffix.lower() != ".toml":
             raise ConfigurationError(f"{file} must end in .toml")
-        given = [self.section(section).get(key, []) for section, _, key in (name.partition(".") for name in _FILES)]
-        named = [text for one in given for text in ([one] if isinstance(one, str) else one)]
+        stated = [self.section(section).get(key, []) for section, _, key in (name.partition(".") for name in _FILES)]
+        named = [text for value in stated for text in ([value] if isinstance(value, str) else value)]
         if file.parent != self.file.parent and any(not Path(text).is_absolute() for text in named):
             raise ConfigurationError(
                 f"{file} must stay in {self.file.parent}: what it names is relative to that folder"
@@ -187,9 +187,9 @@ def arranged(marks: Sequence[Mark], new: str) -> tuple[Mark, ...]:
     if new not in OUTLINES:
         return tuple(marks)
     kept = [mark for mark in marks if mark.kind == new or mark.kind not in OUTLINES]
-    own = [mark for mark in kept if mark.kind == new]
-    if new != "polygon" and len(own) > OUTLINES[new]:  # a third place begins another one
-        kept = [mark for mark in kept if mark.kind != new or mark is own[-1]]
+    of_kind = [mark for mark in kept if mark.kind == new]
+    if new != "polygon" and len(of_kind) > OUTLINES[new]:  # a third place begins another one
+        kept = [mark for mark in kept if mark.kind != new or mark is of_kind[-1]]
     return tuple(kept)
 
 
@@ -236,12 +236,12 @@ def _holes(marks: Sequence[Mark]) -> list[Ring]:
 
 def _corners(name: str, marks: Sequence[Mark]) -> Ring:
     """Return the corners that the marks of an outline or a hole make, to a tenth of a pixel: a pointer's precision."""
-    own = [(mark.x, mark.y) for mark in marks if mark.kind == name]
+    places = [(mark.x, mark.y) for mark in marks if mark.kind == name]
     if name.startswith(("circle", "round hole")):
-        (x, y), on = own[:2]
+        (x, y), on = places[:2]
         radius, angles = math.dist((x, y), on), np.arange(_ROUND) * 2 * np.pi / _ROUND
-        own = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
-    return [[round(float(x), 1), round(float(y), 1)] for x, y in own]
+        places = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
+    return [[round(float(x), 1), round(float(y), 1)] for x, y in places]
 
 
 _SOON = 60

@@ -187,8 +187,8 @@ class Fields:
             As `Result.frame`.
         """
         more = {"fraction": ("light_fraction", "node_status")}.get(self.all[name].kind, ())
-        own = (name,) if name in QUANTITIES and name not in _MOVED and not self.physical.is_strain(name) else ()
-        read = next(self.result.table.each([*_MOVED, *own, *more], [frame]))
+        stored = (name,) if name in QUANTITIES and name not in _MOVED and not self.physical.is_strain(name) else ()
+        read = next(self.result.table.each([*_MOVED, *stored, *more], [frame]))
         u, v, u_std, v_std = (np.asarray(read[part], dtype=np.float64) for part in _MOVED)
         moved = self.result.nodes + np.stack([u, v], axis=1)
         nothing = np.full(len(u), np.nan)
@@ -215,14 +215,14 @@ class Fields:
         """Return the colour range over the whole test, from frames evenly spread over those that are measured."""
         there = np.flatnonzero(self.result.finished).tolist()
         ends = [robust_range(self.read(name, frame)) for frame in (spread(there, _SPREAD) if there else ())]
-        known = [pair for pair in ends if pair is not None]
-        return (min(low for low, _ in known), max(high for _, high in known)) if known else (0.0, 1.0)
+        measured = [pair for pair in ends if pair is not None]
+        return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
 
 
 def robust_range(read: Values) -> tuple[float, float] | None:
     """Return the colour range of one frame without doubtful nodes and outliers; None where nothing is measured."""
-    known = ordinary_values(read.values, read.std)
-    return colour_range(known) if known.size else None
+    ordinary = ordinary_values(read.values, read.std)
+    return colour_range(ordinary) if ordinary.size else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -240,11 +240,11 @@ class Pictures:
     @cached_property
     def reference(self) -> Picture:
         """Mean of the lights' reference images, grey where none was kept."""
-        kept, (left, top) = self.result.reference, self.result.reference_origin
+        images, (left, top) = self.result.reference, self.result.reference_origin
         columns, rows = np.ceil(self.result.nodes.max(axis=0) + 1).astype(int)
         picture = np.full(self.result.frame_shape or (rows, columns), 60, dtype=np.uint8)
-        if kept is not None:
-            picture[top : top + kept.shape[1], left : left + kept.shape[2]] = kept.mean(axis=0)
+        if images is not None:
+            picture[top : top + images.shape[1], left : left + images.shape[2]] = images.mean(axis=0)
         return picture
 
     def frame(self, place: int) -> tuple[Picture, str]:

@@ -163,13 +163,10 @@ class MarkLayer:
         self._canvas.place(at)
         probes = probe_marks(at)
         self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
-        self._joined.data = columns(
-            _PROBE,
-            [
-                ([mark.x for mark in own], [mark.y for mark in own], colour, own[0].x, own[0].y, name.replace("_", " "))
-                for (name, own), colour in zip(probes.items(), self.colours.values(), strict=True)
-            ],
-        )
+        lines = [([mark.x for mark in ends], [mark.y for mark in ends]) for ends in probes.values()]
+        texts = [(xs[0], ys[0], name.replace("_", " ")) for name, (xs, ys) in zip(probes, lines, strict=True)]
+        parts = zip(lines, self.colours.values(), texts, strict=True)
+        self._joined.data = columns(_PROBE, [(*line, colour, *text) for line, colour, text in parts])
 
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""

@@ -202,8 +202,8 @@ def grey_picture(frame: Mosaic | ChannelFrame) -> Picture:
 
 def stretched(image: AnyArray) -> Picture:
     """Stretch an image (H, W) between its 1 % and 99 % quantiles, of every fourth pixel, to 0 to 255; NaN is 0."""
-    known = image[::4, ::4][np.isfinite(image[::4, ::4])]
-    low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 1.0)
+    finite = image[::4, ::4][np.isfinite(image[::4, ::4])]
+    low, high = np.percentile(finite, [1, 99]) if finite.size else (0.0, 1.0)
     return np.asarray(np.clip(255 * (np.nan_to_num(image) - low) / max(high - low, 1e-6), 0, 255), dtype=np.uint8)
 
 
