@@ -177,7 +177,7 @@ def _clear(instrument: Instrument, light: int, before: Zones, after: Zones, brig
     """Inverse variance (directions, points) of the pull of a light, times the fourth power of its diffuse fraction."""
     variance = instrument.light_variance(light, before, after, brightness)
     with np.errstate(invalid="ignore"):
-        clear = (1 - np.fmax(before.share, after.share)) ** _DIFFUSE_POWER / variance
+        clear = (1 - np.fmax(before.specular_fraction, after.specular_fraction)) ** _DIFFUSE_POWER / variance
     full = instrument.scene.camera.full_scale
     for zones in (before, after):
         with np.errstate(invalid="ignore"):
@@ -288,7 +288,7 @@ class Plan:
         reference, outlooks = _predict(scene, self.instrument, self.x, self.y, [o.state for o in self.outlooks])
         return replace(self, scene=scene, reference=reference, outlooks=outlooks)
 
-    def share(self, mask: BoolArray) -> float:
+    def fraction(self, mask: BoolArray) -> float:
         """Fraction of the field on which a mask (h, w) holds."""
         return float(mask[self.inside].mean())
 
@@ -354,14 +354,14 @@ def _predict(
         zones = predict_zones(scene, state, material=material)
         displacement = truth(scene, state, None, (x, y))
         with np.errstate(invalid="ignore"):
-            reflects = np.fmax(reference.share, zones.share) > REFLECTS
+            reflects = np.fmax(reference.specular_fraction, zones.specular_fraction) > REFLECTS
         outlooks.append(
             Outlook(
                 state=state,
                 zones=zones,
                 displacement=displacement,
                 reflects=reflects,
-                lit=np.isfinite(reference.share) & np.isfinite(zones.share),
+                lit=np.isfinite(reference.specular_fraction) & np.isfinite(zones.specular_fraction),
                 saturated=instrument.saturated(reference) | instrument.saturated(zones),
                 forecast=instrument.forecast(reference, zones, _around(trace_change(displacement), reach)),
             )

@@ -107,7 +107,7 @@ def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     rows = []
     for index, light in enumerate(plan.scene.lights):
         azimuth, inclination = _angles(plan.scene, light)
-        worst = max(plan.share(outlook.reflects[index]) for outlook in plan.outlooks)
+        worst = max(plan.fraction(outlook.reflects[index]) for outlook in plan.outlooks)
         place = ", ".join(f"{round(value)}" for value in light.position)
         rows.append([light.name, f"[{place}]", f"{azimuth:.0f}", f"{inclination:.0f}", f"{worst:.1%}"])
     return ["light", "position = (mm)", "azimuth", "inclination", "reflects on"], rows
@@ -115,7 +115,7 @@ def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
 
 def summary(plan: Plan) -> str:
     """One line: the largest overlap of reflections, and the uncertainty over field and states."""
-    overlap = max(plan.share(np.asarray(outlook.reflects.sum(axis=0) > 1)) for outlook in plan.outlooks)
+    overlap = max(plan.fraction(np.asarray(outlook.reflects.sum(axis=0) > 1)) for outlook in plan.outlooks)
     std = f"{plan.std:.4f} px" if math.isfinite(plan.std) else "unbounded: somewhere no light sees"
     return f"reflections overlap on up to {overlap:.1%} of the field; u_std {std}"
 
@@ -127,7 +127,7 @@ def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
         "rgbmidic": __version__,
         "field_px": list(plan.field),
         "element_size_px": plan.instrument.element_size,
-        "reflects_from_specular_share": REFLECTS,
+        "reflects_from_specular_fraction": REFLECTS,
         **_arrangement(plan),
         "proposals": {
             name: {"gain": proposal.gain, **_arrangement(proposal.plan)} for name, proposal in proposals.items()
@@ -171,11 +171,11 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
         "angle_deg": state.angle_deg,
         "translation_mm": list(state.translation),
         "largest_motion_px": float(np.hypot(*outlook.displacement[:, inside]).max()),
-        "reflecting": {name: plan.share(mask) for name, mask in zip(names, outlook.reflects, strict=True)},
-        "all_reflect": plan.share(np.asarray(outlook.reflects.all(axis=0))),
-        "one_light": plan.share(outlook.clean == 1),
-        "no_light": plan.share(outlook.clean == 0),
-        "saturated": plan.share(np.asarray(outlook.saturated.any(axis=0))),
+        "reflecting": {name: plan.fraction(mask) for name, mask in zip(names, outlook.reflects, strict=True)},
+        "all_reflect": plan.fraction(np.asarray(outlook.reflects.all(axis=0))),
+        "one_light": plan.fraction(outlook.clean == 1),
+        "no_light": plan.fraction(outlook.clean == 0),
+        "saturated": plan.fraction(np.asarray(outlook.saturated.any(axis=0))),
         "std_px": dict(zip(("median", "q95", "largest"), quantiles, strict=True)),
         "random_px": _rms(outlook.forecast.std[inside]),
         "feigned_by_domes_px": _rms(outlook.forecast.bias[inside]),
@@ -234,14 +234,14 @@ def _draw_zones(axis: Axes, plan: Plan, outlook: Outlook) -> None:
 
     body = np.isfinite(outlook.displacement[0])
     picture = np.where(body[..., None], 0.93, 1.0) * np.ones(3)
-    largest = np.fmax(plan.reference.share, outlook.zones.share)
+    largest = np.fmax(plan.reference.specular_fraction, outlook.zones.specular_fraction)
     for colour, fraction in zip(_colours(plan.scene), largest, strict=True):
         cover = 0.85 * np.clip(np.nan_to_num(fraction), 0, 1)[..., None]
         picture = picture * (1 - cover) + np.array(to_rgb(colour)) * cover
     axis.imshow(picture, extent=_extent(plan), interpolation="bilinear")
     for index, colour in enumerate(_colours(plan.scene)):
         for zones, style in ((plan.reference, "--"), (outlook.zones, "-")):
-            fraction = zones.share[index]
+            fraction = zones.specular_fraction[index]
             if np.nanmin(fraction, initial=1.0) < REFLECTS < np.nanmax(fraction, initial=0.0):
                 axis.contour(plan.x, plan.y, fraction, [REFLECTS], colors=[colour], linestyles=style, linewidths=1)
     _draw_field(axis, plan)
