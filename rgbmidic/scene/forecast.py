@@ -276,7 +276,7 @@ class Instrument:
         """
         residual = self.variance(self.residual, before, after, change)
         seen = np.isfinite(residual) & ~self.saturated(before) & ~self.saturated(after)
-        contrast = np.where(seen, 1 - (before.specular_fraction + after.specular_fraction) / 2, 0.0)
+        contrast = np.where(seen, 1 - (before.fraction + after.fraction) / 2, 0.0)
         pull = light_pull(contrast, residual)
         information = self.energy * pull * contrast
         total = information.sum(axis=0)
@@ -311,7 +311,7 @@ class Instrument:
         -------
         ndarray, shape (k, ...), float32
         """
-        change = np.full((3, *before.specular_fraction.shape[1:]), 2.0)
+        change = np.full((3, *before.fraction.shape[1:]), 2.0)
         variance = self.variance(self.score, before, after, change, common=float(known))
         seen = np.isfinite(variance) & ~self.saturated(before) & ~self.saturated(after)
         inverse = np.where(seen, 1 / np.where(seen, variance, 1.0), 0.0)
@@ -384,11 +384,7 @@ class Instrument:
         """Variance (k, ...) that comes from a change of the reflections; between the lights it is independent."""
         first, second = self._dome_factor(before), self._dome_factor(after)
         domes = (first**2 + second**2 - 2 * common * first * second).sum(axis=1)
-        contrast = (
-            before.specular_fraction**2
-            + after.specular_fraction**2
-            - 2 * common * before.specular_fraction * after.specular_fraction
-        )
+        contrast = before.fraction**2 + after.fraction**2 - 2 * common * before.fraction * after.fraction
         erratic = self._erratic(before, after, common)
         return np.asarray(energies.erratic * erratic + energies.dome * domes + energies.contrast * contrast)
 
@@ -401,9 +397,7 @@ class Instrument:
         """
         a2, b2 = self._roughness
         parts = [
-            _facet_covariance(one.geometry.slopes, other.geometry.slopes, a2, b2)
-            * one.specular_fraction
-            * other.specular_fraction
+            _facet_covariance(one.geometry.slopes, other.geometry.slopes, a2, b2) * one.fraction * other.fraction
             for one, other in ((before, before), (after, after), (before, after))
         ]
         area = WRINKLE_AREA * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
@@ -415,7 +409,7 @@ class Instrument:
         A slope s changes the reflection at the half-way slope h by the factor exp(h.s/(a^2 + b^2)); its linear part is
         taken.
         """
-        return np.asarray(zones.specular_fraction[:, None] * zones.geometry.slopes / sum(self._roughness))
+        return np.asarray(zones.fraction[:, None] * zones.geometry.slopes / sum(self._roughness))
 
     @property
     def _roughness(self) -> tuple[float, float]:

@@ -108,7 +108,7 @@ class Reflection:
         lobe = np.exp(-square / (2 * math.radians(reflectance.width_deg) ** 2))
         return np.asarray(reflectance.specular * lobe / self.half)
 
-    def specular_fraction(self, reflectance: Reflectance) -> FloatArray:
+    def fraction(self, reflectance: Reflectance) -> FloatArray:
         """Return the expected specular fraction q/(d + q) of the light that reaches the camera, (k, ...), 0 to 1."""
         q = self.specular(reflectance)
         return np.asarray(q / (self.diffuse(reflectance) + q))

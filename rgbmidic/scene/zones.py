@@ -227,9 +227,9 @@ class Zones:
     reflectance: Reflectance
 
     @property
-    def specular_fraction(self) -> FloatArray:
+    def fraction(self) -> FloatArray:
         """Specular fraction (k, ...) of the light that reaches the camera."""
-        return self.geometry.specular_fraction(self.reflectance)
+        return self.geometry.fraction(self.reflectance)
 
     @property
     def level(self) -> FloatArray:

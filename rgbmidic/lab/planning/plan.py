@@ -177,7 +177,7 @@ def _clear(instrument: Instrument, light: int, before: Zones, after: Zones, brig
     """Inverse variance (directions, points) of the pull of a light, times the fourth power of its diffuse fraction."""
     variance = instrument.light_variance(light, before, after, brightness)
     with np.errstate(invalid="ignore"):
-        clear = (1 - np.fmax(before.specular_fraction, after.specular_fraction)) ** _DIFFUSE_POWER / variance
+        clear = (1 - np.fmax(before.fraction, after.fraction)) ** _DIFFUSE_POWER / variance
     full = instrument.scene.camera.full_scale
     for zones in (before, after):
         with np.errstate(invalid="ignore"):
@@ -354,14 +354,14 @@ def _predict(
         zones = predict_zones(scene, state, material=material)
         displacement = truth(scene, state, None, (x, y))
         with np.errstate(invalid="ignore"):
-            reflects = np.fmax(reference.specular_fraction, zones.specular_fraction) > REFLECTS
+            reflects = np.fmax(reference.fraction, zones.fraction) > REFLECTS
         outlooks.append(
             Outlook(
                 state=state,
                 zones=zones,
                 displacement=displacement,
                 reflects=reflects,
-                lit=np.isfinite(reference.specular_fraction) & np.isfinite(zones.specular_fraction),
+                lit=np.isfinite(reference.fraction) & np.isfinite(zones.fraction),
                 saturated=instrument.saturated(reference) | instrument.saturated(zones),
                 forecast=instrument.forecast(reference, zones, _around(trace_change(displacement), reach)),
             )

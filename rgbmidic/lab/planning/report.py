@@ -234,14 +234,14 @@ def _draw_zones(axis: Axes, plan: Plan, outlook: Outlook) -> None:
 
     body = np.isfinite(outlook.displacement[0])
     picture = np.where(body[..., None], 0.93, 1.0) * np.ones(3)
-    largest = np.fmax(plan.reference.specular_fraction, outlook.zones.specular_fraction)
+    largest = np.fmax(plan.reference.fraction, outlook.zones.fraction)
     for colour, fraction in zip(_colours(plan.scene), largest, strict=True):
         cover = 0.85 * np.clip(np.nan_to_num(fraction), 0, 1)[..., None]
         picture = picture * (1 - cover) + np.array(to_rgb(colour)) * cover
     axis.imshow(picture, extent=_extent(plan), interpolation="bilinear")
     for index, colour in enumerate(_colours(plan.scene)):
         for zones, style in ((plan.reference, "--"), (outlook.zones, "-")):
-            fraction = zones.specular_fraction[index]
+            fraction = zones.fraction[index]
             if np.nanmin(fraction, initial=1.0) < REFLECTS < np.nanmax(fraction, initial=0.0):
                 axis.contour(plan.x, plan.y, fraction, [REFLECTS], colors=[colour], linestyles=style, linewidths=1)
     _draw_field(axis, plan)

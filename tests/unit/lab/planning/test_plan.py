@@ -47,7 +47,7 @@ def test_zones_are_those_of_both_states_at_the_points_of_the_reference():
     scene = coarse(sphere_scene())
     made = plan(scene, turned(2.0), turned(6.0))
     assert made.inside.mean() > 0.5
-    shares = [predict_zones(scene).specular_fraction, None]
+    shares = [predict_zones(scene).fraction, None]
     rows, columns = (np.round(a[made.inside]).astype(int) for a in (made.y, made.x))
     near = abs(shares[0][:, rows, columns] - REFLECTS) > 0.02
     at_rest = shares[0][:, rows, columns] > REFLECTS

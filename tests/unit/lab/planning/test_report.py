@@ -72,7 +72,7 @@ def test_the_picture_shows_zones_and_uncertainty_where_they_are(made):
         assert axis.get_xlim() == (-0.5, 159.5)
         assert axis.get_ylim() == (119.5, -0.5)
     # where red reflects, the picture of the first state is red
-    picture, share = zones[0].images[0].get_array(), plan.reference.specular_fraction
+    picture, share = zones[0].images[0].get_array(), plan.reference.fraction
     red = (share[0] > 0.5) & (share[1:].max(axis=0) < 0.05)
     assert red.any()
     assert (picture[red][:, 0] > 1.3 * picture[red][:, 2]).all()
