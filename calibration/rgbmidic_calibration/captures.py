@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-import rgbmidic
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
 from rgbmidic.frames.data import planes_of
@@ -26,10 +23,10 @@ from rgbmidic_calibration.ratio import plane_origins, saturation_pile
 __all__ = [
     "TILE",
     "CaptureFiles",
+    "Captures",
     "TemporalStack",
     "check_output",
     "named_patterns",
-    "provenance",
     "same_camera",
     "stack_frames",
     "tile_means",
@@ -102,6 +99,74 @@ class CaptureFiles:
         return {str(source.path): source.fingerprint for source in self.series.lights[0]}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Captures:
+    """All captures of a calibration, or of a check.
+
+    Attributes
+    ----------
+    lights
+        With one light on, by its name.
+    dark
+        With every lamp off; None: there are none.
+    together
+        With several lights on, by their names joined by ``+``.
+    """
+
+    lights: Mapping[str, CaptureFiles]
+    dark: CaptureFiles | None
+    together: Mapping[str, CaptureFiles]
+
+    @classmethod
+    def find(
+        cls,
+        lights: Mapping[str, str],
+        dark: str | None,
+        stated: FrameSettings,
+        *,
+        calibration: Calibration | None = None,
+        together: Mapping[str, str] | None = None,
+    ) -> Captures:
+        """Find the files of patterns, given by the names of the lights.
+
+        Raises
+        ------
+        ConfigurationError
+            Captures of lights together without the single ones of each.
+        CalibrationError
+            As in `CaptureFiles.find`.
+        """
+        for names in together or ():
+            if missing := [name for name in names.split("+") if name not in lights]:
+                raise ConfigurationError(
+                    f"--together {names} needs the single captures of {', '.join(missing)} too (--light)"
+                )
+            if "+" not in names:
+                raise ConfigurationError(f"--together takes NAME+NAME=FILES, at least two lights, not {names}")
+
+        def found(kind: str, patterns: Mapping[str, str]) -> dict[str, CaptureFiles]:
+            return {
+                name: CaptureFiles.find(f"{kind} {name}".strip(), pattern, stated, calibration)
+                for name, pattern in patterns.items()
+            }
+
+        return cls(
+            lights=found("light", lights),
+            dark=found("dark", {"": dark})[""] if dark else None,
+            together=found("lights", together or {}),
+        )
+
+    @property
+    def groups(self) -> tuple[CaptureFiles, ...]:
+        """The captures of each light, of lights together, and the dark frames."""
+        return *self.lights.values(), *self.together.values(), *([self.dark] if self.dark else [])
+
+    def stacks(self) -> tuple[dict[str, TemporalStack], TemporalStack | None]:
+        """Mean and variance of the captures of every light by its name, and of the dark frames."""
+        dark = stack_frames(self.dark.frames(), drifts=False, name="the dark frames") if self.dark else None
+        return {name: stack_frames(files.frames(), name=files.role) for name, files in self.lights.items()}, dark
+
+
 def named_patterns(options: Sequence[str], option: str) -> dict[str, str]:
     """Split options of the form NAME=FILES.
 
@@ -136,25 +201,6 @@ def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
         raise ConfigurationError(f"{path} exists already; choose another {option} or add --overwrite")
     if not path.parent.is_dir():
         raise ConfigurationError(f"the folder of {option} {path} does not exist")
-
-
-def provenance(command: str, groups: Sequence[CaptureFiles], details: Mapping[str, Any]) -> dict[str, Any]:
-    """Where a section of the calibration file comes from: date, version, inputs with hashes, and `details`."""
-    inputs = [
-        {"role": group.role, "file": path, "sha256": fingerprint}
-        for group in groups
-        for path, fingerprint in group.fingerprints.items()
-    ]
-    names = ("kind", "cfa", "black_level", "white_level", "shape", "dtype")
-    stated = {name: getattr(groups[0].stated, name) for name in names} if groups else {}
-    return {
-        "command": f"rgbmidic-calibrate {command}",
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "version": rgbmidic.__version__,
-        "stated": {name: value for name, value in stated.items() if value is not None},
-        "inputs": inputs,
-        **details,
-    }
 
 
 Images = tuple[FloatImage, ...]

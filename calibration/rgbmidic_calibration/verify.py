@@ -60,7 +60,7 @@ class Limits:
     noise: float = 10.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class CheckItem:
     """One line of the verdict: a figure, its uncertainty and its limit, all in `unit`."""
 
@@ -100,14 +100,9 @@ class Leakage:
 
     def items(self, limit: float) -> list[CheckItem]:
         """One line per pair of lights."""
+        mean, std = 100 * self.mean, 100 * self.std
         return [
-            CheckItem(
-                name=f"{alone} left in {light}",
-                value=100 * float(self.mean[row, column]),
-                std=100 * float(self.std[row, column]),
-                limit=limit,
-                unit="%",
-            )
+            CheckItem(f"{alone} left in {light}", float(mean[row, column]), float(std[row, column]), limit, "%")
             for column, alone in enumerate(self.alone)
             for row, light in enumerate(self.lights)
             if light != alone
@@ -204,19 +199,10 @@ class Additivity:
     def items(self, limits: Limits) -> list[CheckItem]:
         """Lines of the verdict."""
         together = "+".join(self.lights)
-        items = [
-            CheckItem(name=f"{together} not the sum", value=100 * self.left, std=0.0, limit=limits.additivity, unit="%")
-        ]
-        for name, change, std in zip(self.lights, self.change, self.change_std, strict=True):
-            items.append(
-                CheckItem(
-                    name=f"strength of {name} in {together}",
-                    value=100 * float(change),
-                    std=100 * float(std),
-                    limit=limits.strength,
-                    unit="%",
-                )
-            )
+        items = [CheckItem(f"{together} not the sum", 100 * self.left, 0.0, limits.additivity, "%")]
+        for name, *figure in zip(self.lights, self.change.tolist(), self.change_std.tolist(), strict=True):
+            change, std = (100 * value for value in figure)
+            items.append(CheckItem(f"strength of {name} in {together}", change, std, limits.strength, "%"))
         return items
 
 
@@ -334,14 +320,9 @@ def registration_left(
     # The first of the captured lights need not be the calibration's first.
     left = np.linalg.norm(found.displacement(grid) - (known - known[0]), axis=2)
     std = found.displacement_std(grid)
-    places = left.argmax(axis=1)
-    errors = (
-        np.zeros(len(left)) if std is None else [float(np.linalg.norm(s[p])) for s, p in zip(std, places, strict=True)]
-    )
-    return [
-        (name, float(value.max()), float(error))
-        for name, value, error in list(zip(ordered, left, errors, strict=True))[1:]
-    ]
+    errors = np.zeros_like(left) if std is None else np.linalg.norm(std, axis=2)
+    worst = [(float(row.max()), float(error[row.argmax()])) for row, error in zip(left, errors, strict=True)]
+    return [(name, *figures) for name, figures in list(zip(ordered, worst, strict=True))[1:]]
 
 
 def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
