@@ -93,9 +93,8 @@ def check_calibration(
         if calibration.registration is None:
             raise CalibrationError("the calibration has no registration section")
         left = registration_left(calibration.registration, stacks, dark, region=region)
-        return [
-            CheckItem(f"registration of {light}", *figure, "px") for light, *figure in left
-        ]
+        limit = limits.registration
+        return [CheckItem(f"registration of {name}", value, std, limit, "px") for name, value, std in left]
 
     for check in (noise, registration):
         try:
