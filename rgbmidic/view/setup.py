@@ -125,8 +125,8 @@ class SetupPage:
         picture = self.pictures.get(chosen, raw)
         field, ends = None, (0.0, 1.0)
         if chosen == _EXPECTED and self.inspection is not None:
-            ends = colour_range(self.inspection.std[np.isfinite(self.inspection.std)])
-            field = (self.inspection.nodes, self.inspection.elements, self.inspection.std)
+            mesh, std = self.inspection.mesh, self.inspection.prediction.std
+            ends, field = colour_range(std[np.isfinite(std)]), (mesh.nodes, mesh.elements, std)
         colours, window = palette("plasma"), self.canvas.window
         image = paint(window, picture, field, ends, colours, opacity=0.8, around=AROUND[self.dark])
         if self.parts.glare.active:
@@ -183,7 +183,7 @@ class SetupPage:
         self.pictures = pictures(found, self.source.shape)
         self.tiles.show(side_by_side(found, self.pictures, self.source.raw(index)[0]))
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
-        known = found.std[np.isfinite(found.std)]
+        known = found.prediction.std[np.isfinite(found.prediction.std)]
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
