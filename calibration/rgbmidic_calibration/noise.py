@@ -18,7 +18,7 @@ from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
 from rgbmidic_calibration.plausibility import fixed_pattern
 
-__all__ = ["NoiseEstimate", "TransferCurve", "photon_transfer"]
+__all__ = ["NoiseEstimate", "photon_transfer"]
 
 
 HIGHEST = 0.9
@@ -47,43 +47,27 @@ LINEARITY_WARNING = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TransferCurve:
-    """Photon transfer curve of one plane, for a picture: one point per exposure.
-
-    Attributes
-    ----------
-    mean, variance : ndarray, shape (E,)
-        Mean above dark (DN) and variance (DN squared); the first exposure is dark.
-    scatter : float
-        Scatter of the blocks' variances about the line over what noise alone explains.
-    bend : float
-        Largest relative departure of an exposure's mean variance from the line, beyond its noise.
-    """
-
-    mean: FloatArray
-    variance: FloatArray
-    scatter: float
-    bend: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseEstimate:
-    """Result of `photon_transfer`: the figures, the curve of every plane, and what the user should know."""
+    """Result of `photon_transfer`: the figures, and what the user should know."""
 
     camera_noise: CameraNoise
-    curves: tuple[TransferCurve, ...]
-    exposures: tuple[float | None, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """Line of variance over mean of one plane."""
+    """Photon transfer line of one plane: variance over mean.
+
+    `reach` is the mean of the brightest exposure above dark (DN), `scatter` that of the tiles' variances about the line
+    over what noise alone explains, `bend` the largest relative departure of an exposure's mean beyond its noise.
+    """
 
     read_variance: float
     slope: float
     covariance: FloatArray  # (2, 2)
-    curve: TransferCurve
+    reach: float
+    scatter: float
+    bend: float
 
 
 def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> NoiseEstimate:
@@ -105,17 +89,18 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
     """
     same_camera([dark, *flats])
     _check(dark, flats)
-    planes = range(len(dark.names))
-    lines = [_fit_line(dark, flats, plane) for plane in planes]
-    black = _black_level(dark)
+    lines = [_fit_line(dark, flats, plane) for plane in range(len(dark.names))]
+    drift = dark.strength.var(axis=0, ddof=1)
+    rest = np.array([variance.mean(dtype=np.float64) / variance.size for variance in dark.variance])
+    black = Quantity(dark.black + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count))
     saturation, warnings = _saturation(dark, flats, lines, black)
     pattern = fixed_pattern(dark, flats, saturation)
-    read = np.sqrt([line.read_variance for line in lines])
-    gain = np.array([1 / line.slope for line in lines])
+    read, gain = np.sqrt([line.read_variance for line in lines]), np.array([1 / line.slope for line in lines])
+    read_std, slope_std = np.sqrt([np.diag(line.covariance) for line in lines]).T
     noise = CameraNoise(
         planes=dark.names,
-        gain=Quantity(gain, gain**2 * np.array([np.sqrt(line.covariance[1, 1]) for line in lines])),
-        read_noise=Quantity(read, np.array([np.sqrt(line.covariance[0, 0]) for line in lines]) / (2 * read)),
+        gain=Quantity(gain, gain**2 * slope_std),
+        read_noise=Quantity(read, read_std / (2 * read)),
         black_level=black,
         saturation=saturation,
         linearity_error=_linearity(dark, flats, saturation.value),
@@ -123,14 +108,8 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         prnu=pattern.prnu,
         defects=pattern.defects,
     )
-    curves = tuple(line.curve for line in lines)
-    warnings += [*_warnings(dark, flats, noise, curves), *pattern.warnings]
-    return NoiseEstimate(
-        camera_noise=noise,
-        curves=curves,
-        exposures=tuple(flat.exposure for flat in flats),
-        warnings=tuple(warnings),
-    )
+    warnings += [*_warnings(dark, flats, noise, lines), *pattern.warnings]
+    return NoiseEstimate(camera_noise=noise, warnings=tuple(warnings))
 
 
 def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
@@ -165,10 +144,9 @@ def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -
         good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < HIGHEST * range_)
         variance = tile_means(flat.variance[plane])
         points.append((np.where(good, mean, np.nan), variance, flat.count))
-    exposure = np.concatenate([np.full(len(m), i) for i, (m, _, _) in enumerate(points)])
-    mean = np.concatenate([m for m, _, _ in points])
-    variance = np.concatenate([v for _, v, _ in points])
-    freedom = np.concatenate([np.full(len(m), TILE**2 * (n - 1)) for m, _, n in points])
+    mean, variance = (np.concatenate(values) for values in list(zip(*points, strict=True))[:2])
+    exposure = np.repeat(np.arange(float(len(points))), len(level))
+    freedom = np.repeat([TILE**2 * (count - 1) for *_, count in points], len(level))
     used = np.isfinite(mean)
     if not (used & (exposure > 0)).any():
         raise CalibrationError(
@@ -201,19 +179,14 @@ def _weighted_line(mean: FloatArray, variance: FloatArray, freedom: FloatArray, 
             "averaged or noise-reduced frames cannot be calibrated)"
         )
     noise = scatter * np.sqrt([2 / freedom[exposure == g].sum() for g in groups])
-    curve = TransferCurve(
-        mean=means[0],
-        variance=means[1],
+    return _Line(
+        read_variance=max(float(solution[0]), 1e-12),
+        slope=float(solution[1]),
+        covariance=inverse @ (score.T @ score) @ inverse,
+        reach=float(means[0].max()),
         scatter=scatter,
         bend=float(np.maximum(np.abs(means[1] / means[2] - 1) - BEND_SIGNIFICANCE * noise, 0).max()),
     )
-    return _Line(max(float(solution[0]), 1e-12), float(solution[1]), inverse @ (score.T @ score) @ inverse, curve)
-
-
-def _black_level(dark: TemporalStack) -> Quantity:
-    drift = dark.strength.var(axis=0, ddof=1)
-    noise = np.array([variance.mean(dtype=np.float64) / variance.size for variance in dark.variance])
-    return Quantity(dark.black + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, noise) / dark.count))
 
 
 def _saturation(
@@ -269,7 +242,7 @@ def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: 
 
 
 def _warnings(
-    dark: TemporalStack, flats: Sequence[TemporalStack], noise: CameraNoise, curves: Sequence[TransferCurve]
+    dark: TemporalStack, flats: Sequence[TemporalStack], noise: CameraNoise, lines: Sequence[_Line]
 ) -> list[str]:
     warnings = []
     if dark.zeros > ZEROS_WARNING:
@@ -280,16 +253,16 @@ def _warnings(
     drift = max(flat.drift for flat in flats)
     if drift > DRIFT_WARNING:
         warnings.append(f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out")
-    reach = max(float(curve.mean.max()) for curve in curves)
+    reach = max(line.reach for line in lines)
     if reach < RANGE_WARNING * (dark.white - float(dark.black.min())):
         warnings.append(
             f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
         )
-    for name, curve in zip(dark.names, curves, strict=True):
-        if curve.scatter > SCATTER_WARNING or curve.bend > CURVE_WARNING:
+    for name, line in zip(dark.names, lines, strict=True):
+        if line.scatter > SCATTER_WARNING or line.bend > CURVE_WARNING:
             warnings.append(
-                f"plane {name}: the variance does not follow a line (departs by {100 * curve.bend:.1f} %, scatters "
-                f"{curve.scatter:.1f} times as much as noise): did the target move, or the lamp "
+                f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
+                f"{line.scatter:.1f} times as much as noise): did the target move, or the lamp "
                 "flicker, between frames?"
             )
     linearity = noise.linearity_error.value

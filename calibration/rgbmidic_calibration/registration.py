@@ -109,40 +109,32 @@ def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Fl
     CalibrationError
         No plane has enough signal.
     """
-    height, width = stack.shape
-    picture = np.full((height, width), np.nan, dtype=np.float32)
-    used = np.zeros((height, width), dtype=np.float32)
-    planes = []
-    for plane in range(len(stack.names)):
-        signal = stack.mean[plane] - (0 if dark is None else dark.mean[plane])
-        level = float(signal.mean(dtype=np.float64))
-        planes.append((level, plane, signal))
-    brightest = max(level for level, *_ in planes)
-    if brightest < 0.005 * (stack.white - float(stack.black.min())):
-        raise CalibrationError(f"the light gives {brightest:.1f} DN above dark only: was the lamp on?")
+    signals = [mean - (0 if dark is None else dark.mean[plane]) for plane, mean in enumerate(stack.mean)]
+    levels = [float(signal.mean(dtype=np.float64)) for signal in signals]
+    if max(levels) < 0.005 * (stack.white - float(stack.black.min())):
+        raise CalibrationError(f"the light gives {max(levels):.1f} DN above dark only: was the lamp on?")
     if stack.step == 1:
-        _, plane, signal = max(planes, key=lambda entry: entry[0])
-        return _relative(signal, stack.clipped[plane], LOCAL)
-    for level, plane, signal in planes:
-        if not _clear(stack, dark, plane, level, brightest):
-            continue
-        row, column = stack.origins[plane]
-        place = (slice(row, 2 * signal.shape[0], 2), slice(column, 2 * signal.shape[1], 2))
-        picture[place] = _relative(signal, stack.clipped[plane], LOCAL / 2)
-        used[place] = 1
+        brightest = int(np.argmax(levels))
+        return _relative(signals[brightest], stack.clipped[brightest], LOCAL)
+    picture, used = np.full(stack.shape, np.nan, dtype=np.float32), np.zeros(stack.shape, dtype=np.float32)
+    for plane, (signal, (row, column)) in enumerate(zip(signals, stack.origins, strict=True)):
+        if _clear(stack, dark, plane, levels):
+            place = (slice(row, 2 * signal.shape[0], 2), slice(column, 2 * signal.shape[1], 2))
+            picture[place] = _relative(signal, stack.clipped[plane], LOCAL / 2)
+            used[place] = 1
     if not used.any():
         raise CalibrationError("no colour plane stands out of its noise: do all captures show the same scene at rest?")
     return _filled(picture, used)
 
 
-def _clear(stack: TemporalStack, dark: TemporalStack | None, plane: int, level: float, brightest: float) -> bool:
+def _clear(stack: TemporalStack, dark: TemporalStack | None, plane: int, levels: Sequence[float]) -> bool:
     """Whether a plane exceeds its noise by `CLEAR`; of a single frame, a tenth of the brightest plane."""
-    if level < 0.1 * brightest and stack.count < 2:
+    if levels[plane] < 0.1 * max(levels) and stack.count < 2:
         return False
     noise = float(stack.variance[plane].mean(dtype=np.float64)) / stack.count
     if dark is not None and dark.count > 1:
         noise += float(dark.variance[plane].mean(dtype=np.float64)) / dark.count
-    return level > CLEAR * float(np.sqrt(noise))
+    return levels[plane] > CLEAR * float(np.sqrt(noise))
 
 
 def _relative(signal: npt.NDArray[np.floating], clipped: BoolArray, sigma: float) -> FloatImage:

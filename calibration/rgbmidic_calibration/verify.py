@@ -88,15 +88,12 @@ class Leakage:
         Lights that were captured alone.
     mean, std : ndarray, shape (k, m)
         Ratio of the sums over the field, and its standard uncertainty; the light itself gives 1.
-    local : ndarray, shape (k, m)
-        Root mean square over the blocks of the ratio to the light's mean.
     """
 
     lights: tuple[str, ...]
     alone: tuple[str, ...]
     mean: FloatArray
     std: FloatArray
-    local: FloatArray
 
     def items(self, limit: float) -> list[CheckItem]:
         """One line per pair of lights."""
@@ -134,14 +131,14 @@ def leakage(
         )
     level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
     columns = [_unmixed(crosstalk, name, captures, level) for name, captures in lights.items()]
-    mean, std, local = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
-    return Leakage(lights=crosstalk.lights, alone=tuple(lights), mean=mean, std=std, local=local)
+    mean, std = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
+    return Leakage(lights=crosstalk.lights, alone=tuple(lights), mean=mean, std=std)
 
 
 def _unmixed(
     crosstalk: Crosstalk, name: str, captures: Sequence[BlockMeans], level: npt.NDArray[np.floating] | np.float64
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Ratios (k,) of every light's sum to that of light `name`, their uncertainty and their local spread."""
+) -> tuple[FloatArray, FloatArray]:
+    """Ratios (k,) of every light's sum to that of light `name`, and their uncertainty."""
     first = captures[0]
     clear = ~np.any([frame.saturated for frame in captures], axis=0)
     if clear.sum() < 4:
@@ -159,9 +156,7 @@ def _unmixed(
         )
     ratio = values.sum(axis=1) / total
     scatter = values - ratio[:, None] * values[lit]
-    std = np.sqrt((scatter**2).sum(axis=1)) / total
-    local = np.sqrt(((values / values[lit].mean()) ** 2).mean(axis=1))
-    return ratio, std, local
+    return ratio, np.sqrt((scatter**2).sum(axis=1)) / total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,8 +177,6 @@ class Additivity:
         Relative change of every light's strength between its own and the common capture.
     left : float
         Rms over tiles of what remains, as a fraction of the mean signal, noise taken out.
-    signal : float
-        Mean of the sum, DN.
     """
 
     lights: tuple[str, ...]
@@ -194,7 +187,6 @@ class Additivity:
     change: FloatArray
     change_std: FloatArray
     left: float
-    signal: float
 
     def items(self, limits: Limits) -> list[CheckItem]:
         """Lines of the verdict."""
@@ -254,7 +246,6 @@ def additivity(
         change=solution[1:],
         change_std=std[1:],
         left=float(np.sqrt(left)) / max(signal, 1e-9),
-        signal=signal,
     )
 
 
