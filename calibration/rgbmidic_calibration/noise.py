@@ -89,16 +89,18 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
     """
     same_camera([dark, *flats])
     _check(dark, flats)
-    lines = [_fit_line(dark, flats, plane) for plane in range(len(dark.names))]
+    lines = [_fit_line(dark, flats, plane) for plane in range(len(dark.camera.names))]
     drift = dark.strength.var(axis=0, ddof=1)
     rest = np.array([variance.mean(dtype=np.float64) / variance.size for variance in dark.variance])
-    black = Quantity(dark.black + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count))
+    black = Quantity(
+        np.array(dark.camera.black) + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count)
+    )
     saturation, warnings = _saturation(dark, flats, lines, black)
     pattern = fixed_pattern(dark, flats, saturation)
     read, gain = np.sqrt([line.read_variance for line in lines]), np.array([1 / line.slope for line in lines])
     read_std, slope_std = np.sqrt([np.diag(line.covariance) for line in lines]).T
     noise = CameraNoise(
-        planes=dark.names,
+        planes=dark.camera.names,
         gain=Quantity(gain, gain**2 * slope_std),
         read_noise=Quantity(read, read_std / (2 * read)),
         black_level=black,
@@ -127,7 +129,7 @@ def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
         if flat.piled_at is not None:
             raise CalibrationError(
                 f"flat exposure {index + 1}: samples pile up at {flat.piled_at:.0f} DN, below the stated white level "
-                f"{flat.white:g}: the camera saturates there; state --white-level {flat.piled_at:.0f}"
+                f"{flat.camera.white:g}: the camera saturates there; state --white-level {flat.piled_at:.0f}"
             )
     brightest = max(float(flat.strength.mean(axis=0).max()) for flat in flats)
     if float(dark.strength.mean(axis=0).max()) > 0.5 * brightest:
@@ -137,7 +139,7 @@ def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
 def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -> _Line:
     """Line of variance over mean through the blocks of all exposures, weighted by the variance of a variance."""
     level = tile_means(dark.mean[plane])
-    range_ = dark.white - float(dark.black[plane])
+    range_ = dark.camera.white - dark.camera.black[plane]
     points = [(np.zeros_like(level), tile_means(dark.variance[plane]), dark.count)]
     for flat in flats:
         mean = tile_means(flat.mean[plane]) - level
@@ -150,11 +152,11 @@ def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -
     used = np.isfinite(mean)
     if not (used & (exposure > 0)).any():
         raise CalibrationError(
-            f"plane {dark.names[plane]}: every block of every flat exposure is saturated or nearly so; "
+            f"plane {dark.camera.names[plane]}: every block of every flat exposure is saturated or nearly so; "
             "shorten the exposure"
         )
     if mean[used].max() <= 0:
-        raise CalibrationError(f"plane {dark.names[plane]}: the flat frames are not brighter than the dark ones")
+        raise CalibrationError(f"plane {dark.camera.names[plane]}: the flat frames are not brighter than the dark ones")
     return _weighted_line(mean[used], variance[used], freedom[used], exposure[used])
 
 
@@ -193,13 +195,13 @@ def _saturation(
     dark: TemporalStack, flats: Sequence[TemporalStack], lines: Sequence[_Line], black: Quantity
 ) -> tuple[Quantity, list[str]]:
     """Where samples saturate: the white level, or the lower level at which the variance breaks down."""
-    level = dark.white - black.value
+    level = dark.camera.white - black.value
     std = np.hypot(black.std, 0.5)
     warnings = []
     for plane, line in enumerate(lines):
         if (knee := _knee(dark, flats, plane, line)) is not None and knee < 0.95 * level[plane]:
             warnings.append(
-                f"plane {dark.names[plane]}: the variance breaks down at {knee:.0f} DN above black, below "
+                f"plane {dark.camera.names[plane]}: the variance breaks down at {knee:.0f} DN above black, below "
                 f"the white level: the sensor saturates there (white_level {knee + black.value[plane]:.0f} in the test)"
             )
             level[plane], std[plane] = knee, 0.05 * knee
@@ -215,7 +217,7 @@ def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line:
         free = tile_means(flat.clipped[plane]) == 0
         ratio = tile_means(flat.variance[plane]) / (line.read_variance + line.slope * np.maximum(mean, 0))
         noise = np.sqrt(2 / (TILE**2 * (flat.count - 1)))
-        broken = free & (ratio < KNEE - 3 * noise) & (mean > 0.3 * (dark.white - dark.black[plane]))
+        broken = free & (ratio < KNEE - 3 * noise) & (mean > 0.3 * (dark.camera.white - dark.camera.black[plane]))
         if broken.sum() > 0.02 * len(mean):
             knee = float(np.median(mean[broken]))
             lowest = knee if lowest is None else min(lowest, knee)
@@ -224,7 +226,7 @@ def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line:
 
 def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: FloatArray) -> Quantity:
     """EMVA 1288 LE: mean relative deviation in % from the line through mean against exposure time, 5 to 95 %."""
-    planes = len(dark.names)
+    planes = len(dark.camera.names)
     known = [flat for flat in flats if flat.exposure is not None]
     time = np.array([flat.exposure for flat in known], dtype=np.float64)
     error, std = np.full(planes, np.nan), np.full(planes, np.nan)
@@ -254,11 +256,11 @@ def _warnings(
     if drift > DRIFT_WARNING:
         warnings.append(f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out")
     reach = max(line.reach for line in lines)
-    if reach < RANGE_WARNING * (dark.white - float(dark.black.min())):
+    if reach < RANGE_WARNING * (dark.camera.white - min(dark.camera.black)):
         warnings.append(
             f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
         )
-    for name, line in zip(dark.names, lines, strict=True):
+    for name, line in zip(dark.camera.names, lines, strict=True):
         if line.scatter > SCATTER_WARNING or line.bend > CURVE_WARNING:
             warnings.append(
                 f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
@@ -269,7 +271,7 @@ def _warnings(
     if (linearity > LINEARITY_WARNING).any():
         worst = int(np.nanargmax(linearity))
         warnings.append(
-            f"plane {dark.names[worst]}: the linearity error is {linearity[worst]:.2f} %, the limit is "
+            f"plane {dark.camera.names[worst]}: the linearity error is {linearity[worst]:.2f} %, the limit is "
             f"{LINEARITY_WARNING:g} %: are the exposure times those of the frames, was the lamp steady? Unmixing "
             "needs a linear camera"
         )

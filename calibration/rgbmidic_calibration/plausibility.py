@@ -251,9 +251,9 @@ def fixed_pattern(dark: TemporalStack, flats: Sequence[TemporalStack], saturatio
     The variance of the temporal noise that remains in a mean over n frames, its n-th part, is taken out.
     """
     dsnu, prnu, defects, textured = [], [], [], []
-    for plane, name in enumerate(dark.names):
+    for plane, name in enumerate(dark.camera.names):
         excess = dark.mean[plane] - ndimage.median_filter(dark.mean[plane], 5)
-        floor = HOT_FRACTION * (dark.white - float(dark.black[plane]))
+        floor = HOT_FRACTION * (dark.camera.white - dark.camera.black[plane])
         hot = excess > max(HOT * float(np.median(np.abs(excess))) / 0.6745, floor)
         dsnu.append(_spread(dark.mean[plane], dark.variance[plane] / dark.count, ~hot))
         flat = min(flats, key=lambda f: abs(float(f.strength[:, plane].mean()) - saturation.value[plane] / 2))
@@ -262,9 +262,9 @@ def fixed_pattern(dark: TemporalStack, flats: Sequence[TemporalStack], saturatio
             textured.append(f"{name} {100 * response[0]:.0f} %")
             response, dead = (np.nan, np.nan), np.zeros_like(hot)
         prnu.append((100 * response[0], 100 * response[1]))
-        row, column = dark.origins[plane]
+        row, column = dark.camera.origins[plane]
         defects += [
-            (int(r) * dark.step + row, int(c) * dark.step + column, kind)
+            (int(r) * dark.camera.step + row, int(c) * dark.camera.step + column, kind)
             for kind, marked in (("hot", hot), ("dead", dead & ~hot))
             for r, c in np.argwhere(marked)
         ]
@@ -287,9 +287,9 @@ def _response(
     signal = flat.mean[plane] - dark.mean[plane]
     around = ndimage.median_filter(signal, 5)
     usable = ~hot & ~flat.clipped[plane]
-    dead = usable & (signal < DEAD_FRACTION * around) & (around > 0.02 * (flat.white - flat.black[plane]))
+    dead = usable & (signal < DEAD_FRACTION * around) & (around > 0.02 * (flat.camera.white - flat.camera.black[plane]))
     level = float(signal[usable].mean()) if usable.any() else 0.0
-    if level < 0.02 * (flat.white - float(flat.black[plane])):
+    if level < 0.02 * (flat.camera.white - flat.camera.black[plane]):
         return (np.nan, np.nan), np.zeros_like(dead)
     temporal = flat.variance[plane] / flat.count + dark.variance[plane] / dark.count
     local = np.maximum(ndimage.uniform_filter(signal, 4 * WINDOW), 1e-3 * level)

@@ -222,7 +222,7 @@ def additivity(
         Camera noise; None: from the captures where each group has two or more, else rounding to grey levels alone.
     """
     same_camera([together, *singles.values(), *([dark] if dark else [])])
-    images = [_difference(together, singles, dark, plane, noise) for plane in range(len(together.names))]
+    images = [_difference(together, singles, dark, plane, noise) for plane in range(len(together.camera.names))]
     samples = np.concatenate([image[:, np.isfinite(image[0])] for image in images], axis=1)
     if samples.shape[1] < TILE**2:
         raise CalibrationError("nearly every sample is saturated in one of the captures; shorten the exposure")
@@ -304,7 +304,7 @@ def registration_left(
     """
     ordered = {name: lights[name] for name in registration.lights if name in lights}
     found = estimate_registration(ordered, dark, region=region).registration
-    height, width = next(iter(ordered.values())).shape
+    height, width = next(iter(ordered.values())).camera.shape
     x0, y0, x1, y1 = region if region is not None else (0, 0, width - 1, height - 1)
     grid = np.stack(np.meshgrid(np.linspace(x0, x1, 9), np.linspace(y0, y1, 9)), axis=-1).reshape(-1, 2)
     known = registration.displacement(grid)[[registration.lights.index(name) for name in ordered]]
