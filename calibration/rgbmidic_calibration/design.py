@@ -318,7 +318,11 @@ def _draw_registration(axes: Axes, registration: Registration) -> None:
     moved = registration.displacement(points)
     largest = max(float(np.abs(moved).max()), 1e-6)
     for index, name in enumerate(registration.lights[1:], start=1):
-        look: dict[str, Any] = {"color": COLOURS[index % len(COLOURS)], "label": literal(name), "scale": 10 * largest / radius}
+        look: dict[str, Any] = {
+            "color": COLOURS[index % len(COLOURS)],
+            "label": literal(name),
+            "scale": 10 * largest / radius,
+        }
         axes.quiver(*points.T, *moved[index].T, angles="xy", scale_units="xy", **look)
     title = f"seen elsewhere than by {literal(registration.lights[0])}, up to {largest:.2f} px"
     axes.set(xlabel="x, px", ylabel="y, px", title=title)

@@ -35,24 +35,9 @@ Say = Callable[[str], None]
 
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
-[body]
-kind = "sphere"
-
-[[lights]]
-name = "red"
-position = [-190.0, -12.0, 90.0]
-
-[[lights]]
-name = "green"
-position = [200.0, 15.0, 90.0]
-
-[[lights]]
-name = "blue"
-position = [10.0, -220.0, 60.0]
-
+# Body, paint, lamps and camera are those that stand in where a scene states none (docs/planning.md).
 [camera]
 shape = [{size}, {size}]
-crosstalk = [[1.0, 0.10, 0.02], [0.14, 1.0, 0.16], [0.03, 0.12, 1.0]]
 
 [output]
 seed = 2026

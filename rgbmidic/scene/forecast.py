@@ -140,17 +140,14 @@ class Forecast:
         change when a reflection moves.
     weight_fraction : ndarray, shape (k, ...)
         Fraction of the information about the displacement that each light gives.
-    residual : ndarray, shape (k, ...)
-        Standard deviation of the residual of each light, in units of its local mean.
     """
 
     std: FloatArray
     bias: FloatArray
     weight_fraction: FloatArray
-    residual: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Energies:
     """Variance, of a pixel or of the right-hand side, that image errors of unit strength add.
 
@@ -242,13 +239,7 @@ class Instrument:
 
         def energies(measure: Callable[[FloatArray], FloatArray], contrast: float) -> Energies:
             erratic, dome = measure(spectrum.optics), measure(spectrum.slope * relief[1, 1])
-            return Energies(
-                noise=measure(noise),
-                mosaic=measure(mosaic),
-                erratic=float(erratic),
-                dome=float(dome),
-                contrast=contrast,
-            )
+            return Energies(measure(noise), measure(mosaic), float(erratic), float(dome), contrast)
 
         return cls(
             scene=scene,
@@ -291,7 +282,6 @@ class Instrument:
             std=np.where(sees, std, np.nan),
             bias=np.where(sees, bias, np.nan),
             weight_fraction=np.where(sees, fraction, 0.0),
-            residual=np.where(seen, np.sqrt(np.where(seen, residual, 0.0)), np.nan),
         )
 
     def weights(self, before: Zones, after: Zones, *, known: bool = True) -> FloatImage:

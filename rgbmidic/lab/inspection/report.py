@@ -11,9 +11,9 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import check_folder, number_or_none, write_document
+from rgbmidic.lab import check_folder, number_or_none, write_findings
 from rgbmidic.lab.inspection import Inspection, Spread
-from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, save_figure
+from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -46,8 +46,7 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
         An inspection is already there, or the folder cannot be written.
     """
     check_folder(out, FILES, overwrite=overwrite)
-    write_document(inspection_document(inspection), out / "inspection.json")
-    save_figure(inspection_figure(inspection), out / "inspection.png")
+    write_findings(out, "inspection", inspection_document(inspection), inspection_figure(inspection))
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:

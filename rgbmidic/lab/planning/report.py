@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rgbmidic._version import __version__
-from rgbmidic.lab import check_folder, number_or_none, write_document
+from rgbmidic.lab import check_folder, number_or_none, write_findings
 from rgbmidic.lab.planning.plan import Outlook, Plan, Proposal
-from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal, save_figure
+from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
 from rgbmidic.scene.camera import Light
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS
@@ -58,27 +59,26 @@ def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwri
         A plan is already there, or the folder cannot be written.
     """
     check_folder(out, FILES, overwrite=overwrite)
-    write_document(plan_document(plan, proposals), out / "plan.json")
-    save_figure(plan_figure(plan, proposals), out / "plan.png")
+    write_findings(out, "plan", plan_document(plan, proposals), plan_figure(plan, proposals))
 
 
 def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per state: field fractions where each light reflects, all do, one or none is clean."""
-    names = [light.name for light in plan.scene.lights]
     rows = []
-    for label, one in _labelled(plan):
-        fractions = [one["reflecting"][name] for name in names]
-        fractions += [one[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
-        rows.append([label, f"{one['largest_motion_px']:.1f}", *(f"{fraction:.1%}" for fraction in fractions)])
+    for label, state in _labelled(plan):
+        fractions = [*state["reflecting"].values()]
+        fractions += [state[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
+        rows.append([label, f"{state['largest_motion_px']:.1f}", *(f"{fraction:.1%}" for fraction in fractions)])
+    names = [light.name for light in plan.scene.lights]
     return ["state", "motion, px", *names, "all", "one", "none", "clipped"], rows
 
 
 def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per state: standard uncertainty over the field in px, and its parts."""
     rows = []
-    for label, one in _labelled(plan):
-        std = one["std_px"]
-        values = [std["median"], std["q95"], one["random_px"], one["feigned_by_domes_px"]]
+    for label, state in _labelled(plan):
+        std = state["std_px"]
+        values = [std["median"], std["q95"], state["random_px"], state["feigned_by_domes_px"]]
         rows.append([label, *("-" if value is None else f"{value:.4f}" for value in values)])
     return ["state", "median", "95 %", "random", "feigned"], rows
 
@@ -96,10 +96,10 @@ UNCERTAINTY_WORDS = {
 """What the headings of `uncertainty_rows` mean."""
 
 
-def _labelled(plan: Plan) -> list[tuple[str, dict[str, Any]]]:
-    states = [_state(plan, outlook) for outlook in plan.outlooks]
-    turned = [f": {one['angle_deg']:g} deg" if one["angle_deg"] else "" for one in states]
-    return [(f"{number}{label}", one) for number, (label, one) in enumerate(zip(turned, states, strict=True), start=1)]
+def _labelled(plan: Plan) -> Iterator[tuple[str, dict[str, Any]]]:
+    for number, outlook in enumerate(plan.outlooks, start=1):
+        state = _state(plan, outlook)
+        yield f"{number}: {state['angle_deg']:g} deg" if state["angle_deg"] else str(number), state
 
 
 def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
@@ -139,20 +139,10 @@ def _arrangement(plan: Plan) -> dict[str, Any]:
     lamps = []
     for light in plan.scene.lights:
         azimuth, inclination = _angles(plan.scene, light)
-        lamps.append(
-            {
-                "name": light.name,
-                "position_mm": list(light.position),
-                "azimuth_deg": azimuth,
-                "inclination_deg": inclination,
-                "power": light.power,
-            }
-        )
-    return {
-        "lights": lamps,
-        "std_px": number_or_none(plan.std),
-        "states": [_state(plan, outlook) for outlook in plan.outlooks],
-    }
+        lamp = {"name": light.name, "position_mm": list(light.position)}
+        lamps.append({**lamp, "azimuth_deg": azimuth, "inclination_deg": inclination, "power": light.power})
+    states = [_state(plan, outlook) for outlook in plan.outlooks]
+    return {"lights": lamps, "std_px": number_or_none(plan.std), "states": states}
 
 
 def _angles(scene: Scene, light: Light) -> tuple[float, float]:
@@ -206,7 +196,10 @@ def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
             _draw_zones(axes[0, column], one, outlook)
             turned = f": {outlook.state.angle_deg:g}°" if outlook.state.angle_deg else ""
             axes[0, column].set_title(literal(f"{title}{turned}"))
-            shown = _draw_std(axes[1, column], one, outlook, top)
+            axes[1, column].set_facecolor("0.85")
+            look = {"cmap": "magma", "vmin": 0, "vmax": top, "interpolation": "nearest"}
+            shown = axes[1, column].imshow(np.ma.masked_invalid(outlook.std), extent=_extent(one), **look)
+            _draw_field(axes[1, column], one)
         figure.colorbar(shown, ax=list(axes[1]), label="u_std (px)", extend="max", aspect=20, pad=0.02)
         lines = [Line2D([], [], color=colour) for colour in _colours(plan.scene)]
         lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
@@ -245,14 +238,6 @@ def _draw_zones(axis: Axes, plan: Plan, outlook: Outlook) -> None:
             if np.nanmin(fraction, initial=1.0) < REFLECTS < np.nanmax(fraction, initial=0.0):
                 axis.contour(plan.x, plan.y, fraction, [REFLECTS], colors=[colour], linestyles=style, linewidths=1)
     _draw_field(axis, plan)
-
-
-def _draw_std(axis: Axes, plan: Plan, outlook: Outlook, top: float) -> Any:
-    shown = np.ma.masked_invalid(outlook.std)
-    axis.set_facecolor("0.85")
-    picture = axis.imshow(shown, extent=_extent(plan), cmap="magma", vmin=0, vmax=top, interpolation="nearest")
-    _draw_field(axis, plan)
-    return picture
 
 
 def _draw_field(axis: Axes, plan: Plan) -> None:

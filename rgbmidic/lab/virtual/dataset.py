@@ -23,13 +23,12 @@ from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual.rendering import render
 from rgbmidic.scene.camera import Camera, Light, mosaic_samples
-from rgbmidic.scene.scene import DatasetSettings, Experiment, Plate, Scene, State, Target, read_scene
+from rgbmidic.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene
 from rgbmidic.scene.surface import Finish, Surface
 from rgbmidic.scene.zones import region_in_view, truth
 from rgbmidic.typing import FloatImage
 
 __all__ = [
-    "check_frames",
     "dark_frames",
     "flat_frames",
     "record",
@@ -37,7 +36,6 @@ __all__ = [
     "target_scene",
     "true_calibration",
     "write_dataset",
-    "write_experiment",
 ]
 
 Frame = Mosaic | ChannelFrame
@@ -78,15 +76,8 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
         The folder is not empty or cannot be written.
     """
     experiment, out = read_scene(scene_toml), Path(out)
-    test = write_experiment(experiment, out, progress)
-    shutil.copyfile(scene_toml, out / "scene.toml")
-    return test
-
-
-def write_experiment(experiment: Experiment, out: Path, progress: Progress | None = None) -> Path:
-    """Like `write_dataset`, from an experiment in memory."""
-    _check_output(experiment.scene, out)
     scene, settings = experiment.scene, experiment.output
+    _check_output(scene, out)
     states = (State(), *experiment.states)
     seeds = np.random.SeedSequence(settings.seed).spawn(5)
     frame_seeds = seeds[0].generate_state(len(states) * len(scene.lights)).reshape(len(states), -1)
@@ -108,6 +99,7 @@ def write_experiment(experiment: Experiment, out: Path, progress: Progress | Non
     y, x = np.indices(scene.camera.shape, dtype=float, sparse=True)
     region = settings.region or region_in_view(x, y, displacement, scene.camera.shape)
     test.write_text(_test_settings(scene, settings, region), encoding="utf-8")
+    shutil.copyfile(scene_toml, out / "scene.toml")
     return test
 
 
@@ -145,11 +137,14 @@ def _write_frame(folder: Path, index: int, frame: Frame, settings: DatasetSettin
 
 def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest: FloatImage, seeds: list[int]) -> None:
     count = settings.calibration_frames
-    captures = single_light_frames(scene, count=count, seed=seeds[0], target=settings.target)
-    groups = {f"light_{name}": frames for name, frames in captures.items()}
-    groups["dark"] = dark_frames(scene.camera, count=count, seed=seeds[1])
-    groups |= {f"flat_{i}": frames for i, frames in enumerate(flat_frames(scene, seed=seeds[2]), start=1)}
-    groups |= {f"check/{name}": frames for name, frames in check_frames(scene, at_rest, seed=seeds[3]).items()}
+    single = single_light_frames(scene, count=count, seed=seeds[0], target=settings.target)
+    flat, check = flat_frames(scene, seed=seeds[2]), _check_frames(scene, at_rest, seed=seeds[3])
+    groups = {
+        **{f"light_{name}": frames for name, frames in single.items()},
+        "dark": dark_frames(scene.camera, count=count, seed=seeds[1]),
+        **{f"flat_{number}": frames for number, frames in enumerate(flat, start=1)},
+        **{f"check/{name}": frames for name, frames in check.items()},
+    }
     for folder, frames in groups.items():
         for index, frame in enumerate(frames):
             _write_frame(out / folder, index, frame, settings)
@@ -251,20 +246,8 @@ def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]
     return taken
 
 
-def check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
-    """Frames of the specimen at rest: each light alone, all together ("all"), and "dark".
-
-    Parameters
-    ----------
-    scene
-        Its lights and camera.
-    images : ndarray, shape (k, H, W)
-        Images of each light alone.
-    count
-        Frames of each kind.
-    seed
-        Of the noise.
-    """
+def _check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
+    """Frames of the specimen at rest, `images` (k, H, W): each light alone, all together ("all"), and "dark"."""
     lit = {light.name: (light.name,) for light in scene.lights} | {"all": tuple(light.name for light in scene.lights)}
     steps = np.random.SeedSequence(seed).spawn(len(lit) + 1)
     frames = {"dark": dark_frames(scene.camera, count=count, seed=int(steps[-1].generate_state(1)[0]))}
