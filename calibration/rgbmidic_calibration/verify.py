@@ -17,16 +17,7 @@ from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile
 from rgbmidic_calibration.ratio import BlockMeans, block_centres
 from rgbmidic_calibration.registration import estimate_registration
 
-__all__ = [
-    "Additivity",
-    "CheckItem",
-    "Leakage",
-    "Limits",
-    "additivity",
-    "leakage",
-    "noise_ratio",
-    "registration_left",
-]
+__all__ = ["Additivity", "CheckItem", "Leakage", "Limits", "additivity", "leakage", "noise_ratio", "registration_left"]
 
 
 SAME_EXPOSURE = 0.05

@@ -43,17 +43,7 @@ from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "Energies",
-    "Forecast",
-    "Instrument",
-    "channel_mixing",
-    "expected_std",
-    "light_pull",
-    "node_constant",
-    "pixel_size",
-    "trace_change",
-]
+__all__ = ["Forecast", "Instrument", "expected_std", "light_pull", "node_constant", "pixel_size", "trace_change"]
 
 
 WRINKLE_AREA = 0.085
@@ -233,7 +223,7 @@ class Instrument:
         if camera.kind == "bayer":
             noise, mosaic = separation_spectra(scene, patch.texture, demosaic)
         else:
-            unmixing = np.linalg.pinv(channel_mixing(scene))
+            unmixing = np.linalg.pinv(_channel_mixing(scene))
             noise = np.einsum("jc,kc->cjk", unmixing, unmixing)[..., None, None]
             mosaic = np.zeros((3, *noise.shape[1:]))
 
@@ -352,7 +342,7 @@ class Instrument:
         """
         variance = self._reflections(self.score, before, after)
         variance += 2 * float(self.score.mosaic[:, light, light].sum())
-        mixing = channel_mixing(self.scene)
+        mixing = _channel_mixing(self.scene)
         others = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
         for zones in (before, after):
             for colour, factor in enumerate(self.score.noise[:, light, light]):
@@ -410,9 +400,9 @@ class Instrument:
 
     def saturated(self, zones: Zones) -> BoolArray:
         """Where white paint is expected to saturate a channel that the light needs, (k, ...)."""
-        channels = _channels(channel_mixing(self.scene), self.white_level(zones))
+        channels = _channels(_channel_mixing(self.scene), self.white_level(zones))
         full = channels > _SATURATED * self.scene.camera.full_scale
-        unmixing = np.abs(np.linalg.pinv(channel_mixing(self.scene)))
+        unmixing = np.abs(np.linalg.pinv(_channel_mixing(self.scene)))
         needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
         return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)
 
@@ -423,7 +413,7 @@ class Instrument:
 
     def _sample_variance(self, zones: Zones) -> FloatArray:
         """Noise variance (C, ...) of one sample of each colour at the mean grey level, DN squared."""
-        levels = _channels(channel_mixing(self.scene), zones.level)
+        levels = _channels(_channel_mixing(self.scene), zones.level)
         return np.asarray(self.scene.camera.noise.variance(levels) + QUANTISATION)
 
 
@@ -441,7 +431,7 @@ def pixel_size(scene: Scene) -> float:
     return scene.body.front[2] / scene.camera.focal_px
 
 
-def channel_mixing(scene: Scene) -> FloatArray:
+def _channel_mixing(scene: Scene) -> FloatArray:
     """Camera samples from lights, (C, k); before a monochrome camera every light has a frame of its own."""
     if scene.camera.kind == "monochrome":
         return np.eye(len(scene.lights))

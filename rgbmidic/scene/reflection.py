@@ -20,14 +20,7 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = [
-    "LIMIT_DEG",
-    "Reflectance",
-    "Reflection",
-    "angle_weights",
-    "reflection",
-    "surface_from_heights",
-]
+__all__ = ["LIMIT_DEG", "Reflectance", "Reflection", "angle_weights", "reflection", "surface_from_heights"]
 
 
 LIMIT_DEG = 15.0

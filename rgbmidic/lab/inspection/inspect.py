@@ -42,9 +42,7 @@ def inspect_files(
     calibration: Path | str | None = None,
     frame: FrameSettings | None = None,
     region: Sequence[float] | None = None,
-    element_size: float | None = None,
-    accept: Sequence[str] | None = None,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> Inspection:
     """Inspect one frame on disk, or the frames of one state of lights fired in succession.
 
@@ -58,12 +56,10 @@ def inspect_files(
         Calibration file; instead of the test's.
     frame
         What the file does not state (its `path` is not used); instead of the test's.
-    region, element_size
-        (x0, y0, x1, y1) and side of the elements in px; instead of the test's, else the whole frame and 25.
-    accept
-        As in `inspect_frame`; instead of the test's.
-    progress
-        As in `inspect_frame`.
+    region
+        (x0, y0, x1, y1) in px; instead of the test's, else the whole frame.
+    **options
+        As in `inspect_frame`; those that are stated and not None replace the test's.
 
     Raises
     ------
@@ -80,18 +76,13 @@ def inspect_files(
     place = Region.from_rectangle(region, shape) if region is not None else None
     if place is None and test is not None:
         place = read_region(test.region, shape)
+    how: dict[str, Any] = {"name": " + ".join(legible(path.name) for path in paths)}
+    if test is not None:
+        how |= {"element_size": test.element_size, "accept": test.accept}
+        how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
+    how |= {key: value for key, value in options.items() if value is not None}
     try:
-        return inspect_frame(
-            frames,
-            calibration=known,
-            region=place,
-            element_size=element_size or (test.element_size if test else ELEMENT_SIZE),
-            demosaic=test.illumination.demosaic if test else "auto",
-            prefilter=test.solver.prefilter if test else "binomial",
-            name=" + ".join(legible(path.name) for path in paths),
-            accept=accept if accept is not None else (test.accept if test else ()),
-            progress=progress,
-        )
+        return inspect_frame(frames, calibration=known, region=place, **how)
     except InputError as error:
         raise FrameError(f"{' + '.join(map(str, paths))}: {error}") from None
 

@@ -20,15 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "FILES",
-    "channel_rows",
-    "inspection_document",
-    "inspection_figure",
-    "light_rows",
-    "uncertainty_rows",
-    "write_inspection",
-]
+__all__ = ["FILES", "channel_rows", "inspection_document", "light_rows", "uncertainty_rows", "write_inspection"]
 
 FILES = ("inspection.json", "inspection.png")
 """What `write_inspection` writes."""
@@ -46,7 +38,7 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
         An inspection is already there, or the folder cannot be written.
     """
     check_folder(out, FILES, overwrite=overwrite)
-    write_findings(out, "inspection", inspection_document(inspection), inspection_figure(inspection))
+    write_findings(out, "inspection", inspection_document(inspection), _inspection_figure(inspection))
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
@@ -119,7 +111,7 @@ def _plain(summary: Any) -> dict[str, Any]:
     return {name: number_or_none(value) if isinstance(value, float) else value for name, value in values.items()}
 
 
-def inspection_figure(inspection: Inspection) -> Figure:
+def _inspection_figure(inspection: Inspection) -> Figure:
     """One page: lights, reflection index with its colour bar, then troubles, summary and predicted uncertainty."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
