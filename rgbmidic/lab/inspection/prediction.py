@@ -270,12 +270,12 @@ def _drawn_channels(model: Reconstruction, shape: tuple[int, ...], random: np.ra
     sparkle = TextureModel(weights=(1.0,), widths=(float(np.sqrt(2 * SPARKLE_VARIANCE)),))
     channels = np.repeat(gaussian_field(texture, shape, random)[None], 3, axis=0)
     # by the median around: variances are cut off at zero, so that a mean would be too large
-    typical = median_filter(factors.private - LEAST, size=(1, TYPICAL, TYPICAL), mode="reflect")
+    typical = median_filter(factors.specific - LEAST, size=(1, TYPICAL, TYPICAL), mode="reflect")
     deviation = np.sqrt(enlarged(np.maximum(typical, 0), BLOCK, shape))
     for channel in range(3):
         if deviation[channel].any():
             coarse, fine = (gaussian_field(kind, shape, random) for kind in (texture, sparkle))
-            specific = np.sqrt(texture.private) * coarse + np.sqrt(1 - texture.private) * fine
+            specific = np.sqrt(texture.specific) * coarse + np.sqrt(1 - texture.specific) * fine
             channels[channel] += deviation[channel] * specific
     mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
     return np.asarray(mean + enlarged(_settled(factors.slope, BLOCK), BLOCK, shape) * channels, dtype=np.float32)

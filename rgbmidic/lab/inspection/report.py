@@ -93,7 +93,7 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         and {
             "diameter_px": number_or_none(texture.diameter),
             "agreement_of_colours": texture.correlation,
-            "channel_specific_fraction": texture.private,
+            "channel_specific_fraction": texture.specific,
         },
         "reflects_from_index": REFLECTING,
         "channels": [_plain(channel) for channel in inspection.channels],

@@ -260,7 +260,7 @@ def _of_exposure(inspection: Inspection) -> Iterator[Finding]:
 
 def _of_speckle(inspection: Inspection) -> Iterator[Finding]:
     texture, size = inspection.texture, inspection.speckle_px
-    if texture is not None and (texture.private > 0.5 or texture.correlation < COLOURED):
+    if texture is not None and (texture.specific > 0.5 or texture.correlation < COLOURED):
         yield Finding(
             "coloured",
             f"the colours do not show one texture (agreement {texture.correlation:.2f}): a coloured specimen, or "
