@@ -55,7 +55,7 @@ class CaptureFiles:
     def find(
         cls, role: str, pattern: str, stated: FrameSettings, calibration: Calibration | None = None
     ) -> CaptureFiles:
-        """Files that a pattern or folder names; `stated` is what the user says of them (its path is not used).
+        """Files that a pattern or folder names; `stated` is what the user states of them (its path is not used).
 
         What neither the files nor the user state comes from the `calibration`, which must agree with both.
 

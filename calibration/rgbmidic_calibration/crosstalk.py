@@ -266,7 +266,7 @@ def check_matrix(fits: Sequence[LightFit], *, allow: Sequence[str]) -> list[str]
     Raises
     ------
     CalibrationError
-        A light is seen best by another channel than its name says, or two by the same, and that is not waived.
+        A light is seen best by another channel than its name states, or two by the same, and that is not waived.
     """
     lower = [fit.name.lower() for fit in fits]
     if all(name in (*COLOURS, "r", "g", "b") for name in lower):  # single letters count where all names are colours

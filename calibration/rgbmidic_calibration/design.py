@@ -124,7 +124,7 @@ def design(camera: Sensitivities, lamps: Mapping[str, Lamp]) -> Design:
     Raises
     ------
     CalibrationError
-        The camera cannot tell the lamps apart, or does not see one of them.
+        The camera cannot separate the lamps, or does not see one of them.
     """
     spectra = np.stack([lamp.power(camera.wavelengths) for lamp in lamps.values()], axis=1)
     response = camera.values @ spectra
@@ -141,7 +141,7 @@ def design(camera: Sensitivities, lamps: Mapping[str, Lamp]) -> Design:
 
 
 def best_sets(camera: Sensitivities, lamps: Mapping[str, Lamp], count: int = 3) -> list[Design]:
-    """All sets of `count` lamps that the camera can tell apart, those with the least noise first.
+    """All sets of `count` lamps that the camera can separate, those with the least noise first.
 
     Raises
     ------
@@ -154,10 +154,10 @@ def best_sets(camera: Sensitivities, lamps: Mapping[str, Lamp], count: int = 3) 
     for names in combinations(lamps, count):
         try:
             found.append(design(camera, {name: lamps[name] for name in names}))
-        except CalibrationError:  # a set that cannot be told apart is no candidate
+        except CalibrationError:  # a set that cannot be separated is no candidate
             continue
     if not found:
-        raise CalibrationError("the camera can tell no set of these lamps apart")
+        raise CalibrationError("the camera can separate no set of these lamps")
     return sorted(found, key=lambda candidate: candidate.noise)
 
 

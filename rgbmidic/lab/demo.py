@@ -31,8 +31,6 @@ from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["DemoRow", "run_demo"]
 
-Say = Callable[[str], None]
-
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
 # Body, paint, lamps and camera are those that stand in where a scene states none (docs/planning.md).
@@ -90,7 +88,7 @@ class DemoRow:
 
 def run_demo(
     out: Path,
-    say: Say,
+    report: Callable[[str], None],
     calibrate: Callable[[Path], None],
     progress: Callable[[int, int, str], None] | None = None,
     *,
@@ -103,7 +101,7 @@ def run_demo(
     ----------
     out
         Folder; it must be empty or not exist.
-    say
+    report
         Called with a line about each step.
     calibrate
         Called with the folder of the virtual test; writes calibration.json from the captures there.
@@ -132,16 +130,16 @@ def run_demo(
     out.mkdir(parents=True, exist_ok=True)
     states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
     scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")
-    say(f"1 of 5: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
+    report(f"1 of 5: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
     with kernels_compiled_meanwhile():
         settings_file = write_dataset(scene, test, progress)
         (test / "calibration.json").rename(test / "true_calibration.json")
-        say("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from the captures with one light at a time")
+        report("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from the captures with one light at a time")
         calibrate(test)
     settings = read_test(settings_file)
-    say(f"3 of 5: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")
+    report(f"3 of 5: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")
     result = measure(settings, out / "result", progress=progress)
-    say("4 of 5: the same with each colour alone, for comparison, some 5 s")
+    report("4 of 5: the same with each colour alone, for comparison, some 5 s")
     return _compare(settings, result)
 
 

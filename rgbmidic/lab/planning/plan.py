@@ -73,18 +73,17 @@ class Proposal:
 def propose_colours(plan: Plan) -> Proposal:
     """Return the present lamp directions with the colours exchanged for the best."""
     compared = _Compared.of(plan, _directions(plan.scene))
-    own = tuple(range(len(plan.scene.lights)))
-    return compared.proposal(plan, min(permutations(own), key=compared.cost), affordable=1.0)
+    orders = permutations(range(len(plan.scene.lights)))
+    return compared.proposal(plan, min(orders, key=compared.cost), affordable=1.0)
 
 
 def propose_lamps(plan: Plan) -> Proposal:
     """Return the best directions of a grid over azimuth and inclination, with the best colour for each."""
     present = _directions(plan.scene)
     compared = _Compared.of(plan, np.concatenate([present, _grid()]))
-    own = tuple(range(len(present)))
-    starts = sorted(permutations(own), key=compared.cost)[:2]
-    starts += [compared.greedy(order) for order in list(permutations(own))[:6]]
-    return compared.proposal(plan, min((compared.descend(start) for start in starts), key=compared.cost), _AFFORDABLE)
+    orders = list(permutations(range(len(present))))
+    guesses = sorted(orders, key=compared.cost)[:2] + [compared.greedy(order) for order in orders[:6]]
+    return compared.proposal(plan, min(map(compared.descend, guesses), key=compared.cost), _AFFORDABLE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,8 +168,8 @@ def _zones(scene: Scene, candidates: tuple[Light, ...], light: int, material: Fl
     camera = replace(scene.camera, crosstalk=None, sensitivities=None)
     alone = replace(scene, lights=(scene.lights[light],), camera=camera)
     zones = predict_zones(alone, state, material=material, lights=candidates)
-    own = scene.camera.response(scene.lights).max(axis=0)[light]
-    return replace(zones, irradiance=zones.irradiance * own)
+    response = scene.camera.response(scene.lights).max(axis=0)[light]
+    return replace(zones, irradiance=zones.irradiance * response)
 
 
 def _clear(instrument: Instrument, light: int, before: Zones, after: Zones, brightness: FloatArray) -> FloatArray:
