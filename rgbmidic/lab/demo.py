@@ -134,7 +134,7 @@ def run_demo(
     with kernels_compiled_meanwhile():
         settings_file = write_dataset(scene, test, progress)
         (test / "calibration.json").rename(test / "true_calibration.json")
-        report("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from the captures with one light at a time")
+        report("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from captures with one light at a time")
         calibrate(test)
     settings = read_test(settings_file)
     report(f"3 of 5: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")
