@@ -22,11 +22,12 @@ __all__ = ["NoiseEstimate", "photon_transfer"]
 
 
 HIGHEST = 0.9
-"""Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white. Chosen."""
+"""Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white.
+From .7 to .95 the gain of the virtual camera changes by .7 of its standard uncertainty at most."""
 
 KNEE = 0.8
-"""Variance over its prediction below which the sensor itself saturates before the white level does. Chosen: tiles must
-fall below it by three standard deviations as well."""
+"""Variance over its prediction below which the sensor itself saturates before the white level does: from .6 to .9 no
+figure of the virtual camera changes, since tiles must fall below it by three standard deviations as well."""
 
 DRIFT_LIMIT, DRIFT_WARNING = 0.2, 0.02
 """Drift of the lamp's strength within an exposure (`TemporalStack.drift`). Chosen: frames are scaled to one strength,

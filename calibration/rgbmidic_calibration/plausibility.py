@@ -224,15 +224,18 @@ WINDOW = 7
 """Side (samples of a plane) of the neighbourhood whose mean is taken out: shading and dirt are wider than this."""
 
 HOT = 8.0
-"""Robust standard deviations above the neighbourhood's median that make a pixel hot in the dark: chosen; of
-normal noise one sample in 1e15 lies there."""
+"""Robust standard deviations above the neighbourhood's median that make a pixel hot in the dark: of normal
+noise one sample in 1e15 lies there; from 6 to 10 the virtual camera has no false one."""
 HOT_FRACTION = 0.005
-"""Fraction of the full scale that a hot pixel exceeds its neighbourhood by at least: chosen."""
+"""Fraction of the full scale by which a hot pixel exceeds its neighbourhood at least: 20 DN of 12 bit, seven times the
+dark noise of the virtual camera, which has no false one from .002 to .01."""
 DEAD_FRACTION = 0.5
-"""Response relative to the neighbourhood's median below which a pixel is dead: chosen."""
+"""Response relative to the neighbourhood's median below which a pixel is dead: half, as far
+from a live pixel as from a black one; from .3 to .7 the virtual camera has no false one."""
 
 TEXTURED = 0.05
-"""Local variation of the response above which the target, not the sensor, is uneven: chosen."""
+"""Local variation of the response above which the target, not the sensor, is uneven: from .03 to .08 the
+virtual camera's white card is judged alike."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
