@@ -144,16 +144,13 @@ class Captures:
             if "+" not in names:
                 raise ConfigurationError(f"--together takes NAME+NAME=FILES, at least two lights, not {names}")
 
-        def found(kind: str, patterns: Mapping[str, str]) -> dict[str, CaptureFiles]:
-            return {
-                name: CaptureFiles.find(f"{kind} {name}".strip(), pattern, stated, calibration)
-                for name, pattern in patterns.items()
-            }
+        def found(role: str, pattern: str) -> CaptureFiles:
+            return CaptureFiles.find(role, pattern, stated, calibration)
 
         return cls(
-            lights=found("light", lights),
-            dark=found("dark", {"": dark})[""] if dark else None,
-            together=found("lights", together or {}),
+            lights={name: found(f"light {name}", pattern) for name, pattern in lights.items()},
+            dark=found("dark", dark) if dark else None,
+            together={names: found(f"lights {names}", pattern) for names, pattern in (together or {}).items()},
         )
 
     @property

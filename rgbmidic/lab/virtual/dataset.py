@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -141,7 +141,7 @@ def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest:
     flat, check = flat_frames(scene, seed=seeds[2]), _check_frames(scene, at_rest, seed=seeds[3])
     groups = {
         **{f"light_{name}": frames for name, frames in single.items()},
-        "dark": dark_frames(scene.camera, count=count, seed=seeds[1]),
+        "dark": dark_frames(scene, count=count, seed=seeds[1]),
         **{f"flat_{number}": frames for number, frames in enumerate(flat, start=1)},
         **{f"check/{name}": frames for name, frames in check.items()},
     }
@@ -219,43 +219,40 @@ def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Targ
     generator = np.random.SeedSequence(seed)
     frames: dict[str, list[Frame]] = {light.name: [] for light in scene.lights}
     for name, taken in frames.items():
-        for step, child in enumerate(generator.spawn(count)):
-            dimmed = images * np.float32((step + 1) / count)
-            taken.append(record(dimmed, scene.camera, scene.lights, seed=int(child.generate_state(1)[0]), on=(name,)))
+        for step, child in enumerate(generator.spawn(count), start=1):
+            taken += _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
     return frames
 
 
-def dark_frames(camera: Camera, *, count: int = 3, seed: int) -> list[Frame]:
+def dark_frames(scene: Scene, *, count: int = 3, seed: int) -> list[Frame]:
     """Frames with all lights off."""
-    darkness = np.zeros((1, *camera.shape), dtype=np.float32)
-    lightless = replace(camera, crosstalk=np.ones((camera.channels, 1)))
-    off = (Light(name="off", position=(0.0, 0.0, 0.0), power=0.0),)
-    seeds = np.random.SeedSequence(seed).generate_state(count)
-    return [record(darkness, lightless, off, seed=int(s)) for s in seeds]
+    darkness = np.zeros((len(scene.lights), *scene.camera.shape), dtype=np.float32)
+    return _shots(scene, darkness, np.random.SeedSequence(seed).generate_state(count), ())
 
 
 def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]:
     """Frames of a white card under all lights together: `count` at each of the `EXPOSURES`."""
     images = render(target_scene(scene, "white"))
     brightest = float(np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images).max())
-    steps = np.random.SeedSequence(seed).spawn(len(EXPOSURES))
-    taken = []
-    for fraction, step in zip(EXPOSURES, steps, strict=True):
-        exposed = images * np.float32(fraction * scene.camera.full_scale / brightest)
-        taken.append([record(exposed, scene.camera, scene.lights, seed=int(s)) for s in step.generate_state(count)])
-    return taken
+    levels = [np.float32(fraction * scene.camera.full_scale / brightest) for fraction in EXPOSURES]
+    seeds = [step.generate_state(count) for step in np.random.SeedSequence(seed).spawn(len(levels))]
+    return [_shots(scene, images * level, taken) for level, taken in zip(levels, seeds, strict=True)]
 
 
 def _check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
     """Frames of the specimen at rest, `images` (k, H, W): each light alone, all together ("all"), and "dark"."""
     lit = {light.name: (light.name,) for light in scene.lights} | {"all": tuple(light.name for light in scene.lights)}
-    steps = np.random.SeedSequence(seed).spawn(len(lit) + 1)
-    frames = {"dark": dark_frames(scene.camera, count=count, seed=int(steps[-1].generate_state(1)[0]))}
-    for (name, on), step in zip(lit.items(), steps, strict=False):
-        frames[name] = [
-            record(images, scene.camera, scene.lights, seed=int(s), on=on) for s in step.generate_state(count)
-        ]
+    *steps, last = np.random.SeedSequence(seed).spawn(len(lit) + 1)
+    frames = {"dark": dark_frames(scene, count=count, seed=int(last.generate_state(1)[0]))}
+    for (name, on), step in zip(lit.items(), steps, strict=True):
+        frames[name] = _shots(scene, images, step.generate_state(count), on)
     return frames
+
+
+def _shots(
+    scene: Scene, images: FloatImage, seeds: Iterable[np.uint32], on: Collection[str] | None = None
+) -> list[Frame]:
+    return [record(images, scene.camera, scene.lights, seed=int(seed), on=on) for seed in seeds]
 
 
 def record(
