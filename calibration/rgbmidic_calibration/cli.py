@@ -103,7 +103,7 @@ def _writes(name: str, hint: Any, default: str | None = None) -> Callable[[Comma
 @_takes_captures
 def crosstalk(
     captures: Any,
-    out: Any,
+    out: Path,
     block: Annotated[int, typer.Option(help="Side of the blocks that are averaged, px.")] = 16,
     field: Annotated[
         str, typer.Option(help="Degree by which A varies over the field: 0 to 4, or auto: what the data ask for.")
@@ -136,7 +136,7 @@ def noise(
         ),
     ],
     stated: Any,
-    out: Any,
+    out: Path,
 ) -> None:
     """Measure gain, read noise, black level, saturation, linearity, fixed pattern and defects of the camera."""
     from rgbmidic_calibration import display, jobs
@@ -151,7 +151,7 @@ def noise(
 @_takes_captures
 def registration(
     captures: Any,
-    out: Any,
+    out: Path,
     region: Region = None,
     element_size: Annotated[float, typer.Option(help="Side of the elements, px; several speckles.")] = 25.0,
 ) -> None:
@@ -207,7 +207,7 @@ def design(
     ],
     choose: Annotated[int, typer.Option(help="Lamps in a set; of more candidates the best sets are found.")] = 3,
     show_sets: Annotated[int, typer.Option("--sets", help="How many of the best sets to list.")] = 5,
-    picture: Any = None,
+    picture: Path | None = None,
 ) -> None:
     """Predict crosstalk, condition number and noise from spectra, and find the best set of lamps to buy."""
     from rgbmidic_calibration import design as designs
@@ -226,7 +226,7 @@ def design(
 @_writes("out", Out, "calibration.json")
 def merge(
     files: Annotated[list[Path], typer.Argument(help="Calibration files; every section from one of them.")],
-    out: Any,
+    out: Path,
 ) -> None:
     """Merge noise, crosstalk and registration from several files into one."""
     from rgbmidic_calibration import display
@@ -241,7 +241,7 @@ def merge(
 @_writes("picture", Annotated[Path | None, typer.Option(help="Write a picture too (PNG, PDF or SVG).")])
 def show(
     file: Annotated[Path, typer.Argument(help="Calibration file.")],
-    picture: Any = None,
+    picture: Path | None = None,
 ) -> None:
     """Show a calibration file as tables, and in one picture."""
     from rgbmidic.illumination.calibration import Calibration

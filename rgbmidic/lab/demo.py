@@ -147,7 +147,10 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
     with np.load(settings.base / "truth.npz") as archive:
         truth, angles = archive["displacement"].astype(np.float64), archive["angle_deg"]
     mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-    images = _separated(settings)
+    assert settings.calibration_file is not None
+    calibration = Calibration.read(settings.calibration_file)
+    separation, frames = Separation(calibration=calibration), open_series(settings.frames, settings.base, calibration)
+    images = [separation(frames.read(index)).values for index in range(len(frames))]
     options: dict[str, Any] = {
         "region": settings.region.rectangle,
         "element_size": settings.element_size,
@@ -169,15 +172,6 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
             )
         )
     return rows
-
-
-def _separated(settings: TestSettings) -> list[FloatImage]:
-    """Return the lights (k, H, W) of every frame."""
-    assert settings.calibration_file is not None
-    calibration = Calibration.read(settings.calibration_file)
-    separation = Separation(calibration=calibration)
-    frames = open_series(settings.frames, settings.base, calibration)
-    return [separation(frames.read(index)).values for index in range(len(frames))]
 
 
 def _rms(values: FloatArray) -> float:

@@ -13,7 +13,6 @@ from rgbmidic._version import __version__
 from rgbmidic.lab import check_folder, number_or_none, write_findings
 from rgbmidic.lab.planning.plan import Outlook, Plan, Proposal
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
-from rgbmidic.scene.camera import Light
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS
 from rgbmidic.typing import FloatArray
@@ -105,11 +104,11 @@ def _labelled(plan: Plan) -> Iterator[tuple[str, dict[str, Any]]]:
 def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per lamp: position (mm) as SCENE.toml states it, direction, largest zone of any state."""
     rows = []
-    for index, light in enumerate(plan.scene.lights):
-        azimuth, inclination = _angles(plan.scene, light)
+    for index, lamp in enumerate(_lamps(plan)):
         worst = max(plan.fraction(outlook.reflects[index]) for outlook in plan.outlooks)
-        place = ", ".join(f"{round(value)}" for value in light.position)
-        rows.append([light.name, f"[{place}]", f"{azimuth:.0f}", f"{inclination:.0f}", f"{worst:.1%}"])
+        place = ", ".join(f"{round(value)}" for value in lamp["position_mm"])
+        angles = [f"{lamp[key]:.0f}" for key in ("azimuth_deg", "inclination_deg")]
+        rows.append([lamp["name"], f"[{place}]", *angles, f"{worst:.1%}"])
     return ["light", "position = (mm)", "azimuth", "inclination", "reflects on"], rows
 
 
@@ -136,19 +135,19 @@ def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
 
 
 def _arrangement(plan: Plan) -> dict[str, Any]:
+    states = [_state(plan, outlook) for outlook in plan.outlooks]
+    return {"lights": _lamps(plan), "std_px": number_or_none(plan.std), "states": states}
+
+
+def _lamps(plan: Plan) -> list[dict[str, Any]]:
+    """The lamps; azimuth about the optical axis (0 to the right, 90 down) and inclination from it, from the body."""
     lamps = []
     for light in plan.scene.lights:
-        azimuth, inclination = _angles(plan.scene, light)
+        x, y, z = (a - b for a, b in zip(light.position, plan.scene.body.front, strict=True))
+        angles = math.degrees(math.atan2(y, x)) % 360, math.degrees(math.atan2(math.hypot(x, y), -z))
         lamp = {"name": light.name, "position_mm": list(light.position)}
-        lamps.append({**lamp, "azimuth_deg": azimuth, "inclination_deg": inclination, "power": light.power})
-    states = [_state(plan, outlook) for outlook in plan.outlooks]
-    return {"lights": lamps, "std_px": number_or_none(plan.std), "states": states}
-
-
-def _angles(scene: Scene, light: Light) -> tuple[float, float]:
-    """Azimuth about the optical axis (degrees, 0 to the right, 90 down) and inclination from it, seen from the body."""
-    x, y, z = (a - b for a, b in zip(light.position, scene.body.front, strict=True))
-    return math.degrees(math.atan2(y, x)) % 360, math.degrees(math.atan2(math.hypot(x, y), -z))
+        lamps.append({**lamp, "azimuth_deg": angles[0], "inclination_deg": angles[1], "power": light.power})
+    return lamps
 
 
 def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
