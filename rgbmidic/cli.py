@@ -372,10 +372,12 @@ def demo(
 def _calibrate_demo(test: Path) -> None:
     """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` finds it."""
     from rgbmidic.settings import FrameSettings
+    from rgbmidic_calibration.captures import Captures
     from rgbmidic_calibration.jobs import calibrate_crosstalk
 
     lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
-    calibration, _ = calibrate_crosstalk(lights, str(test / "dark"), FrameSettings(path=("captures",)))
+    captures = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",)))
+    calibration, _ = calibrate_crosstalk(captures)
     calibration.write(test / "calibration.json")
 
 

@@ -21,6 +21,7 @@ from rgbmidic.errors import InputError, RgbmidicError, disk_reason
 __all__ = [
     "FAILURE",
     "FRAME_OPTIONS",
+    "REQUIRED",
     "execute",
     "fail",
     "frame_options",
@@ -34,6 +35,7 @@ __all__ = [
 ]
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
+REQUIRED = inspect.Parameter.empty
 
 FRAME_OPTIONS: dict[str, Any] = {
     "kind": Annotated[
@@ -101,7 +103,7 @@ def help_where_alone(context: typer.Context) -> None:
 
 
 def gather(
-    name: str, options: Mapping[str, Any], read: Callable[[dict[str, Any]], Any]
+    name: str, options: Mapping[str, Any], read: Callable[[dict[str, Any]], Any], **defaults: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorator of a command whose parameter `name` is asked for as several options.
 
@@ -110,9 +112,11 @@ def gather(
     name
         Parameter of the command; it gets what `read` makes of the options.
     options
-        Annotated type of every option by its key; each may be left out.
+        Annotated type of every option by its key.
     read
-        Function of the options' values by key, None for one that is left out.
+        Function of the options' values by key.
+    **defaults
+        Values of options that are left out, None where none is given here; ``REQUIRED`` for one that may not be.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -125,9 +129,10 @@ def gather(
         asked: list[inspect.Parameter] = []
         for parameter in signature.parameters.values():
             parts = options if parameter.name == name else {parameter.name: parameter.annotation}
-            default = None if parameter.name == name else parameter.default
             kind = inspect.Parameter.KEYWORD_ONLY
-            asked += [inspect.Parameter(key, kind, default=default, annotation=hint) for key, hint in parts.items()]
+            for key, hint in parts.items():
+                default = defaults.get(key) if parameter.name == name else parameter.default
+                asked.append(inspect.Parameter(key, kind, default=default, annotation=hint))
         gathering.__annotations__ = {parameter.name: parameter.annotation for parameter in asked}
         vars(gathering)["__signature__"] = signature.replace(parameters=asked)
         return gathering

@@ -89,25 +89,25 @@ class ColourFactors:
     ----------
     slope : (3, h, w) float64
         alpha_c in DN per standard deviation of the texture.
-    private : (3, h, w) float64
+    specific : (3, h, w) float64
         Variance of e_c without camera noise, relative to alpha_c².
     noise : (3, h, w) float64
         Variance of the camera noise, relative to alpha_c².
     """
 
     slope: FloatArray
-    private: FloatArray
+    specific: FloatArray
     noise: FloatArray
 
     @property
     def spread(self) -> FloatArray:
         """Standard deviation (3, h, w) of each channel's contrast without camera noise, DN."""
-        return np.asarray(self.slope * np.sqrt(1 + self.private))
+        return np.asarray(self.slope * np.sqrt(1 + self.specific))
 
     @property
     def common_fraction(self) -> FloatArray:
         """Fraction (3, h, w) of the common texture in each channel's variance, 0 to 1."""
-        return np.asarray(1 / (1 + self.private))
+        return np.asarray(1 / (1 + self.specific))
 
 
 def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel | None) -> Moments:
@@ -264,7 +264,7 @@ def colour_factors(
     crosstalk : (3, k)
         A in channels = A . lights: one light's sparkle is seen by all channels, which is taken out of their moments.
     coloured
-        `TextureModel.private`: 1 for a specimen on which no colour shows the common texture alone.
+        `TextureModel.specific`: 1 for a specimen on which no colour shows the common texture alone.
 
     Returns
     -------
@@ -287,8 +287,8 @@ def colour_factors(
         excess = own / square
         least = excess.min(axis=0)
         # at least one channel is free of reflections at each place, unless it shows too much of its own for that
-        private = excess - least + np.maximum(least - 1 - allowed, 0)
-        sparkle = private * square * band.own
+        specific = excess - least + np.maximum(least - 1 - allowed, 0)
+        sparkle = specific * square * band.own
     # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side
-    variance = np.maximum(private * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
-    return ColourFactors(slope=np.sqrt(square), private=variance, noise=moments.noise / square)
+    variance = np.maximum(specific * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
+    return ColourFactors(slope=np.sqrt(square), specific=variance, noise=moments.noise / square)

@@ -74,7 +74,7 @@ class TextureModel:
         w_m and s_m (px).
     offset : float
         c: the loss by the removal of the local mean; not positive.
-    private : float
+    specific : float
         Fraction (0 to 1) of the channel-specific component that is as coarse as the speckle: 0 for the sparkle of
         reflections, towards 1 for a coloured specimen.
     correlation : float
@@ -84,7 +84,7 @@ class TextureModel:
     weights: tuple[float, ...]
     widths: tuple[float, ...]
     offset: float = 0.0
-    private: float = 0.0
+    specific: float = 0.0
     correlation: float = 1.0
 
     def __post_init__(self) -> None:
@@ -92,10 +92,10 @@ class TextureModel:
         w, s = np.asarray(self.weights, float), np.asarray(self.widths, float)
         if w.ndim != 1 or w.shape != s.shape or not (w >= 0).all() or not w.sum() > 0 or not (s > 0).all():
             raise InputError(f"a texture needs weights >= 0 and widths > 0, equally many; given are {w} and {s}")
-        if not (0 <= self.private <= 1 and self.offset <= 0 and abs(w.sum() + self.offset - 1) < 1e-6):
+        if not (0 <= self.specific <= 1 and self.offset <= 0 and abs(w.sum() + self.offset - 1) < 1e-6):
             raise InputError(
                 "weights and offset of a texture sum to 1, its channel-specific fraction lies in 0 to 1; given are a "
-                f"sum of {w.sum() + self.offset} and {self.private}"
+                f"sum of {w.sum() + self.offset} and {self.specific}"
             )
 
     @classmethod
@@ -174,7 +174,7 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
         r = np.broadcast_to(distance[:, None], met.shape)[met]
         # one colour's samples are two pixels apart and show nothing of what is finer
         coarse = WIDTHS[WIDTHS > 1]
-        return _mixture(r, sums[:, :3][met] / counts[:, :3][met], best, widths=coarse, private=1.0)
+        return _mixture(r, sums[:, :3][met] / counts[:, :3][met], best, widths=coarse, specific=1.0)
     pairs = counts[:, 3:] * correlations
     adjacent, diagonal = pairs[:, 0] + pairs[:, 2], pairs[:, 1]
     parity = LAGS.sum(axis=1) % 2 == 1
@@ -188,7 +188,7 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     ratio = float(np.clip(agreement, finest, coarsest))
     fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
     model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, band=(unit, fine))
-    return replace(model, private=_coarse_fraction(model, sums, counts, correlations))
+    return replace(model, specific=_coarse_fraction(model, sums, counts, correlations))
 
 
 def _mixture(
@@ -198,7 +198,7 @@ def _mixture(
     *,
     widths: FloatArray = WIDTHS,
     band: tuple[FloatArray, FloatArray] | None = None,
-    private: float = 0.0,
+    specific: float = 0.0,
 ) -> TextureModel:
     """Fit weights w >= 0 and offset c <= 0 of a texture by least squares.
 
@@ -228,7 +228,7 @@ def _mixture(
         weights=tuple(weights.tolist()),
         widths=tuple(widths[kept].tolist()),
         offset=min(float(1 - weights.sum()), 0.0),
-        private=private,
+        specific=specific,
         correlation=correlation,
     )
 

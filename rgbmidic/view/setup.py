@@ -123,8 +123,12 @@ class SetupPage:
         picture = self.pictures.get(chosen, raw)
         over, ends, colours, window = None, (0.0, 1.0), palette("plasma"), self.canvas.window
         if chosen == _EXPECTED and (found := self.inspection) is not None:
-            ends = colour_range(found.std[np.isfinite(found.std)])
-            mesh: dict[str, Any] = {"nodes": found.nodes, "elements": found.elements, "values": found.std}
+            ends = colour_range(found.prediction.std[np.isfinite(found.prediction.std)])
+            mesh: dict[str, Any] = {
+                "nodes": found.mesh.nodes,
+                "elements": found.mesh.elements,
+                "values": found.prediction.std,
+            }
             over = Overlay(**mesh, ends=ends, colours=colours, opacity=0.8)
         image = paint(window, picture, over, AROUND[self.dark])
         if self.parts.glare.active:
@@ -178,7 +182,7 @@ class SetupPage:
         self.pictures = pictures(found, self.source.shape)
         self.tiles.show(side_by_side(found, self.pictures, self.source.raw(index)[0]))
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
-        known = found.std[np.isfinite(found.std)]
+        known = found.prediction.std[np.isfinite(found.prediction.std)]
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
