@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"

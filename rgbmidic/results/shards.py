@@ -6,9 +6,9 @@ they look for the next one of the same run. A process that is killed leaves at m
 pass over it, and nobody appends to a file of another writer. A frame that is written twice counts as it is in the file
 with the higher number, there as it was written last; one that is discarded has `_NO_FRAME` in its header.
 
-A record begins with a head of unsigned 32-bit numbers: the CRC-32 of each quantity and, of each quantity that is not
-stackable, its shape and its size in bytes. The quantities of one shape in all frames follow raw, the smallest first;
-then the others: texts as JSON, pictures packed by zlib, other arrays raw. All numbers are little-endian.
+A record begins with a head of unsigned 32-bit numbers: the CRC-32 of each quantity, its size in bytes and, of each
+that is not stackable, its shape. The quantities of one shape in all frames follow raw, the smallest first; then the
+others: texts as JSON, pictures packed by zlib, other arrays raw. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -45,7 +45,7 @@ _BUFFER = 2**16
 """Bytes that the system is asked for at once: a call takes some us, as long as copying these. Small records come by the
 dozen, large ones pass by the buffer."""
 _AHEAD = 1024
-"""Bytes read where single quantities are asked for: the head (some 250 bytes) and the plain numbers lie in them."""
+"""Bytes read where single quantities are asked for: the head (some 300 bytes) and the plain numbers lie in them."""
 _FAST = 1
 """zlib's quickest level."""
 _RATIO = 1032
@@ -58,26 +58,10 @@ _CHECKED = _HEADER.size - 4
 _NO_FRAME = 2**63 - 1
 _NUMBER_SIZE = 4
 """Bytes of a number of the head."""
+_STORED = {name: np.dtype(entry.dtype).newbyteorder("<") for name, entry in QUANTITIES.items()}
+_PICTURES = [name for name, entry in QUANTITIES.items() if entry.dtype is np.uint8 and not entry.stackable]
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
-
-
-class _Fixed(NamedTuple):
-    """Where a quantity lies that has one shape in all frames: first byte, size, checksum in the head, type, shape."""
-
-    first: int
-    size: int
-    check: int
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-
-
-class _Open(NamedTuple):
-    """Places in the head of the numbers of another quantity: its checksum, its shape, its size in bytes."""
-
-    check: int
-    shape: range
-    size: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,46 +72,34 @@ class RecordLayout:
     ----------
     sizes
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
+    places
+        Of every quantity, in the order in which they lie: its place in that order, and its shape, or where the head has
+        it.
     head
         Bytes of the head.
-    fixed, open
-        The quantities in the order in which they lie: those of one shape in all frames, then the others.
-    length
-        Bytes of head and fixed quantities.
     """
 
     sizes: Mapping[str, int]
+    places: Mapping[str, tuple[int, tuple[int, ...] | slice]]
     head: int
-    fixed: Mapping[str, _Fixed]
-    open: Mapping[str, _Open]
-    length: int
 
     @classmethod
     def of(cls, sizes: Mapping[str, int]) -> RecordLayout:
         """Lay out records with these sizes of ``"node"`` and ``"light"``."""
-        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items() if entry.stackable}
-        fixed, count, open_ = sorted(blank, key=lambda name: blank[name].nbytes), len(QUANTITIES), {}
-        for check, name in enumerate((name for name in QUANTITIES if name not in blank), start=len(fixed)):
-            axes = len(QUANTITIES[name].axes)
-            open_[name] = _Open(check, range(count, count + axes), count + axes)
-            count += axes + 1
-        head = count * _NUMBER_SIZE
-        sums = accumulate((blank[name].nbytes for name in fixed), initial=head)
-        places = {
-            name: _Fixed(first, blank[name].nbytes, check, _stored(QUANTITIES[name]), blank[name].shape)
-            for check, (name, first) in enumerate(zip(fixed, sums, strict=False))
-        }
-        length = head + sum(one.size for one in places.values())
-        return cls(sizes=dict(sizes), head=head, fixed=places, open=open_, length=length)
+        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
+        fixed = sorted((name for name in blank if QUANTITIES[name].stackable), key=lambda name: blank[name].nbytes)
+        places: dict[str, tuple[int, tuple[int, ...] | slice]] = {}
+        end = 2 * len(blank)
+        for place, name in enumerate(dict.fromkeys([*fixed, *blank])):
+            begin, end = end, end + (0 if name in fixed else blank[name].ndim)
+            places[name] = place, blank[name].shape if name in fixed else slice(begin, end)
+        return cls(sizes=dict(sizes), places=places, head=end * _NUMBER_SIZE)
 
     def encode(self, values: Mapping[str, Any]) -> tuple[bytes, int]:
         """Return the bytes of a record with these quantities, and the CRC-32 of its head."""
-        parts = [np.asarray(values[name], dtype=one.dtype).tobytes() for name, one in self.fixed.items()]
-        packed = {name: _packed(QUANTITIES[name], values[name]) for name in self.open}
-        parts += packed.values()
-        numbers = [zlib.crc32(part) for part in parts]
-        for name, part in packed.items():
-            numbers += [*np.shape(values[name]), len(part)]
+        parts = [_packed(QUANTITIES[name], values[name]) for name in self.places]
+        shapes = (np.shape(values[name]) for name, (_, place) in self.places.items() if isinstance(place, slice))
+        numbers = [*map(zlib.crc32, parts), *map(len, parts), *itertools.chain(*shapes)]
         head = struct.pack(f"<{len(numbers)}I", *numbers)
         return b"".join([head, *parts]), zlib.crc32(head)
 
@@ -159,51 +131,42 @@ class RecordLayout:
         """
         file.seek(start)
         block = file.read(length if names is None or length < _AHEAD else _AHEAD)
-        if length < self.length or zlib.crc32(block[: self.head]) != check:
+        if length < self.head or zlib.crc32(block[: self.head]) != check:
             raise ResultError("its head is damaged, or of another mesh or other lights")
-        numbers = struct.unpack_from(f"<{self.head // _NUMBER_SIZE}I", block)
-        ends = accumulate((numbers[entry.size] for entry in self.open.values()), initial=self.length)
-        firsts = dict(zip(self.open, ends, strict=False))
+        numbers, count = struct.unpack_from(f"<{self.head // _NUMBER_SIZE}I", block), len(self.places)
+        ends = list(accumulate(numbers[count : 2 * count], initial=self.head))
         values = {}
-        for name in (*self.fixed, *self.open) if names is None else names:
-            quantity, fixed = QUANTITIES[name], self.fixed.get(name)
-            first, size = (fixed.first, fixed.size) if fixed else (firsts[name], numbers[self.open[name].size])
-            part = block[first : first + size]
-            if first + size > len(block):
+        for name in self.places if names is None else names:
+            quantity, (place, shape) = QUANTITIES[name], self.places[name]
+            first, end = ends[place : place + 2]
+            part = block[first:end]
+            if end > len(block):
                 file.seek(start + first)
-                part = file.read(min(size, length))
-            if zlib.crc32(part) != numbers[(fixed or self.open[name]).check]:
+                part = file.read(min(end - first, length))
+            if zlib.crc32(part) != numbers[place]:
                 raise ResultError(f"the checksum of {name} is wrong")
-            if fixed is None:
-                shape = [numbers[place] for place in self.open[name].shape]
-                values[name] = quantity.convert(_unpacked(quantity, part, shape), self.sizes)
+            if isinstance(shape, slice):
+                values[name] = quantity.convert(_unpacked(quantity, part, numbers[shape]), self.sizes)
             else:
-                array = np.frombuffer(part, dtype=fixed.dtype)
-                values[name] = array.reshape(fixed.shape).astype(quantity.dtype) if fixed.shape else array.item()
+                array = np.frombuffer(part, dtype=_STORED[name])
+                values[name] = array.reshape(shape).astype(quantity.dtype) if shape else array.item()
         return values
-
-
-def _stored(entry: ResultQuantity) -> np.dtype[Any]:
-    return np.dtype(entry.dtype).newbyteorder("<")
 
 
 def _packed(entry: ResultQuantity, value: Any) -> bytes:
     if entry.dtype is np.str_:
         return json.dumps(np.asarray(value).tolist()).encode("ascii")
-    raw = np.asarray(value, dtype=_stored(entry)).tobytes()
-    return zlib.compress(raw, _FAST) if entry.dtype is np.uint8 else raw
+    raw = np.asarray(value, dtype=_STORED[entry.name]).tobytes()
+    return zlib.compress(raw, _FAST) if entry.name in _PICTURES else raw
 
 
 def _unpacked(entry: ResultQuantity, part: bytes, shape: Sequence[int]) -> Any:
     """Undo `_packed`; a head that promises more than there is is an error before memory is taken for it."""
     if entry.dtype is np.str_:
         return np.array(json.loads(part), dtype=np.str_).reshape(shape)
-    promised = math.prod(shape) * _stored(entry).itemsize
-    if entry.dtype is np.uint8:
-        part = zlib.decompressobj().decompress(part, min(promised, _RATIO * len(part)) + 1)
-    if len(part) != promised:
-        raise ResultError(f"the head promises {promised} bytes of {entry.name}, there are {len(part)}")
-    return np.frombuffer(part, dtype=_stored(entry)).reshape(shape).astype(entry.dtype)
+    if entry.name in _PICTURES:
+        part = zlib.decompressobj().decompress(part, min(math.prod(shape), _RATIO * len(part)) + 1)
+    return np.frombuffer(part, dtype=_STORED[entry.name]).reshape(shape).astype(entry.dtype)
 
 
 def shard_files(folder: Path) -> list[Path]:
@@ -252,7 +215,11 @@ class ShardWriter:
         if self._count == _SHARD_FRAMES:
             self.close()
         if self._file is None:
-            self._file = _new_file(self.folder)
+            number = max(map(_number, shard_files(self.folder)), default=-1)
+            while self._file is None:  # of a number that nobody has
+                number += 1
+                with writing(self.folder), suppress(FileExistsError):
+                    self._file = (self.folder / f"{number:06d}.frames").open("xb", buffering=0)
         try:
             with writing(self._file.name):
                 self._file.seek(self._end)
@@ -278,15 +245,6 @@ class ShardWriter:
         if file is not None:
             with writing(file.name), file:
                 os.fsync(file.fileno())
-
-
-def _new_file(folder: Path) -> BinaryIO:
-    """Open a file of a number that nobody has."""
-    used = [_number(file) for file in shard_files(folder)]
-    for number in itertools.count(max(used, default=-1) + 1):
-        with writing(folder), suppress(FileExistsError):
-            return (folder / f"{number:06d}.frames").open("xb", buffering=0)
-    raise AssertionError("numbers do not end")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -152,8 +152,9 @@ def test_a_forged_head_is_told(copy: Path, name: str, size: int) -> None:
     table = Result.open(copy).table
     file = table.files[0]
     content, first = bytearray(file.read_bytes()), int(table.start[0])
-    place = table.layout.open[name]
-    for number in place.shape:
+    _, place = table.layout.places[name]
+    assert isinstance(place, slice)
+    for number in range(place.start, place.stop):
         content[first + 4 * number : first + 4 * number + 4] = size.to_bytes(4, "little")
     file.write_bytes(content)
     table.head[0] = zlib.crc32(content[first : first + table.layout.head])
