@@ -22,7 +22,7 @@ import re
 import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
@@ -50,8 +50,7 @@ _FAST = 1
 """zlib's quickest level."""
 _RATIO = 1032
 """How many times its size packed content can have at most (zlib's technical details, "Maximum Compression Factor")."""
-_NAME = re.compile(r"([0-9]{6,})\.(frames|index)")
-"""Index files were written by earlier versions, and go with their result."""
+_NAME = re.compile(r"([0-9]{6,})\.frames")
 _HEADER = struct.Struct("<16sQQII")
 """Digest of the run, frame, bytes of the record, CRC-32 of the record's head, CRC-32 of these 36 bytes."""
 _CHECKED = _HEADER.size - 4
@@ -60,6 +59,7 @@ _NUMBER_SIZE = 4
 """Bytes of a number of the head."""
 _STORED = {name: np.dtype(entry.dtype).newbyteorder("<") for name, entry in QUANTITIES.items()}
 _PICTURES = [name for name, entry in QUANTITIES.items() if entry.dtype is np.uint8 and not entry.stackable]
+_PLACE = np.dtype([(name, np.int64) for name in ("shard", "start", "length", "head")])
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
 
@@ -257,10 +257,9 @@ class FrameTable:
         Of the records.
     files
         Files of records.
-    shard : ndarray, shape (T,), int64
-        Which of the files each frame is in; -1 where it is not measured yet.
-    start, length, head : ndarray, shape (T,), int64
-        First byte of each record, its bytes, checksum of its head.
+    places : ndarray, shape (T,), of the fields ``shard``, ``start``, ``length``, ``head``
+        Which of the files each frame is in, -1 where it is not measured yet; first byte of its record, its bytes, and
+        the checksum of its head.
     damaged : ndarray, shape (T,), bool
         Frames that are known to be lost to damage; they are not `finished`.
     gaps
@@ -269,10 +268,7 @@ class FrameTable:
 
     layout: RecordLayout
     files: Sequence[Path]
-    shard: npt.NDArray[np.int64]
-    start: npt.NDArray[np.int64]
-    length: npt.NDArray[np.int64]
-    head: npt.NDArray[np.int64]
+    places: npt.NDArray[np.void]
     damaged: BoolArray
     gaps: tuple[Path, ...]
 
@@ -296,24 +292,21 @@ class FrameTable:
         ResultError
             A file cannot be read, or holds frames of another run.
         """
-        shard, start, length, head = np.full(count, -1), *np.zeros((3, count), dtype=np.int64)
-        files = [file for file in shard_files(folder) if file.suffix == ".frames"]
-        gaps = []
+        places, files, gaps = np.zeros(count, dtype=_PLACE), shard_files(folder), []
+        places["shard"] = -1
         for number, file in enumerate(files):
             records, damaged = _records(file, run)
             gaps += [file] if damaged else []
-            table = np.array(records, dtype=np.int64).reshape(-1, 4)
-            frames, *columns = table[table[:, 0] != _NO_FRAME].T
-            shard[frames] = number
-            start[frames], length[frames], head[frames] = columns
+            for frame, *place in records:
+                if frame != _NO_FRAME:
+                    places[frame] = (number, *place)
         lost = np.zeros(count, dtype=bool)
-        places = {"shard": shard, "start": start, "length": length, "head": head}
-        return cls(layout=layout, files=files, damaged=lost, gaps=tuple(gaps), **places)
+        return cls(layout=layout, files=files, places=places, damaged=lost, gaps=tuple(gaps))
 
     @property
     def finished(self) -> BoolArray:
         """Which frames there are, shape (T,)."""
-        return np.asarray(self.shard >= 0)
+        return np.asarray(self.places["shard"] >= 0)
 
     def without_damaged(self, *, ended: bool) -> FrameTable:
         """Read every record once and return the table without the damaged ones.
@@ -329,7 +322,9 @@ class FrameTable:
                 next(self.each(None, [frame]))
             except ResultError:
                 damaged[frame] = True
-        return replace(self, shard=np.where(damaged, -1, self.shard), damaged=damaged)
+        places = self.places.copy()
+        places["shard"][damaged] = -1
+        return replace(self, places=places, damaged=damaged)
 
     def read(self, frame: int) -> FrameRecord:
         """Read all of one frame; a frame that is not measured yet gives a blank record with that as its reason.
@@ -362,32 +357,26 @@ class FrameTable:
             A record is damaged; the message names file and frame.
         """
         chosen = np.fromiter(frames, dtype=np.int64)
-        columns = (column[chosen].tolist() for column in (self.shard, self.start, self.length, self.head))
-        opened, file = -1, None
-        blanks: dict[bool, dict[str, Any]] = {}
-        try:
-            for frame, shard, start, length, head in zip(chosen.tolist(), *columns, strict=True):
-                if shard < 0:
-                    lost = bool(self.damaged[frame])
-                    if lost not in blanks:
-                        reason, sizes = _DAMAGED if lost else _NOT_YET, self.layout.sizes
+        opened, blanks = -1, dict[str, dict[str, Any]]()
+        with ExitStack() as stack:
+            try:
+                for frame, (shard, *place) in zip(chosen.tolist(), self.places[chosen].tolist(), strict=True):
+                    if shard >= 0:
+                        if shard != opened:
+                            stack.close()
+                            file = stack.enter_context(self.files[shard].open("rb", buffering=_BUFFER))
+                            opened = shard
+                        yield self.layout.decode(file, *place, names=names)
+                        continue
+                    reason, sizes = _DAMAGED if self.damaged[frame] else _NOT_YET, self.layout.sizes
+                    if reason not in blanks:
                         blank = FrameRecord.failed(reason, nodes=sizes["node"], lights=sizes["light"]).values
-                        blanks[lost] = {name: blank[name] for name in (blank if names is None else names)}
-                    yield dict(blanks[lost])
-                    continue
-                if shard != opened:
-                    if file is not None:
-                        file.close()
-                    opened, file = shard, self.files[shard].open("rb", buffering=_BUFFER)
-                assert file is not None
-                yield self.layout.decode(file, start, length, head, names)
-        except OSError as error:
-            raise ResultError(f"{self.files[shard]} cannot be read: {error.strerror or error}") from None
-        except (ResultError, ValueError, TypeError, RecursionError, zlib.error) as error:
-            raise ResultError(f"{self.files[shard]} is damaged in frame {frame}: {error}; {_REMEDY}") from None
-        finally:
-            if file is not None:
-                file.close()
+                        blanks[reason] = {name: blank[name] for name in (blank if names is None else names)}
+                    yield dict(blanks[reason])
+            except OSError as error:
+                raise ResultError(f"{self.files[shard]} cannot be read: {error.strerror or error}") from None
+            except (ResultError, ValueError, TypeError, RecursionError, zlib.error) as error:
+                raise ResultError(f"{self.files[shard]} is damaged in frame {frame}: {error}; {_REMEDY}") from None
 
 
 def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], bool]:
@@ -426,14 +415,12 @@ def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], b
 
 def _parsed(header: bytes, file: Path, run: bytes) -> tuple[int, int, int] | None:
     """Frame, length and checksum of the head that a header states; None where it is damaged."""
-    if len(header) < _HEADER.size:
+    if len(header) < _HEADER.size or zlib.crc32(header[:_CHECKED]) != int.from_bytes(header[_CHECKED:], "little"):
         return None
-    owner, frame, length, head, check = _HEADER.unpack(header)
-    if zlib.crc32(header[:_CHECKED]) != check:
-        return None
+    owner, *stated, _ = _HEADER.unpack(header)
     if owner != run:
         raise ResultError(f"{file} is of another run than {file.parent.parent / PROVENANCE}: {PUT_BACK}")
-    return frame, length, head
+    return tuple(stated)
 
 
 def _header(run: bytes, frame: int, length: int, head: int) -> bytes:
@@ -449,7 +436,7 @@ def discard(folder: Path, run: bytes, frames: Collection[int]) -> None:
     ResultError
         The disk refuses.
     """
-    for file in (file for file in shard_files(folder) if file.suffix == ".frames"):
+    for file in shard_files(folder):
         old = [record for record in _records(file, run)[0] if record[0] in frames]
         with writing(file), file.open("r+b") as opened:
             for _, start, length, head in old:
