@@ -10,7 +10,9 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -169,9 +171,12 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
             changed.append(place)
             continue
         tries[place] = kept["tries"]
-        if kept["unread"] and _can_be_read(plan, chosen[place]):
-            readable.append(place)
-        elif retry_failed and kept["status"] == Status.FAILED:
+        if kept["unread"]:
+            with suppress(FrameError):
+                read_state(plan, chosen[place])
+                readable.append(place)
+                continue
+        if retry_failed and kept["status"] == Status.FAILED:
             changed.append(place)
     lost = np.flatnonzero(damaged).tolist()
     again = {*lost, *changed, *readable, *dependants([*changed, *readable], tries)}
@@ -182,13 +187,6 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
             "measured again with what started from it, since it can be read now: %s", listed(readable, names)
         )
     store.discard(again)
-
-
-def _can_be_read(plan: Plan, index: int) -> bool:
-    try:
-        return bool(read_state(plan, index))
-    except FrameError:
-        return False
 
 
 def _places(chosen: range, frames: range | None) -> range:
@@ -332,7 +330,7 @@ def measure_sequence(
     plan = Plan.from_settings(
         replace(settings, frames=frames), source=latest, separation=separation, weights=counted, mesh=mesh, region=mask
     )
-    return _solutions(plan, latest, _with_first(reference, remaining) if own else remaining)
+    return _solutions(plan, latest, chain([reference], remaining) if own else remaining)
 
 
 @dataclass(slots=True)
@@ -351,11 +349,6 @@ class _Latest:
         if self.light_images and not hasattr(state, "values"):
             return np.asarray(state, dtype=np.float32)
         return state
-
-
-def _with_first(first: Any, remaining: Iterator[Any]) -> Iterator[Any]:
-    yield first
-    yield from remaining
 
 
 def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[Solution]:

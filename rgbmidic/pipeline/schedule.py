@@ -23,7 +23,7 @@ from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Updated, Workers
+from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
 from rgbmidic.results import FrameRecord, ResultStore
 from rgbmidic.typing import FloatArray
 
@@ -112,7 +112,10 @@ class Schedule:
     def _submit(self, workers: Workers, position: int, start: Start) -> None:
         # a key frame looks for what has been lost; those between follow what there is
         given = replace(start, unmeasured=0.0) if is_key(position) else start
-        future = workers.submit(self._index(position), given, self._renewed(start.reference_updates))
+        last = start.reference_updates[-2:]  # all that the reference which they make depends on
+        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
+        found = [_solution(mesh, lights, kept) for kept in self._store.table().each(_MEASURED, last)] if last else []
+        future = workers.submit(self._index(position), given, list(zip(map(self._index, last), found, strict=True)))
         self._running[future] = position, start
 
     def _index(self, position: int) -> int:
@@ -141,7 +144,12 @@ class Schedule:
         first = self._first_tries.pop(position, None)
         if first is None and is_key(position) and loses(record, start):
             self._first_tries[position] = record
-            self._measure_after(position - 1, position)
+            before = position - 1  # it may have to be measured first
+            if self._finished[before]:
+                heappush(self._ready, (position, self._start_after(before)))
+            else:
+                self._waiting.setdefault(before, []).append(position)
+                self._want(before)
             return
         if first is not None:
             better = first if rank(first) <= rank(record) else record
@@ -154,16 +162,12 @@ class Schedule:
             heappush(self._ready, (after, following))
         if progress is not None:
             places = self._places
-            done = int(self._finished[places.start : places.stop].sum())
-            progress(done, len(places), _line(self._plan.series.name(self._index(position)), record))
-
-    def _measure_after(self, before: int, position: int) -> None:
-        """Have a frame measured from one that may have to be measured first."""
-        if self._finished[before]:
-            heappush(self._ready, (position, self._start_after(before)))
-        else:
-            self._waiting.setdefault(before, []).append(position)
-            self._want(before)
+            done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
+            line = f"{status.name.lower().replace('_', ' ')}: {record.reason}"
+            if status is Status.CONVERGED:
+                measured = 1 - rank(record)[1]
+                line = f"converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
+            progress(done, len(places), f"{self._plan.series.name(self._index(position))}: {line}")
 
     def _want(self, position: int) -> None:
         """Have a frame measured, and all that it depends on."""
@@ -198,15 +202,6 @@ class Schedule:
         return replace(
             after, reference_updates=tuple(kept["reference_updates"].tolist()), best_match=float(kept["best_match"])
         )
-
-    def _renewed(self, reference_updates: tuple[int, ...]) -> Updated:
-        """Index and solution of the last two frames that became the reference."""
-        if not reference_updates:
-            return ()
-        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
-        last = reference_updates[-2:]
-        solutions = (_solution(mesh, lights, kept) for kept in self._store.table().each(_MEASURED, last))
-        return list(zip(map(self._index, last), solutions, strict=True))
 
 
 def _solution(mesh: Tri3Mesh, lights: int, kept: Mapping[str, Any]) -> Solution:
@@ -244,14 +239,6 @@ def loses(record: FrameRecord | Solution, start: Start) -> bool:
     return status != Status.CONVERGED or unmeasured > start.unmeasured + _LOSS
 
 
-def _line(name: str, record: FrameRecord) -> str:
-    status = Status(record.status)
-    if status is Status.CONVERGED:
-        measured = float((record.node_status == NodeStatus.MEASURED).mean())
-        return f"{name}: converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
-    return f"{name}: {status.name.lower().replace('_', ' ')}: {record.reason}"
-
-
 STRIDE = 16
 """Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
 
@@ -277,10 +264,10 @@ def children(position: int, count: int) -> Iterator[int]:
 
 def lineage(position: int) -> Iterator[int]:
     """A frame, its parent, the parent of that, and so on to the first."""
-    following: int | None = position
-    while following is not None:
-        yield following
-        following = parent(following)
+    yield position
+    while position:
+        position -= _step(position)
+        yield position
 
 
 def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:

@@ -37,7 +37,6 @@ __all__ = [
     "write_arrays",
     "write_complete",
     "write_json",
-    "write_new_json",
     "writing",
 ]
 
@@ -87,18 +86,10 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
     return array
 
 
-def write_json(path: Path, document: Any) -> None:
-    """Write a JSON file."""
-    write_complete(path, lambda file: file.write(_text(document)))
-
-
-def write_new_json(path: Path, document: Any) -> bool:
-    """Write a JSON file where there is none; of several processes at once one gets True, the others False."""
-    return write_complete(path, lambda file: file.write(_text(document)), _name_new)
-
-
-def _text(document: Any) -> bytes:
-    return json.dumps(document, indent=2).encode() + b"\n"
+def write_json(path: Path, document: Any, *, new: bool = False) -> None:
+    """Write a JSON file; a `new` one is not written where there is one, also where several processes begin at once."""
+    content = json.dumps(document, indent=2).encode() + b"\n"
+    write_complete(path, lambda file: file.write(content), new=new)
 
 
 def read_json(path: Path) -> Any:
@@ -119,34 +110,35 @@ def read_json(path: Path) -> Any:
         raise ResultError(f"{path} is damaged: {error}") from None
 
 
-def _rename(temporary: Path, path: Path) -> bool:
-    """Rename, over an older file where there is one."""
-    temporary.replace(path)
-    return True
+def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool = False) -> None:
+    """Write a file under another name and rename it when all of it is on the disk; else nothing is left of it.
 
-
-def _name_new(temporary: Path, path: Path) -> bool:
-    """Rename where there is none yet."""
-    try:
-        path.hardlink_to(temporary)
-    except FileExistsError:
-        return False
-    except OSError:  # a disk without links, where nobody else starts in the same millisecond
-        return not path.exists() and _rename(temporary, path)
-    return True
-
-
-def write_complete(
-    path: Path, write: Callable[[BinaryIO], object], rename: Callable[[Path, Path], bool] = _rename
-) -> bool:
-    """Write a file under another name and `rename` it when all of it is on the disk; else nothing is left of it."""
+    Parameters
+    ----------
+    path
+        The file.
+    write
+        Writes its content.
+    new
+        Whether a file of this name stays as it is, also one that another process writes at the same time; else it is
+        replaced.
+    """
     temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{os.getpid()}.part")
     try:
         with writing(path), temporary.open("wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-            return rename(temporary, path)
+            if new:
+                try:
+                    path.hardlink_to(temporary)
+                    return
+                except FileExistsError:
+                    return
+                except OSError:  # a disk without links, where nobody else starts in the same millisecond
+                    if path.exists():
+                        return
+            temporary.replace(path)
     finally:
         with contextlib.suppress(OSError):  # a read-only disk refuses even to remove what is not there
             temporary.unlink()
@@ -258,5 +250,5 @@ def _may_live(holder: dict[str, Any]) -> bool:
     except ProcessLookupError:
         return False
     except (KeyError, TypeError, OverflowError, OSError):
-        return True
+        pass
     return True

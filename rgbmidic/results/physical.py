@@ -300,11 +300,10 @@ class Physical:
     def of(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
         scale = scale_of(result) if scale is None else scale
-        times, units = frame_times(result, scale), units_of(result, scale)
-        mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
+        untimed, times = cls.untimed(result, scale), frame_times(result, scale)
         if times is None or not (np.diff(times) > 0).all():
-            times, units = np.arange(len(result), dtype=np.float64), replace(units, timed=False)
-        return cls(result=result, scale=scale, units=units, times=times, mesh=mesh)
+            return untimed
+        return replace(untimed, times=times, units=replace(untimed.units, timed=True))
 
     @classmethod
     def untimed(cls, result: Result, scale: ScaleSettings) -> Self:

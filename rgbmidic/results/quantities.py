@@ -66,6 +66,15 @@ class ResultQuantity:
         """Whether all frames make one array: no axis is open, and it is no text."""
         return None not in self.shape({"node": 0, "light": 0}) and self.dtype is not np.str_
 
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Description by the CF conventions: units ("1" where there is none), long_name, and what a status means."""
+        about: dict[str, Any] = {"units": self.unit or "1", "long_name": self.meaning}
+        if self.codes:
+            about["flag_values"] = np.arange(len(self.codes), dtype=self.dtype)
+            about["flag_meanings"] = " ".join(code.replace(" ", "_") for code in self.codes)
+        return about
+
     def convert(self, value: Any, sizes: Mapping[str, int]) -> Any:
         """Return `value` in the type of the table; an `InputError` where it has another shape."""
         array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)

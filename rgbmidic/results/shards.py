@@ -26,7 +26,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,7 @@ import numpy.typing as npt
 from rgbmidic.errors import ResultError
 from rgbmidic.results.files import writing
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
-from rgbmidic.results.quantities import QUANTITIES, FrameRecord, ResultQuantity
+from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.typing import BoolArray
 
 __all__ = ["FrameTable", "RecordLayout", "ShardWriter", "discard", "shard_files"]
@@ -57,11 +57,17 @@ _CHECKED = _HEADER.size - 4
 _NO_FRAME = 2**63 - 1
 _NUMBER_SIZE = 4
 """Bytes of a number of the head."""
-_STORED = {name: np.dtype(entry.dtype).newbyteorder("<") for name, entry in QUANTITIES.items()}
-_PICTURES = [name for name, entry in QUANTITIES.items() if entry.dtype is np.uint8 and not entry.stackable]
 _PLACE = np.dtype([(name, np.int64) for name in ("shard", "start", "length", "head")])
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
+
+
+class _Place(NamedTuple):
+    """Where a quantity lies: its place in the order of all, its type, and its shape, or where the head has it."""
+
+    order: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...] | slice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,14 +79,13 @@ class RecordLayout:
     sizes
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
     places
-        Of every quantity, in the order in which they lie: its place in that order, and its shape, or where the head has
-        it.
+        Of every quantity, in the order in which they lie.
     head
         Bytes of the head.
     """
 
     sizes: Mapping[str, int]
-    places: Mapping[str, tuple[int, tuple[int, ...] | slice]]
+    places: Mapping[str, _Place]
     head: int
 
     @classmethod
@@ -88,17 +93,17 @@ class RecordLayout:
         """Lay out records with these sizes of ``"node"`` and ``"light"``."""
         blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
         fixed = sorted((name for name in blank if QUANTITIES[name].stackable), key=lambda name: blank[name].nbytes)
-        places: dict[str, tuple[int, tuple[int, ...] | slice]] = {}
-        end = 2 * len(blank)
-        for place, name in enumerate(dict.fromkeys([*fixed, *blank])):
+        places, end = dict[str, _Place](), 2 * len(blank)
+        for order, name in enumerate(dict.fromkeys([*fixed, *blank])):
             begin, end = end, end + (0 if name in fixed else blank[name].ndim)
-            places[name] = place, blank[name].shape if name in fixed else slice(begin, end)
+            dtype = np.dtype(QUANTITIES[name].dtype).newbyteorder("<")
+            places[name] = _Place(order, dtype, blank[name].shape if name in fixed else slice(begin, end))
         return cls(sizes=dict(sizes), places=places, head=end * _NUMBER_SIZE)
 
     def encode(self, values: Mapping[str, Any]) -> tuple[bytes, int]:
         """Return the bytes of a record with these quantities, and the CRC-32 of its head."""
-        parts = [_packed(QUANTITIES[name], values[name]) for name in self.places]
-        shapes = (np.shape(values[name]) for name, (_, place) in self.places.items() if isinstance(place, slice))
+        parts = [_packed(place, values[name]) for name, place in self.places.items()]
+        shapes = (np.shape(values[name]) for name, place in self.places.items() if isinstance(place.shape, slice))
         numbers = [*map(zlib.crc32, parts), *map(len, parts), *itertools.chain(*shapes)]
         head = struct.pack(f"<{len(numbers)}I", *numbers)
         return b"".join([head, *parts]), zlib.crc32(head)
@@ -137,36 +142,36 @@ class RecordLayout:
         ends = list(accumulate(numbers[count : 2 * count], initial=self.head))
         values = {}
         for name in self.places if names is None else names:
-            quantity, (place, shape) = QUANTITIES[name], self.places[name]
-            first, end = ends[place : place + 2]
+            quantity, place = QUANTITIES[name], self.places[name]
+            first, end = ends[place.order : place.order + 2]
             part = block[first:end]
             if end > len(block):
                 file.seek(start + first)
                 part = file.read(min(end - first, length))
-            if zlib.crc32(part) != numbers[place]:
+            if zlib.crc32(part) != numbers[place.order]:
                 raise ResultError(f"the checksum of {name} is wrong")
-            if isinstance(shape, slice):
-                values[name] = quantity.convert(_unpacked(quantity, part, numbers[shape]), self.sizes)
+            if isinstance(place.shape, slice):
+                values[name] = quantity.convert(_unpacked(place, part, numbers[place.shape]), self.sizes)
             else:
-                array = np.frombuffer(part, dtype=_STORED[name])
-                values[name] = array.reshape(shape).astype(quantity.dtype) if shape else array.item()
+                array = np.frombuffer(part, dtype=place.dtype)
+                values[name] = array.reshape(place.shape).astype(quantity.dtype) if place.shape else array.item()
         return values
 
 
-def _packed(entry: ResultQuantity, value: Any) -> bytes:
-    if entry.dtype is np.str_:
+def _packed(place: _Place, value: Any) -> bytes:
+    if place.dtype.kind == "U":
         return json.dumps(np.asarray(value).tolist()).encode("ascii")
-    raw = np.asarray(value, dtype=_STORED[entry.name]).tobytes()
-    return zlib.compress(raw, _FAST) if entry.name in _PICTURES else raw
+    raw = np.asarray(value, dtype=place.dtype).tobytes()
+    return zlib.compress(raw, _FAST) if place.dtype == np.uint8 and isinstance(place.shape, slice) else raw
 
 
-def _unpacked(entry: ResultQuantity, part: bytes, shape: Sequence[int]) -> Any:
+def _unpacked(place: _Place, part: bytes, shape: Sequence[int]) -> Any:
     """Undo `_packed`; a head that promises more than there is is an error before memory is taken for it."""
-    if entry.dtype is np.str_:
+    if place.dtype.kind == "U":
         return np.array(json.loads(part), dtype=np.str_).reshape(shape)
-    if entry.name in _PICTURES:
+    if place.dtype == np.uint8:
         part = zlib.decompressobj().decompress(part, min(math.prod(shape), _RATIO * len(part)) + 1)
-    return np.frombuffer(part, dtype=_STORED[entry.name]).reshape(shape).astype(entry.dtype)
+    return np.frombuffer(part, dtype=place.dtype).reshape(shape)
 
 
 def shard_files(folder: Path) -> list[Path]:
@@ -360,13 +365,15 @@ class FrameTable:
         opened, blanks = -1, dict[str, dict[str, Any]]()
         with ExitStack() as stack:
             try:
-                for frame, (shard, *place) in zip(chosen.tolist(), self.places[chosen].tolist(), strict=True):
+                for frame, (shard, start, length, head) in zip(
+                    chosen.tolist(), self.places[chosen].tolist(), strict=True
+                ):
                     if shard >= 0:
                         if shard != opened:
                             stack.close()
                             file = stack.enter_context(self.files[shard].open("rb", buffering=_BUFFER))
                             opened = shard
-                        yield self.layout.decode(file, *place, names=names)
+                        yield self.layout.decode(file, start, length, head, names)
                         continue
                     reason, sizes = _DAMAGED if self.damaged[frame] else _NOT_YET, self.layout.sizes
                     if reason not in blanks:

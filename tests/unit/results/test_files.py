@@ -152,9 +152,9 @@ def test_a_forged_head_is_told(copy: Path, name: str, size: int) -> None:
     table = Result.open(copy).table
     file = table.files[0]
     content, first = bytearray(file.read_bytes()), int(table.places["start"][0])
-    _, place = table.layout.places[name]
-    assert isinstance(place, slice)
-    for number in range(place.start, place.stop):
+    shape = table.layout.places[name].shape
+    assert isinstance(shape, slice)
+    for number in range(shape.start, shape.stop):
         content[first + 4 * number : first + 4 * number + 4] = size.to_bytes(4, "little")
     file.write_bytes(content)
     table.places["head"][0] = zlib.crc32(content[first : first + table.layout.head])
