@@ -53,20 +53,23 @@ class FrameFormat:
     movies
         Endings of its files that are named by themselves: a folder does not stand for movies.
     recognises
-        Whether a file, with what the user states of it, is read as this format; it raises nothing for any file.
+        Whether a file, with what the user states of it, is read as this format; it raises nothing for any file. None:
+        by its ending.
     source
         Its reader; built with `path` and `stated`, it reads nothing yet.
     """
 
     name: str
     endings: tuple[str, ...] = ()
-    recognises: Callable[[Path, FrameSettings], bool]
+    recognises: Callable[[Path, FrameSettings], bool] | None = None
     source: type[FrameSource]
     movies: tuple[str, ...] = ()
 
-
-def _ends(*endings: str) -> Callable[[Path, FrameSettings], bool]:
-    return lambda path, _: path.suffix.lower() in endings
+    def reads(self, path: Path, stated: FrameSettings) -> bool:
+        """Report whether it reads a file of which the user states this."""
+        if self.recognises is None:
+            return path.suffix.lower() in self.endings + self.movies
+        return self.recognises(path, stated)
 
 
 FORMATS = (
@@ -76,7 +79,7 @@ FORMATS = (
         recognises=is_headerless,
         source=HeaderlessFile,
     ),
-    FrameFormat(name="PNG", endings=(".png",), recognises=_ends(".png"), source=PngFile),
+    FrameFormat(name="PNG", endings=(".png",), source=PngFile),
     FrameFormat(
         name="TIFF stacks",
         recognises=lambda path, _: path.suffix.lower() in TIFF_ENDINGS and not is_dng(path) and is_tiff_stack(path),
@@ -88,21 +91,16 @@ FORMATS = (
         recognises=lambda path, _: path.suffix.lower() in TIFF_ENDINGS and not is_dng(path),
         source=TiffFile,
     ),
-    FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, recognises=_ends(*CINE_ENDINGS), source=CineFile),
+    FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, source=CineFile),
     FrameFormat(
         name="camera raws (DNG, NEF, CR2, ARW, ...)",
         endings=CAMERA_RAW_ENDINGS,
         recognises=lambda path, _: has_camera_header(path),
         source=CameraRaw,
     ),
-    FrameFormat(
-        name="Photron .mraw with .cihx or .cih",
-        movies=MRAW_ENDINGS,
-        recognises=_ends(*MRAW_ENDINGS),
-        source=MrawFile,
-    ),
-    FrameFormat(name="NorPix .seq", movies=(".seq",), recognises=_ends(".seq"), source=SeqFile),
-    FrameFormat(name="stacks in .npy files", movies=(".npy",), recognises=_ends(".npy"), source=NpyFile),
+    FrameFormat(name="Photron .mraw with .cihx or .cih", movies=MRAW_ENDINGS, source=MrawFile),
+    FrameFormat(name="NorPix .seq", movies=(".seq",), source=SeqFile),
+    FrameFormat(name="stacks in .npy files", movies=(".npy",), source=NpyFile),
     FrameFormat(
         name="stacks in HDF5 files",
         movies=HDF5_ENDINGS,
@@ -201,7 +199,7 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
         Of the first of `FORMATS` that recognises the file.
     """
     path = Path(path)
-    source = next((known.source for known in known_formats() if known.recognises(path, stated)), _UnknownFile)
+    source = next((known.source for known in known_formats() if known.reads(path, stated)), _UnknownFile)
     return source(path=path, stated=stated, camera=camera)
 
 

@@ -216,13 +216,19 @@ def open_series(
     if len(set(counts)) > 1:
         numbers_given = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
         raise FrameError(f"lights fired in succession need equal numbers of frames; given are {numbers_given}")
+    begins: Sequence[int] = ()
     numbers = _numbers(settings, lights) if in_order else ()
     if settings.lights > 1:
-        begins, numbers = _turns(numbers or range(sum(map(len, lights[0]))), settings.lights)
-        series = FrameSeries(lights=lights, numbers=numbers, turn=settings.lights, begins=begins)
-    else:
-        series = FrameSeries(lights=lights, numbers=numbers)
-    _check_sizes(series)
+        begins, numbers = _turns(numbers or range(counts[0]), settings.lights)
+    series = FrameSeries(lights=lights, numbers=numbers, turn=settings.lights, begins=begins)
+    shapes = series.shapes()
+    for first, (rows, columns) in shapes:
+        for source, shape in shapes:
+            if shape != (rows, columns):
+                raise FrameError(
+                    f"all frames must have one size: {source.path} has {shape[0]} rows of {shape[1]} pixels, "
+                    f"{first.path} has {rows} of {columns}"
+                )
     return replace(series, chosen=chosen_frames(settings, len(series)))
 
 
@@ -295,17 +301,6 @@ def _listed(numbers: Sequence[int], most: int = 10) -> str:
     return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")
 
 
-def _check_sizes(series: FrameSeries) -> None:
-    shapes = series.shapes()
-    for first, (rows, columns) in shapes:
-        for source, shape in shapes:
-            if shape != (rows, columns):
-                raise FrameError(
-                    f"all frames must have one size: {source.path} has {shape[0]} rows of {shape[1]} pixels, "
-                    f"{first.path} has {rows} of {columns}"
-                )
-
-
 def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]:
     """List frame files in natural order (frame9 before frame10).
 
@@ -341,7 +336,12 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
         what = "a folder without frames" if place.is_dir() else "no file matches"
         other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")
         raise FrameError(f"no frames: {what}: {pattern} (looked for in {Path(base).resolve()}){other}")
-    return tuple(Path(f"{file}:{dataset}") if dataset else file for file in sorted(files, key=_natural_key))
+
+    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
+        parts = re.split(r"([0-9]+)", str(file).casefold())
+        return [(int(part), "") if place % 2 else (0, part) for place, part in enumerate(parts)], str(file)
+
+    return tuple(Path(f"{file}:{dataset}") if dataset else file for file in sorted(files, key=natural))
 
 
 def _matching(pattern: Path, base: Path) -> list[Path]:
@@ -352,9 +352,3 @@ def _matching(pattern: Path, base: Path) -> list[Path]:
     if not parts:
         return [base]
     return [base / match for match in glob.glob(str(Path(*parts)), root_dir=base, recursive=True)]  # noqa: PTH207
-
-
-def _natural_key(path: Path) -> tuple[list[tuple[int, str]], str]:
-    parts = re.split(r"([0-9]+)", str(path).casefold())
-    keys = [(int(part), "") if position % 2 else (0, part) for position, part in enumerate(parts)]
-    return keys, str(path)

@@ -168,9 +168,18 @@ class Movie(FrameSource):
 
 
 @contextmanager
+def _reading(path: Path | str) -> Iterator[None]:
+    """Turn what the disk refuses into a FrameError."""
+    try:
+        yield
+    except OSError as error:
+        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
+
+
+@contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
     """Check that there is something to read; what the disk refuses becomes a FrameError."""
-    try:
+    with _reading(path):
         if path.is_symlink() and not path.exists():
             raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
         if not regular(path).is_file():
@@ -178,8 +187,6 @@ def _on_disk(path: Path) -> Iterator[None]:
         if path.stat().st_size == 0:
             raise damaged(path, "it is empty")
         yield
-    except OSError as error:
-        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
 
 
 def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
@@ -215,7 +222,8 @@ def file_hash(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    return _digest(path, _sha256)
+    with _reading(path):
+        return _sha256(Path(path))
 
 
 def file_fingerprint(path: Path | str) -> str:
@@ -236,14 +244,8 @@ def file_fingerprint(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    return _digest(path, _sampled)
-
-
-def _digest(path: Path | str, function: Callable[[Path], str]) -> str:
-    try:
-        return function(Path(path))
-    except OSError as error:
-        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
+    with _reading(path):
+        return _sampled(Path(path))
 
 
 @remembered

@@ -61,7 +61,14 @@ def tiff_pages(path: Path) -> Iterator[list[TiffPage]]:
         It is no TIFF file, or what is done inside fails over a damaged header.
     """
     with _opened(path) as tiff:
-        yield [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
+        pages: dict[int, TiffPage] = {}
+        for frame in tiff.pages:
+            page = frame.aspage()
+            if page.offset in pages:  # tifffile would go round for ever
+                raise ValueError("its list of images leads back to itself")
+            pages[page.offset] = page
+        found = (one for page in pages.values() for one in (page, *(child.aspage() for child in page.pages or ())))
+        yield [page for page in found if not int(page.subfiletype) & _REDUCED]
 
 
 @contextmanager
@@ -109,17 +116,6 @@ def is_dng(path: Path) -> bool:
     return head[:4] in _BYTE_ORDERS and _DNG_VERSION in (
         int.from_bytes(tags[start : start + 2], order) for start in range(0, len(tags), 12)
     )
-
-
-def _pages(tiff: TiffFile) -> Iterator[TiffPage]:
-    seen: set[int] = set()
-    for frame in tiff.pages:
-        page = frame.aspage()
-        if page.offset in seen:  # tifffile would go round for ever
-            raise ValueError("its list of images leads back to itself")
-        seen.add(page.offset)
-        yield page
-        yield from (child.aspage() for child in page.pages or ())
 
 
 def missing_data(page: TiffPage, size: int) -> str | None:

@@ -36,17 +36,9 @@ _DESCRIPTION_BYTES = 256 * 2**20
 """Most bytes of a description: OME uses some 300 for every frame."""
 _SHORT = 3
 _NEW_TYPE, _COLUMNS, _ROWS, _DESCRIPTION = 254, 256, 257, 270
-_UNITS = {
-    "s": 1,
-    "sec": 1,
-    "seconds": 1,
-    "ms": 1000,
-    "msec": 1000,
-    "µs": 10**6,
-    "us": 10**6,
-    "usec": 10**6,
-    "ns": 10**9,
-}
+_UNITS = {"s": 1, "sec": 1, "seconds": 1}
+_UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": 10**9}
+"""Of time, by how many make a second."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,19 +54,16 @@ class TiffStack(Movie):
             raise FrameError(
                 f"{self.path}: its list of frames ends after {index - 1}: truncated or still being written"
             )
-        behind_one_page = len(stack.offsets) == 1
-        with tiff_page(self.path, int(stack.offsets[0 if behind_one_page else index])) as page:
+        alone = len(stack.offsets) == 1
+        with tiff_page(self.path, int(stack.offsets[0 if alone else index])) as page:
             checked_page(page, self.path)
             if (page.imagelength, page.imagewidth) != stack.shape:
-                sizes = "{} rows of {} pixels, the first {} of {}".format(
-                    page.imagelength, page.imagewidth, *stack.shape
+                here = f"{page.imagelength} rows of {page.imagewidth} pixels"
+                raise FrameError(
+                    f"{self.path}: frame {index} has {here}, the first {stack.shape[0]} of {stack.shape[1]}"
                 )
-                raise FrameError(f"{self.path}: frame {index} has {sizes}")
-            samples = (
-                _behind(page, self.path, index, stack.recording.count, rows)
-                if behind_one_page
-                else page_rows(page, self.path, rows)
-            )
+            behind = _behind(page, self.path, index, stack.recording.count, rows) if alone else None
+            samples = behind if alone else page_rows(page, self.path, rows)
             stored = page_frame(page, self.path, samples)
             return stored if samples is not None else replace(stored, values=stored.values[rows.start : rows.stop])
 

@@ -171,7 +171,7 @@ def _unpacked(place: _Place, part: bytes, shape: Sequence[int]) -> Any:
         return np.array(json.loads(part), dtype=np.str_).reshape(shape)
     if place.dtype == np.uint8:
         part = zlib.decompressobj().decompress(part, min(math.prod(shape), _RATIO * len(part)) + 1)
-    return np.frombuffer(part, dtype=place.dtype).reshape(shape)
+    return np.frombuffer(part, dtype=place.dtype).reshape(shape).copy()
 
 
 def shard_files(folder: Path) -> list[Path]:
