@@ -14,7 +14,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -128,11 +128,9 @@ class CineFile(Movie):
             return part.reshape(len(rows), lines[1]), range(len(rows))
 
     def _ends(self, header: _Header, index: int) -> FrameError:
-        last = min(header.last_whole, index - 1)
+        last, count = min(header.last_whole, index - 1), len(self)
         place = f"after frame {last}" if last >= 0 else "before the first frame"
-        return FrameError(
-            f"{self.path} ends {place} of {len(self)} (0 to {len(self) - 1}): truncated or still being written"
-        )
+        return FrameError(f"{self.path} ends {place} of {count} (0 to {count - 1}): truncated or still being written")
 
 
 def _samples(header: _Header, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
@@ -211,18 +209,22 @@ def _header(path: Path) -> _Header:
     """
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
-        mark, _, compression, version, _, _, first, count, *places, trigger = _unpacked(path, file, _FILE, 0)
+        mark, _, compression, version, _, _, first, count, *places, trigger = _FILE.unpack(
+            _piece(path, file, 0, _FILE.size)
+        )
         if mark != b"CI":
             raise FrameError(f"{path} is no Phantom movie: it does not begin as one")
         if not 0 < count <= _MOST_FRAMES:
             raise damaged(path, f"its header announces {count} frames")
-        _, columns, height, _, bit_count, packing, _, _, _, _, levels = _unpacked(path, file, _BITMAP, places[0])
+        _, columns, height, _, bit_count, packing, _, _, _, _, levels = _BITMAP.unpack(
+            _piece(path, file, places[0], _BITMAP.size)
+        )
         setup, end = _setup(path, file, places[1])
         kind, cfa = _colours(path, compression, bit_count, setup.get("cfa", 0))
         bits, shape = _PACKED_BITS.get(packing, bit_count), (abs(height), columns)
         if packing not in _PACKED_BITS and (packing != 0 or bit_count not in (8, 16)):
-            what = f"samples of {bit_count} bit, packed in the way {packing}, which is unknown"
-            raise damaged(path, f"its header announces {what}")
+            what = f"its header announces samples of {bit_count} bit, packed in the way {packing}, which is unknown"
+            raise damaged(path, what)
         if min(shape) < 1:
             raise damaged(path, f"its header announces {shape[0]} rows of {shape[1]} pixels")
         check_size(path, needed=2 * math.prod(shape), stored=_needed(shape, bits))
@@ -268,10 +270,6 @@ def _piece(path: Path, file: BinaryIO, start: int, length: int) -> bytes:
     return piece
 
 
-def _unpacked(path: Path, file: BinaryIO, layout: struct.Struct, start: int) -> tuple[Any, ...]:
-    return layout.unpack(_piece(path, file, start, layout.size))
-
-
 def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]:
     """Read the fields that the camera's settings store, and where these end."""
     head = _piece(path, file, start, _LENGTH + 2)
@@ -279,11 +277,10 @@ def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]
     if head[_MARK:_LENGTH] != b"ST" or length < len(head):
         raise damaged(path, "the camera's settings in its header are not where they should be")
     stored = _piece(path, file, start, length)
-    layouts = {name: (place, struct.Struct("<" + kind)) for name, (place, kind) in _SETUP.items()}
     fields = {
-        name: layout.unpack_from(stored, place)[0]
-        for name, (place, layout) in layouts.items()
-        if place + layout.size <= length
+        name: struct.unpack_from("<" + kind, stored, place)[0]
+        for name, (place, kind) in _SETUP.items()
+        if place + struct.calcsize(kind) <= length
     }
     return fields, start + length
 
@@ -296,10 +293,11 @@ def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[F
     FrameError
         The samples are not the sensor's, or the pattern is no Bayer pattern.
     """
-    if compression == _LEAD:
-        _refuse(path, "compressed (JPEG)")
-    if bit_count > 16:
-        _refuse(path, "processed (interpolated) colour")
+    if compression == _LEAD or bit_count > 16:
+        what = "compressed (JPEG)" if compression == _LEAD else "processed (interpolated) colour"
+        raise FrameError(
+            f"{path} is {what}: its samples are no longer the sensor's; save it as raw .cine from the camera's software"
+        )
     if compression not in (0, _UNINTERPOLATED):
         raise damaged(path, f"its header announces the kind of compression {compression}, which is unknown")
     if code & _GREY_HEADS:
@@ -309,12 +307,6 @@ def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[F
     if compression == _UNINTERPOLATED and code in _PATTERNS:
         return "bayer", _PATTERNS[code]
     return ("monochrome" if code == compression == 0 else None), None
-
-
-def _refuse(path: Path, what: str) -> NoReturn:
-    raise FrameError(
-        f"{path} is {what}: its samples are no longer the sensor's; save it as raw .cine from the camera's software"
-    )
 
 
 def _depth(bits: int, real: int, levels: int) -> int:

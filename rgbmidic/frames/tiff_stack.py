@@ -128,10 +128,9 @@ class _Pages:
         head = file.read(4)
         if head not in HEADERS:
             raise damaged(path, "it is not a TIFF file")
-        big = head in HEADERS[2:]
         order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
-        widths = {"offset": 8, "count": 8, "entry": 20} if big else {"offset": 4, "count": 2, "entry": 12}
-        return cls(file=file, size=file.seek(0, 2), order=order, **widths)
+        offset, count, entry = (8, 8, 20) if head in HEADERS[2:] else (4, 2, 12)
+        return cls(file=file, size=file.seek(0, 2), order=order, offset=offset, count=count, entry=entry)
 
     def offsets(self, path: Path) -> tuple[list[int], bool]:
         """Where the pages in full resolution begin, and whether their list leads out of the file."""
@@ -146,7 +145,8 @@ class _Pages:
             if content is None:
                 return found, True
             seen.add(offset)
-            if not self._reduced(content):
+            # entries come in the order of their codes, and that of reduced images is the lowest
+            if self._number(content, self.count, 2) != _NEW_TYPE or not self.value(content, _NEW_TYPE) & 1:
                 found.append(offset)
             offset = self._number(content, len(content) - self.offset, self.offset)
         if not found:
@@ -186,10 +186,6 @@ class _Pages:
         starts = range(self.count, len(content) - self.offset, self.entry)
         return next((start for start in starts if self._number(content, start, 2) == code), 0)
 
-    def _reduced(self, content: bytes) -> bool:
-        # entries come in the order of their codes, and this one's is the lowest
-        return self._number(content, self.count, 2) == _NEW_TYPE and bool(self.value(content, _NEW_TYPE) & 1)
-
     def _number(self, content: bytes, start: int, width: int) -> int:
         return int.from_bytes(content[start : start + width], self.order)
 
@@ -197,11 +193,10 @@ class _Pages:
 def _imagej_times(text: str, count: int) -> Integers | None:
     """Derive times from ImageJ's frame interval, where all images are frames in time."""
     entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
-    interval = _fraction(entries.get("finterval", ""))
     others = {"channels", "slices"} & entries.keys()
     if entries.get("frames", "" if others else str(count)) != str(count):
         return None
-    return _even(interval, entries.get("tunit", "s"), count)
+    return _even_times(entries.get("finterval", ""), entries.get("tunit", "s"), count)
 
 
 def _ome_times(text: str, count: int) -> Integers | None:
@@ -215,19 +210,20 @@ def _ome_times(text: str, count: int) -> Integers | None:
     if pixels is None or pixels.get("SizeT") != str(count):
         return None
     if pixels.get("TimeIncrement"):
-        return _even(_fraction(pixels.get("TimeIncrement", "")), pixels.get("TimeIncrementUnit", "s"), count)
+        return _even_times(pixels.get("TimeIncrement", ""), pixels.get("TimeIncrementUnit", "s"), count)
     planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
     each = [planes.get(str(index), pixels) for index in range(count)]
-    times = [(_fraction(plane.get("DeltaT", "")), _UNITS.get(plane.get("DeltaTUnit", "s"))) for plane in each]
-    if any(time is None or unit is None for time, unit in times):
+    times = [_seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s")) for plane in each]
+    known = [round(time * 10**9) for time in times if time is not None]
+    return np.array(known, dtype=np.int64) if len(known) == count else None
+
+
+def _even_times(interval: str, unit: str, count: int) -> Integers | None:
+    seconds = _seconds(interval, unit)
+    return even_times(range(count), seconds) if seconds else None
+
+
+def _seconds(text: str, unit: str) -> Fraction | None:
+    if unit not in _UNITS or not re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,15})?([eE]-?[0-9])?", text):
         return None
-    return np.array([round(time * 10**9 / unit) for time, unit in times if time is not None and unit], dtype=np.int64)
-
-
-def _even(interval: Fraction | None, unit: str, count: int) -> Integers | None:
-    per_second = _UNITS.get(unit)
-    return even_times(range(count), interval / per_second) if interval and per_second else None
-
-
-def _fraction(text: str) -> Fraction | None:
-    return Fraction(text) if re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,15})?([eE]-?[0-9])?", text) else None
+    return Fraction(text) / _UNITS[unit]
