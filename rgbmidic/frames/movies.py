@@ -233,14 +233,8 @@ _SEQ_FIELDS = struct.Struct("<I24xi4x512x6I3Id16xi8xI32xI364x")
 """Magic; version; width, height, bits stored, bits used, bytes, format; frames, origin, distance; rate; pattern;
 compression; oldest frame."""
 
-_RAW: dict[int, tuple[Literal["<", ">"], bool]] = {
-    100: ("<", False),
-    101: ("<", False),
-    112: ("<", True),
-    113: ("<", True),
-    114: (">", True),
-    115: (">", True),
-}
+_RAW: dict[int, tuple[Literal["<", ">"], bool]] = dict.fromkeys((100, 101), ("<", False))
+_RAW |= dict.fromkeys((112, 113), ("<", True)) | dict.fromkeys((114, 115), (">", True))
 """Monochrome and raw Bayer formats: byte order, and whether a sample's highest bit is the highest of its type."""
 _BAYER = (101, 113, 115)
 _PACKED = range(131, 135)

@@ -80,9 +80,7 @@ class FrameSeries:
         FrameError
             None can be read.
         """
-        for _, shape in self.shapes():
-            return shape
-        return self.lights[0][0].shape
+        return next((shape for _, shape in self.shapes()), None) or self.lights[0][0].shape
 
     @property
     def recording(self) -> Recording:
@@ -139,10 +137,8 @@ class FrameSeries:
         file is not read whole for it.
         """
         in_part = window is not None and not window.is_whole
-        sources = (source for source, _ in self._locate(index))
-        return {
-            legible(source.path): file_fingerprint(source.path) if in_part else source.fingerprint for source in sources
-        }
+        sources = [source for source, _ in self._locate(index)]
+        return {legible(one.path): file_fingerprint(one.path) if in_part else one.fingerprint for one in sources}
 
     def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
         """Return the SHA-256 of names and sampled content of all files, and the names of those that count without it.

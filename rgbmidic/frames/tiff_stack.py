@@ -1,7 +1,4 @@
-"""TIFF and BigTIFF files of several frames: one page each, as ImageJ's hyperstacks and OME-TIFF are, too.
-
-The list of pages is followed by own code, once: a hundred thousand pages take tifffile seconds, for every frame anew.
-"""
+"""TIFF and BigTIFF files of several frames: one page each, as ImageJ's hyperstacks and OME-TIFF are, too."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Literal
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,8 +15,8 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.images import checked_page, page_frame, page_rows
 from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import Layout, StoredFrame, check_count, damaged
-from rgbmidic.frames.tiff_pages import HEADERS, is_stored_as_is, tiff_page
+from rgbmidic.frames.stored import Layout, StoredFrame, check_count
+from rgbmidic.frames.tiff_pages import COLUMNS, DESCRIPTION, ROWS, PageList, is_stored_as_is, tiff_page
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
@@ -28,14 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TiffStack", "is_tiff_stack"]
 
-_PIECE = 512
-"""Bytes that are read of a page at once: its usual one to two dozen entries."""
-_MOST_ENTRIES = 4096
-"""Entries of a page beyond which it is no page: those seen have a few dozen."""
-_DESCRIPTION_BYTES = 256 * 2**20
-"""Most bytes of a description: OME uses some 300 for every frame."""
-_SHORT = 3
-_NEW_TYPE, _COLUMNS, _ROWS, _DESCRIPTION = 254, 256, 257, 270
 _UNITS = {"s": 1, "sec": 1, "seconds": 1}
 _UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": 10**9}
 """Of time, by how many make a second."""
@@ -99,95 +88,17 @@ class _Stack:
 @remembered
 def _stack(path: Path) -> _Stack:
     with regular(path).open("rb") as file:
-        pages = _Pages.begin(file, path)
+        pages = PageList.begin(file, path)
         offsets, ends_early = pages.offsets(path)
         content = pages.content(offsets[0]) or b""
-        text = pages.text(content, _DESCRIPTION)
-        shape = (pages.value(content, _ROWS), pages.value(content, _COLUMNS))
+        text = pages.text(content, DESCRIPTION)
+        shape = (pages.value(content, ROWS), pages.value(content, COLUMNS))
     images = re.search(r"^images=([0-9]{1,9})$", text, re.MULTILINE) if text.startswith("ImageJ=") else None
     count = int(images[1]) if images and len(offsets) == 1 else len(offsets) + (ends_early and len(offsets) > 1)
     check_count(path, count)
     times = _imagej_times(text, count) if images else _ome_times(text, count)
     recording = Recording(count=count, times_ns=times)
     return _Stack(offsets=np.array(offsets, dtype=np.int64), shape=shape, recording=recording)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Pages:
-    """The pages of an open file of `size` bytes; widths in bytes of an offset, a number of entries, an entry."""
-
-    file: BinaryIO
-    size: int
-    order: Literal["little", "big"]
-    offset: int
-    count: int
-    entry: int
-
-    @classmethod
-    def begin(cls, file: BinaryIO, path: Path) -> _Pages:
-        head = file.read(4)
-        if head not in HEADERS:
-            raise damaged(path, "it is not a TIFF file")
-        order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
-        offset, count, entry = (8, 8, 20) if head in HEADERS[2:] else (4, 2, 12)
-        return cls(file=file, size=file.seek(0, 2), order=order, offset=offset, count=count, entry=entry)
-
-    def offsets(self, path: Path) -> tuple[list[int], bool]:
-        """Where the pages in full resolution begin, and whether their list leads out of the file."""
-        self.file.seek(self.offset)  # 4 or 8: of both headers the offset of the first page is the last field
-        offset = self._number(self.file.read(self.offset), 0, self.offset)
-        found: list[int] = []
-        seen: set[int] = set()
-        while offset:
-            content = self.content(offset)
-            if offset in seen or (content is None and not found):
-                raise damaged(path, "its list of images leads back to itself" if found else "it leads to no image")
-            if content is None:
-                return found, True
-            seen.add(offset)
-            # entries come in the order of their codes, and that of reduced images is the lowest
-            if self._number(content, self.count, 2) != _NEW_TYPE or not self.value(content, _NEW_TYPE) & 1:
-                found.append(offset)
-            offset = self._number(content, len(content) - self.offset, self.offset)
-        if not found:
-            raise damaged(path, "its header leads to no image")
-        return found, False
-
-    def content(self, offset: int) -> bytes | None:
-        """Read the number of entries, the entries and the offset of the next page; None where the file ends before."""
-        if offset + self.count > self.size:
-            return None
-        self.file.seek(offset)
-        content = self.file.read(_PIECE)
-        number = self._number(content, 0, self.count)
-        needed = self.count + number * self.entry + self.offset
-        if not 0 < number <= _MOST_ENTRIES or offset + needed > self.size:
-            return None
-        return content[:needed] + self.file.read(max(needed - len(content), 0))
-
-    def value(self, content: bytes, code: int) -> int:
-        """Return the one value of an entry; 0 where there is none."""
-        found = self._entry(content, code)
-        width = 2 if self._number(content, found + 2, 2) == _SHORT else 4
-        return self._number(content, found + 4 + self.offset, width) if found else 0
-
-    def text(self, content: bytes, code: int) -> str:
-        """Return the text of an entry; empty where there is none."""
-        found = self._entry(content, code)
-        number = self._number(content, found + 4, self.offset) if found else 0
-        start = found + 4 + self.offset
-        if number <= self.offset:
-            return content[start : start + number].decode(errors="replace").rstrip("\0")
-        self.file.seek(min(self._number(content, start, self.offset), self.size))
-        return self.file.read(min(number, _DESCRIPTION_BYTES)).decode(errors="replace").rstrip("\0")
-
-    def _entry(self, content: bytes, code: int) -> int:
-        """Return where the entry begins; 0 where there is none."""
-        starts = range(self.count, len(content) - self.offset, self.entry)
-        return next((start for start in starts if self._number(content, start, 2) == code), 0)
-
-    def _number(self, content: bytes, start: int, width: int) -> int:
-        return int.from_bytes(content[start : start + width], self.order)
 
 
 def _imagej_times(text: str, count: int) -> Integers | None:
