@@ -48,6 +48,7 @@ __all__ = [
     "finish_result",
     "listed",
     "load_frames",
+    "load_result",
     "read_mesh",
     "read_names",
     "read_reference",
@@ -231,12 +232,9 @@ def finish_result(path: Path | str) -> None:
         The folder is no result, a frame is missing or damaged, or it cannot be written.
     """
     path = Path(path)
-    provenance = read_provenance(path)
-    names = read_names(path, provenance)
-    sizes = {"node": len(read_mesh(path, provenance)["nodes"]), "light": len(provenance["lights"])}
-    ended = "finished" in provenance
-    table = load_frames(path, sizes, len(names), fingerprint(provenance)).without_damaged(ended=ended)
-    check_complete(path, names, table, ended=ended)
+    kept = load_result(path)
+    provenance, ended = kept["provenance"], "finished" in kept["provenance"]
+    check_complete(path, kept["names"], kept["table"].without_damaged(ended=ended), ended=ended)
     if not ended:
         write_json(path / PROVENANCE, sealed({**provenance, "finished": now()}))
 
@@ -262,6 +260,15 @@ def listed(frames: Sequence[int], names: Sequence[str]) -> str:
     """List the first of some frames with their names, and how many more there are."""
     more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
     return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:_LISTED]) + more
+
+
+def load_result(path: Path) -> dict[str, Any]:
+    """Read what a `Result` is made of, as far as the folder has come; a `ResultError` where something is damaged."""
+    provenance = read_provenance(path)
+    names, mesh, lights = read_names(path, provenance), read_mesh(path, provenance), tuple(provenance["lights"])
+    sizes = {"node": len(mesh["nodes"]), "light": len(lights)}
+    table = load_frames(path, sizes, len(names), fingerprint(provenance))
+    return {"table": table, "names": names, "lights": lights, "provenance": provenance, **mesh}
 
 
 def load_frames(path: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
