@@ -24,7 +24,6 @@ from rgbmidic.fields import (
     Probe,
     RigidMotion,
     Units,
-    column,
     make_probe,
     rates,
 )
@@ -44,29 +43,8 @@ _FAST = 95
 """Percentile of the nodes' speeds that stands for the fast ones: single outliers do not count."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class HistoryColumn:
-    """A column of `Histories`: one quantity over the frames in the reader's unit.
-
-    Attributes
-    ----------
-    name
-        Without its unit.
-    unit
-        Such as ``"mm"``, ``"px/frame"``, ``"1/s"``; empty for a strain.
-    values, std : ndarray, shape (T,)
-        NaN where not known; `std` is None for what was not measured by the images.
-    """
-
-    name: str
-    unit: str
-    values: FloatArray
-    std: FloatArray | None
-
-    @property
-    def column(self) -> str:
-        """Name of its column, with the unit."""
-        return column(self.name, self.unit)
+HistoryColumn = History
+"""A column of `Histories`: one quantity over the frames in the reader's unit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,7 +140,6 @@ def read_histories(
     *,
     scale: ScaleSettings | None = None,
     channels: Channels | None = None,
-    offset: float = 0.0,
     area: float | None = None,
     force: str | None = None,
 ) -> Histories:
@@ -180,8 +157,6 @@ def read_histories(
         It replaces the ``[scale]`` that was kept with the result; None: that one.
     channels
         Recorded beside the test.
-    offset
-        Seconds that are added to the times of the channels.
     area
         Cross-section of the specimen in square mm, for a stress.
     force
@@ -231,7 +206,7 @@ def read_histories(
         for history in read
         for column in _in_units(history, units, clock, probes.window, shared_part(result), references)
     ]
-    beside, stress = _beside(channels, times, offset, area, force)
+    beside, stress = _beside(channels, times, area, force)
     strain = next((column.name for column in quantities if column.name.endswith(("_strain", "_e1"))), None)
     return Histories(
         frames=there,
@@ -291,6 +266,7 @@ def _in_units(
         values, std = units.lengths(values, std) if length else (values, std)
         return HistoryColumn(name=name, unit=unit, values=values, std=std)
 
+    assert history.std is not None
     yield column(history.name, unit, history.values, history.std)
     if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
@@ -305,7 +281,7 @@ def _in_units(
 
 
 def _beside(
-    channels: Channels | None, times: FloatArray | None, offset: float, area: float | None, force: str | None
+    channels: Channels | None, times: FloatArray | None, area: float | None, force: str | None
 ) -> tuple[list[HistoryColumn], list[HistoryColumn]]:
     """Interpolate the channels at the times of the frames; compute the stress where a cross-section (mm²) is known."""
     if area is not None and (channels is None or not area > 0):
@@ -317,7 +293,7 @@ def _beside(
             f"the channels {channels.path} cannot be brought to the frames, whose times are not known: state "
             "frame_rate in [scale]"
         )
-    read = channels.at(times, offset)
+    read = channels.at(times)
     beside = [HistoryColumn(name=name, unit="", values=values, std=None) for name, values in read.items()]
     if area is None:
         return beside, []
