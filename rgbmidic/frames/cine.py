@@ -90,60 +90,6 @@ class CineFile(Movie):
     def _header(self) -> _Header:
         return _header(self.path)
 
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        header = _header(self.path)
-        height = header.shape[0]
-        stored = range(height - rows.stop, height - rows.start) if header.bottom_up else rows
-        values = _samples(header, *self._lines(header, index, stored))
-        if header.bits == _CODED_BITS:
-            values = _LINEAR[values]
-        return StoredFrame(
-            values=values[::-1] if header.bottom_up else values,
-            kind=header.kind,
-            cfa=header.cfa,
-            black_level=header.black_level,
-            white_level=header.white_level,
-        )
-
-    def _lines(self, header: _Header, index: int, rows: range) -> tuple[npt.NDArray[np.uint8], range]:
-        """Read the lines (n, bytes) that hold some rows of a frame; return them and the rows in them."""
-        start = int(header.pointers[index])
-        with self.path.open("rb") as file:
-            if start < header.first_byte or start + 8 > header.size:
-                raise self._ends(header, index)
-            file.seek(start)
-            annotation = int.from_bytes(file.read(4), "little")
-            if annotation < 8 or start + annotation > header.size:
-                raise damaged(self.path, f"the annotation of frame {index} has {annotation} bytes")
-            file.seek(start + annotation - 4)
-            lines = header.lines(int.from_bytes(file.read(4), "little"))
-            if lines is None:
-                raise damaged(self.path, f"frame {index} has not the size that its header announces")
-            if start + annotation + lines[0] * lines[1] > header.size:
-                raise self._ends(header, index)
-            if lines[0] == 1:  # all samples in a row
-                return np.fromfile(file, dtype=np.uint8, count=lines[1]).reshape(lines), rows
-            file.seek(rows.start * lines[1], 1)
-            part = np.fromfile(file, dtype=np.uint8, count=len(rows) * lines[1])
-            return part.reshape(len(rows), lines[1]), range(len(rows))
-
-    def _ends(self, header: _Header, index: int) -> FrameError:
-        last, count = min(header.last_whole, index - 1), len(self)
-        place = f"after frame {last}" if last >= 0 else "before the first frame"
-        return FrameError(f"{self.path} ends {place} of {count} (0 to {count - 1}): truncated or still being written")
-
-
-def _samples(header: _Header, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
-    """Return samples (n, W), uint8 or uint16, of some of the rows in the lines that they are stored in."""
-    columns = header.shape[1]
-    if header.bits in (8, 16):
-        samples: AnyArray = lines.view("u1" if header.bits == 8 else "<u2")
-    else:
-        samples = unpack_bits(lines, header.bits)
-    if len(lines) == 1 and header.shape[0] > 1:
-        return samples[0, rows.start * columns : rows.stop * columns].reshape(len(rows), columns)
-    return samples[:, :columns]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Header:
@@ -196,6 +142,60 @@ class _Header:
             return (rows, size // rows) if self.bits in (8, 16) else (1, size)
         line = math.ceil(columns * self.bits / 32) * 4  # as in Windows bitmaps
         return (rows, line) if size == rows * line else None
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame."""
+        height = self.shape[0]
+        stored = range(height - rows.stop, height - rows.start) if self.bottom_up else rows
+        values = _samples(self, *self._lines(path, index, stored))
+        if self.bits == _CODED_BITS:
+            values = _LINEAR[values]
+        return StoredFrame(
+            values=values[::-1] if self.bottom_up else values,
+            kind=self.kind,
+            cfa=self.cfa,
+            black_level=self.black_level,
+            white_level=self.white_level,
+        )
+
+    def _lines(self, path: Path, index: int, rows: range) -> tuple[npt.NDArray[np.uint8], range]:
+        """Read the lines (n, bytes) that hold some rows of a frame; return them and the rows in them."""
+        start = int(self.pointers[index])
+        with path.open("rb") as file:
+            if start < self.first_byte or start + 8 > self.size:
+                raise self._ends(path, index)
+            file.seek(start)
+            annotation = int.from_bytes(file.read(4), "little")
+            if annotation < 8 or start + annotation > self.size:
+                raise damaged(path, f"the annotation of frame {index} has {annotation} bytes")
+            file.seek(start + annotation - 4)
+            lines = self.lines(int.from_bytes(file.read(4), "little"))
+            if lines is None:
+                raise damaged(path, f"frame {index} has not the size that its header announces")
+            if start + annotation + lines[0] * lines[1] > self.size:
+                raise self._ends(path, index)
+            if lines[0] == 1:  # all samples in a row
+                return np.fromfile(file, dtype=np.uint8, count=lines[1]).reshape(lines), rows
+            file.seek(rows.start * lines[1], 1)
+            part = np.fromfile(file, dtype=np.uint8, count=len(rows) * lines[1])
+            return part.reshape(len(rows), lines[1]), range(len(rows))
+
+    def _ends(self, path: Path, index: int) -> FrameError:
+        last, count = min(self.last_whole, index - 1), self.recording.count
+        place = f"after frame {last}" if last >= 0 else "before the first frame"
+        return FrameError(f"{path} ends {place} of {count} (0 to {count - 1}): truncated or still being written")
+
+
+def _samples(header: _Header, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
+    """Return samples (n, W), uint8 or uint16, of some of the rows in the lines that they are stored in."""
+    columns = header.shape[1]
+    if header.bits in (8, 16):
+        samples: AnyArray = lines.view("u1" if header.bits == 8 else "<u2")
+    else:
+        samples = unpack_bits(lines, header.bits)
+    if len(lines) == 1 and header.shape[0] > 1:
+        return samples[0, rows.start * columns : rows.stop * columns].reshape(len(rows), columns)
+    return samples[:, :columns]
 
 
 @remembered

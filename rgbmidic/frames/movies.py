@@ -109,9 +109,6 @@ class MrawFile(Movie):
             raise FrameError(f"{self.path} needs its header {self.path.stem}.cihx or {self.path.stem}.cih beside it")
         return _mraw_header(found)
 
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        return self._header().read(self.path, index, rows)
-
 
 def _beside(path: Path, *endings: str) -> Path | None:
     """Find the file of the same name with the first of these endings that exists, in lower or upper case."""
@@ -248,9 +245,6 @@ class SeqFile(Movie):
 
     def _header(self) -> _Header:
         return _seq_header(self.path)
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        return self._header().read(self.path, index, rows)
 
 
 @remembered

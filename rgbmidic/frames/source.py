@@ -125,10 +125,13 @@ class MovieHeader(Protocol):
     def recording(self) -> Recording:
         """Number, times and settings of the frames."""
 
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame, the first of which is a whole multiple of 4."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Movie(FrameSource):
-    """A file of several frames, whose header is read when the number of its frames is asked for.
+    """A file of several frames, whose header is read when the number of its frames is asked for, and reads the frames.
 
     Of a frame only its own samples are read, whatever the size of the file; a header that is `remembered` is read once.
     """
@@ -160,11 +163,11 @@ class Movie(FrameSource):
     def _stored(self, index: int) -> StoredFrame:
         return self._rows(index, range(self._shape()[0]))
 
-    @abstractmethod
-    def _header(self) -> MovieHeader: ...
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        return self._header().read(self.path, index, rows)
 
     @abstractmethod
-    def _rows(self, index: int, rows: range) -> StoredFrame: ...
+    def _header(self) -> MovieHeader: ...
 
 
 @contextmanager

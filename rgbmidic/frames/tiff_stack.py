@@ -37,25 +37,6 @@ class TiffStack(Movie):
     def _header(self) -> _Stack:
         return _stack(self.path)
 
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        stack = _stack(self.path)
-        if index >= len(stack.offsets) > 1:
-            raise FrameError(
-                f"{self.path}: its list of frames ends after {index - 1}: truncated or still being written"
-            )
-        alone = len(stack.offsets) == 1
-        with tiff_page(self.path, int(stack.offsets[0 if alone else index])) as page:
-            checked_page(page, self.path)
-            if (page.imagelength, page.imagewidth) != stack.shape:
-                here = f"{page.imagelength} rows of {page.imagewidth} pixels"
-                raise FrameError(
-                    f"{self.path}: frame {index} has {here}, the first {stack.shape[0]} of {stack.shape[1]}"
-                )
-            behind = _behind(page, self.path, index, stack.recording.count, rows) if alone else None
-            samples = behind if alone else page_rows(page, self.path, rows)
-            stored = page_frame(page, self.path, samples)
-            return stored if samples is not None else replace(stored, values=stored.values[rows.start : rows.stop])
-
 
 def is_tiff_stack(path: Path) -> bool:
     """Return whether a TIFF file holds several frames; False for what cannot be read."""
@@ -83,6 +64,21 @@ class _Stack:
     offsets: Integers
     shape: tuple[int, int]
     recording: Recording
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame."""
+        if index >= len(self.offsets) > 1:
+            raise FrameError(f"{path}: its list of frames ends after {index - 1}: truncated or still being written")
+        alone = len(self.offsets) == 1
+        with tiff_page(path, int(self.offsets[0 if alone else index])) as page:
+            checked_page(page, path)
+            if (page.imagelength, page.imagewidth) != self.shape:
+                here = f"{page.imagelength} rows of {page.imagewidth} pixels"
+                raise FrameError(f"{path}: frame {index} has {here}, the first {self.shape[0]} of {self.shape[1]}")
+            behind = _behind(page, path, index, self.recording.count, rows) if alone else None
+            samples = behind if alone else page_rows(page, path, rows)
+            stored = page_frame(page, path, samples)
+            return stored if samples is not None else replace(stored, values=stored.values[rows.start : rows.stop])
 
 
 @remembered
