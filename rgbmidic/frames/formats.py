@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Literal, NoReturn, TypedDict, Unpack
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
@@ -36,8 +36,6 @@ __all__ = [
 ]
 
 logger = logging.getLogger(__name__)
-
-SampleType = Literal["uint8", "uint16", ">u2"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,16 +206,18 @@ def reader_name(source: FrameSource) -> str:
     return next((known.name for known in known_formats() if known.source is type(source)), "unknown")
 
 
-def read_frame(
-    path: Path | str,
-    *,
-    kind: FrameKind | None = None,
-    cfa: str | None = None,
-    black_level: float | None = None,
-    white_level: float | None = None,
-    shape: tuple[int, int] | None = None,
-    dtype: SampleType | None = None,
-) -> Mosaic | ChannelFrame:
+class Statements(TypedDict, total=False):
+    """What the caller of `read_frame` states of a file; None: what the file states."""
+
+    kind: FrameKind | None
+    cfa: str | None
+    black_level: float | None
+    white_level: float | None
+    shape: tuple[int, int] | None
+    dtype: Literal["uint8", "uint16", ">u2"] | None
+
+
+def read_frame(path: Path | str, **stated: Unpack[Statements]) -> Mosaic | ChannelFrame:
     """Read one raw frame.
 
     Camera raws (LibRaw) state everything themselves. TIFF and PNG state size and number of channels; headerless
@@ -227,15 +227,12 @@ def read_frame(
     ----------
     path
         Frame file.
-    kind
-        None: what the file states (three channels: ``"rgb"``), else ``"bayer"``.
-    cfa
-        Bayer pattern of the first visible pixels; needed for a mosaic whose file does not state it.
-    black_level, white_level
-        Grey levels (DN); where nobody states them 0 and the largest value of the sample type.
-    shape, dtype
-        Rows and columns, and sample type (``"uint8"``, ``"uint16"`` little-endian, ``">u2"`` big-endian) of headerless
-        files.
+    **stated
+        What is stated of it. ``kind``: None is what the file states (three channels: ``"rgb"``), else ``"bayer"``.
+        ``cfa``: Bayer pattern of the first visible pixels; needed for a mosaic whose file does not state it.
+        ``black_level``, ``white_level``: grey levels (DN); where nobody states them 0 and the largest value of the
+        sample type. ``shape``, ``dtype``: rows and columns, and sample type (``"uint8"``, ``"uint16"`` little-endian,
+        ``">u2"`` big-endian) of headerless files.
 
     Returns
     -------
@@ -249,16 +246,10 @@ def read_frame(
     InputError
         A statement is not allowed by itself.
     """
+    if odd := stated.keys() - Statements.__annotations__:
+        raise TypeError(f"read_frame takes {', '.join(Statements.__annotations__)}, not {', '.join(odd)}")
     try:
-        stated = FrameSettings(
-            path=(str(path),),
-            kind=kind,
-            cfa=cfa,
-            black_level=black_level,
-            white_level=white_level,
-            shape=shape,
-            dtype=dtype,
-        )
+        settings = FrameSettings(path=(str(path),), **stated)
     except ConfigurationError as error:
         raise InputError(str(error).replace("frames.", "")) from None
-    return open_source(path, stated).read(0)
+    return open_source(path, settings).read(0)
