@@ -27,11 +27,11 @@ from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, is_key, loses, parent, rank
+from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank
 from rgbmidic.pipeline.separation import LightSeparation
 from rgbmidic.pipeline.source import FrameSequence, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
-from rgbmidic.results import Origin, Result, ResultStore
+from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.store import listed
 from rgbmidic.settings import (
@@ -127,9 +127,8 @@ def measure(
     """
     if retry_failed and not resume:
         raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
-    given = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
-    plan = Plan.from_settings(settings, source=source, separation=separation, weights=weights, mesh=mesh)
-    plan = replace(plan, timings=timings)
+    given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
+    plan = replace(Plan.from_settings(settings, **given), timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
@@ -391,9 +390,4 @@ def _solved(
         logger.warning("%s failed: %s", plan.series.name(index), error)
         mesh, lights = plan.reference.mesh, len(plan.images.names)
         return Solution.failed(mesh, lights, str(error), np.zeros(0)), start
-    solution: Solution = values["solution"]
-    if not solution.measured.any():
-        return solution, start
-    after = start.after(plan.reference.mesh, solution.displacement, solution.measured)
-    best = float(np.float32(values["best_match"]))  # as a result keeps it
-    return solution, replace(after, reference_updates=values["reference_updates"], best_match=best)
+    return values["solution"], following(plan, FrameRecord.from_solution(**values).values, start)

@@ -27,7 +27,7 @@ from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
 from rgbmidic.results import FrameRecord, ResultStore
 from rgbmidic.typing import FloatArray
 
-__all__ = ["STRIDE", "Schedule", "children", "dependants", "is_key", "lineage", "loses", "parent", "rank"]
+__all__ = ["STRIDE", "Schedule", "children", "dependants", "following", "is_key", "lineage", "loses", "parent", "rank"]
 
 logger = logging.getLogger("rgbmidic.pipeline.frame")
 
@@ -156,10 +156,10 @@ class Schedule:
             record = replace(better, values={**better.values, "tries": 2})
         self._store.write_frame(position, record)
         self._finished[position] = True
-        following = self._following(record.values, start)
+        next_start = following(self._plan, record.values, start)
         released = [child for child in children(position, len(self._finished)) if self._wanted[child]]
         for after in (*released, *self._waiting.pop(position, ())):
-            heappush(self._ready, (after, following))
+            heappush(self._ready, (after, next_start))
         if progress is not None:
             places = self._places
             done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
@@ -190,18 +190,18 @@ class Schedule:
         table = self._store.table()
         for kept in table.each(_KEPT, range(position, -1, -1)):
             if (kept["node_status"] == NodeStatus.MEASURED).any():
-                return self._following(kept, Start(displacement=None))
+                return following(self._plan, kept, Start(displacement=None))
         return Start(displacement=None)
 
-    def _following(self, kept: Mapping[str, Any], start: Start) -> Start:
-        """Where a frame starts that follows one that started from `start` and of which this is kept."""
-        measured = kept["node_status"] == NodeStatus.MEASURED
-        if not measured.any():
-            return start
-        after = start.after(self._plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
-        return replace(
-            after, reference_updates=tuple(kept["reference_updates"].tolist()), best_match=float(kept["best_match"])
-        )
+
+def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:
+    """Where a frame starts that follows one that started from `start` and of which this is kept."""
+    measured = kept["node_status"] == NodeStatus.MEASURED
+    if not measured.any():
+        return start
+    after = start.after(plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
+    updates, best = tuple(kept["reference_updates"].tolist()), float(kept["best_match"])
+    return replace(after, reference_updates=updates, best_match=best)
 
 
 def _solution(mesh: Tri3Mesh, lights: int, kept: Mapping[str, Any]) -> Solution:
