@@ -111,8 +111,6 @@ class _Header:
         How the frames were recorded.
     pointers : ndarray, shape (count,), int64
         Where each frame begins in the file.
-    first_byte
-        Where the first frame can begin.
     size
         Bytes of the file.
     """
@@ -126,13 +124,12 @@ class _Header:
     white_level: float
     recording: Recording
     pointers: npt.NDArray[np.int64]
-    first_byte: int
     size: int
 
     @property
     def last_whole(self) -> int:
         """Index of the last frame before the first that the file does not hold whole; -1 where it holds none."""
-        begun = (self.pointers >= self.first_byte) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
+        begun = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
         return int(np.argmin(np.append(begun, False))) - 1
 
     def lines(self, size: int) -> tuple[int, int] | None:
@@ -162,7 +159,7 @@ class _Header:
         """Read the lines (n, bytes) that hold some rows of a frame; return them and the rows in them."""
         start = int(self.pointers[index])
         with path.open("rb") as file:
-            if start < self.first_byte or start + 8 > self.size:
+            if start < _FILE.size or start + 8 > self.size:
                 raise self._ends(path, index)
             file.seek(start)
             annotation = int.from_bytes(file.read(4), "little")
@@ -252,7 +249,6 @@ def _header(path: Path) -> _Header:
             **_settings(setup, exposures, remarks),
         ),
         pointers=pointers,
-        first_byte=_FILE.size,
         size=size,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -20,6 +21,7 @@ __all__ = [
     "Window",
     "cfa_channels",
     "even_times",
+    "fraction",
     "frame_numbers",
     "planes_of",
     "sampled_channels",
@@ -313,3 +315,11 @@ def even_times(numbers: range, interval: Fraction) -> Integers:
     """
     above, below = 10**9 * interval.numerator, interval.denominator
     return np.fromiter(((2 * number * above + below) // (2 * below) for number in numbers), np.int64, len(numbers))
+
+
+_NUMBER = re.compile(r"[0-9]{1,9}(/0{0,8}[1-9][0-9]{0,8}|(\.[0-9]{1,15})?([eE]-?[0-9])?)")
+
+
+def fraction(text: str) -> Fraction | None:
+    """Return the number that a header states as text, such as "0.25", "1/500" or "2.5e-3"; None where it is none."""
+    return Fraction(text) if _NUMBER.fullmatch(text) else None

@@ -25,7 +25,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import Integers, Recording, even_times
+from rgbmidic.frames.data import Integers, Recording, even_times, fraction
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import Layout, StoredFrame, damaged, unpack_bits
 
@@ -86,7 +86,6 @@ _NAMES = {
 _HEADER_BYTES = 4 * 2**20
 """Most bytes that are read of a header; those seen have 9 and 19 kB."""
 
-_NUMBER = re.compile(r"[0-9]{1,9}(\.[0-9]{1,6}|/[0-9]{1,9})?")
 _LARGEST = 2**40
 """Largest frame number: 12 days at a million frames a second."""
 
@@ -160,10 +159,7 @@ class _Entries:
 
     def number(self, name: str) -> Fraction | None:
         """Return a positive number; None where there is none."""
-        text = self.text(name)
-        if not _NUMBER.fullmatch(text) or re.search("/0+$", text):
-            return None
-        return Fraction(text) or None
+        return fraction(self.text(name)) or None
 
 
 def _lines(content: bytes) -> dict[str, str]:

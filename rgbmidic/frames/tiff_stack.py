@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import Integers, Recording, even_times
+from rgbmidic.frames.data import Integers, Recording, even_times, fraction
 from rgbmidic.frames.images import checked_page, page_frame, page_rows
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import Layout, StoredFrame, check_count
@@ -131,6 +131,5 @@ def _even_times(interval: str, unit: str, count: int) -> Integers | None:
 
 
 def _seconds(text: str, unit: str) -> Fraction | None:
-    if unit not in _UNITS or not re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,15})?([eE]-?[0-9])?", text):
-        return None
-    return Fraction(text) / _UNITS[unit]
+    number = fraction(text)
+    return None if number is None or unit not in _UNITS else number / _UNITS[unit]
