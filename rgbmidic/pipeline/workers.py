@@ -145,7 +145,7 @@ def _pickled(plan: Plan) -> bytes:
     try:
         return pickle.dumps(plan, protocol=pickle.HIGHEST_PROTOCOL)
     except Exception as error:  # objects raise what they like
-        given = {"frame source": getattr(plan.series, "source", None)}
+        given = {"frame source": getattr(plan.series, "source", plan.series)}
         given |= {"separation": plan.separation, "weights": plan.weights}
         for what, one in given.items():
             try:
