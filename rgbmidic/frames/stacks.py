@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError, first_line, legible
+from rgbmidic.errors import FrameError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import (
@@ -30,6 +30,7 @@ from rgbmidic.frames.stored import (
     check_size,
     cut_short,
     damaged,
+    faults_of,
 )
 from rgbmidic.typing import AnyArray
 
@@ -200,13 +201,8 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     """Open the file; what libhdf5 raises while it is open becomes a FrameError."""
     import h5py
 
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            yield file
-    except RgbmidicError:
-        raise
-    except Exception as error:  # h5py meets damaged files with many kinds of error
-        raise damaged(path, first_line(error)) from None
+    with faults_of(path), h5py.File(path, "r", locking=False) as file:
+        yield file
 
 
 @remembered

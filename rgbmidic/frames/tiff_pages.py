@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError, first_line
-from rgbmidic.frames.stored import damaged
+from rgbmidic.errors import FrameError
+from rgbmidic.frames.stored import damaged, faults_of
 from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
@@ -107,13 +107,8 @@ def _opened(path: Path) -> Iterator[TiffFile]:
     with regular(path).open("rb") as file:
         if file.read(4) not in _HEADERS:  # tifffile tries some camera raws that begin as a TIFF file does
             raise damaged(path, "it is not a TIFF file")
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            yield tiff
-    except (RgbmidicError, OSError):
-        raise
-    except Exception as error:  # tifffile meets damaged headers with many kinds of error
-        raise damaged(path, first_line(error)) from None
+    with faults_of(path, OSError), tifffile.TiffFile(path) as tiff:
+        yield tiff
 
 
 def is_dng(path: Path) -> bool:
