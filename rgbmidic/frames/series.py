@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 
-from rgbmidic.errors import ConfigurationError, FrameError, disk_reason, legible
+from rgbmidic.errors import ConfigurationError, FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import advice, frame_endings, open_source
 from rgbmidic.frames.source import FrameSource, file_fingerprint
@@ -319,15 +319,13 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     """
     text, dataset = split_dataset(pattern)
     place = Path(base) / text
-    try:
+    with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
         if place.is_dir():
             found = sorted(file for file in place.iterdir() if file.name[0] != ".")
             files = [file for file in found if file.suffix.lower() in frame_endings()]
         else:
             found = files = _matching(Path(text), Path(base))
         files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read
-    except OSError as error:
-        raise FrameError(f"the frames {pattern} cannot be looked for: {disk_reason(error)}") from None
     if not files:
         what = "a folder without frames" if place.is_dir() else "no file matches"
         other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")

@@ -11,7 +11,7 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from rgbmidic.errors import FrameError, disk_reason, legible
+from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings, regular
@@ -171,18 +171,9 @@ class Movie(FrameSource):
 
 
 @contextmanager
-def _reading(path: Path | str) -> Iterator[None]:
-    """Turn what the disk refuses into a FrameError."""
-    try:
-        yield
-    except OSError as error:
-        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
-
-
-@contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
     """Check that there is something to read; what the disk refuses becomes a FrameError."""
-    with _reading(path):
+    with disk_faults(FrameError, f"{path} cannot be read"):
         if path.is_symlink() and not path.exists():
             raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
         if not regular(path).is_file():
@@ -225,7 +216,7 @@ def file_hash(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    with _reading(path):
+    with disk_faults(FrameError, f"{path} cannot be read"):
         return _sha256(Path(path))
 
 
@@ -247,7 +238,7 @@ def file_fingerprint(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    with _reading(path):
+    with disk_faults(FrameError, f"{path} cannot be read"):
         return _sampled(Path(path))
 
 

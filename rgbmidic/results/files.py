@@ -6,7 +6,6 @@ names a process that writes into the folder, and the frames that it writes.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import os
@@ -17,13 +16,14 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from rgbmidic.errors import ResultError, disk_reason
+from rgbmidic.errors import ResultError, disk_faults
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
@@ -136,7 +136,7 @@ def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool
                         return
             temporary.replace(path)
     finally:
-        with contextlib.suppress(OSError):  # a read-only disk refuses even to remove what is not there
+        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
             temporary.unlink()
 
 
@@ -157,13 +157,9 @@ def check_file(out: Path, *, overwrite: bool) -> None:
             raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
 
 
-@contextlib.contextmanager
-def writing(path: Path | str) -> Iterator[None]:
+def writing(path: Path | str) -> AbstractContextManager[None]:
     """Turn an error of the disk inside the block into a `ResultError` that names the file."""
-    try:
-        yield
-    except OSError as error:
-        raise ResultError(f"{path} cannot be written: {disk_reason(error)}") from None
+    return disk_faults(ResultError, f"{path} cannot be written")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -31,7 +31,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import ResultError
+from rgbmidic.errors import ResultError, disk_faults
 from rgbmidic.results.files import writing
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
@@ -395,28 +395,25 @@ def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], b
         It cannot be read, or holds a record of another run.
     """
     records, damaged, place, search = [], False, 0, 0
-    try:
-        with file.open("rb", buffering=0) as opened:
-            size = os.fstat(opened.fileno()).st_size
-            while place < size:
-                opened.seek(place)
-                header = opened.read(_HEADER.size)
-                found = _parsed(header, file, run)
-                search = search if found is None else place + 1
-                if found is not None and place + len(header) + found[1] <= size:
-                    frame, length, head = found
-                    records.append((frame, place + len(header), length, head))
-                    place += len(header) + length
-                    continue
-                with mmap.mmap(opened.fileno(), size, access=mmap.ACCESS_READ) as content:
-                    place = content.find(run, search, max(size - _HEADER.size + len(run), 0))
-                # a record that is not whole at the end is what a killed process leaves
-                damaged |= place >= 0 or (found is None and len(header) == _HEADER.size)
-                if place < 0:
-                    break
-                search = place + 1
-    except OSError as error:
-        raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
+    with disk_faults(ResultError, f"{file} cannot be read"), file.open("rb", buffering=0) as opened:
+        size = os.fstat(opened.fileno()).st_size
+        while place < size:
+            opened.seek(place)
+            header = opened.read(_HEADER.size)
+            found = _parsed(header, file, run)
+            search = search if found is None else place + 1
+            if found is not None and place + len(header) + found[1] <= size:
+                frame, length, head = found
+                records.append((frame, place + len(header), length, head))
+                place += len(header) + length
+                continue
+            with mmap.mmap(opened.fileno(), size, access=mmap.ACCESS_READ) as content:
+                place = content.find(run, search, max(size - _HEADER.size + len(run), 0))
+            # a record that is not whole at the end is what a killed process leaves
+            damaged |= place >= 0 or (found is None and len(header) == _HEADER.size)
+            if place < 0:
+                break
+            search = place + 1
     return records, damaged
 
 
