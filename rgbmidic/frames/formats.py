@@ -70,6 +70,10 @@ class FrameFormat:
         return self.recognises(path, stated)
 
 
+def _is_tiff(path: Path) -> bool:
+    return path.suffix.lower() in TIFF_ENDINGS and not is_dng(path)
+
+
 FORMATS = (
     FrameFormat(
         name="headerless .raw and .bin files whose shape and dtype are stated",
@@ -79,16 +83,9 @@ FORMATS = (
     ),
     FrameFormat(name="PNG", endings=(".png",), source=PngFile),
     FrameFormat(
-        name="TIFF stacks",
-        recognises=lambda path, _: path.suffix.lower() in TIFF_ENDINGS and not is_dng(path) and is_tiff_stack(path),
-        source=TiffStack,
+        name="TIFF stacks", recognises=lambda path, _: _is_tiff(path) and is_tiff_stack(path), source=TiffStack
     ),
-    FrameFormat(
-        name="TIFF",
-        endings=TIFF_ENDINGS,
-        recognises=lambda path, _: path.suffix.lower() in TIFF_ENDINGS and not is_dng(path),
-        source=TiffFile,
-    ),
+    FrameFormat(name="TIFF", endings=TIFF_ENDINGS, recognises=lambda path, _: _is_tiff(path), source=TiffFile),
     FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, source=CineFile),
     FrameFormat(
         name="camera raws (DNG, NEF, CR2, ARW, ...)",

@@ -75,8 +75,8 @@ class _Stack:
             if (page.imagelength, page.imagewidth) != self.shape:
                 here = f"{page.imagelength} rows of {page.imagewidth} pixels"
                 raise FrameError(f"{path}: frame {index} has {here}, the first {self.shape[0]} of {self.shape[1]}")
-            behind = _behind(page, path, index, self.recording.count, rows) if alone else None
-            samples = behind if alone else page_rows(page, path, rows)
+            count = self.recording.count
+            samples = _behind(page, path, index, count, rows) if alone else page_rows(page, path, rows)
             stored = page_frame(page, path, samples)
             return stored if samples is not None else replace(stored, values=stored.values[rows.start : rows.stop])
 
