@@ -24,8 +24,8 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
-from rgbmidic.results import FrameRecord, ResultStore
-from rgbmidic.typing import FloatArray
+from rgbmidic.results import QUANTITIES, FrameRecord, ResultStore
+from rgbmidic.typing import AnyArray
 
 __all__ = ["STRIDE", "Schedule", "children", "dependants", "following", "is_key", "lineage", "loses", "parent", "rank"]
 
@@ -205,20 +205,16 @@ def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:
 
 
 def _solution(mesh: Tri3Mesh, lights: int, kept: Mapping[str, Any]) -> Solution:
-    """What a result keeps of a measured frame, as the solution that makes it a reference."""
-
-    def columns(*names: str) -> FloatArray:
-        return np.stack([kept[name].astype(np.float64) for name in names], axis=1)
-
-    return replace(
-        Solution.failed(mesh, lights, "", np.zeros(0)),
-        displacement=columns("u", "v"),
-        displacement_std=columns("u_std", "v_std"),
-        strain=columns("exx", "eyy", "exy"),
-        strain_std=columns("exx_std", "eyy_std", "exy_std"),
-        node_status=kept["node_status"],
-        rigid=kept["rigid"].astype(np.float64),
-    )
+    """What a result keeps of a measured frame, as the solution that makes it a reference: the field table undone."""
+    columns: dict[str, list[AnyArray]] = {}
+    for name in _MEASURED:
+        values = kept[name]
+        attribute = QUANTITIES[name].source.partition(".")[0]
+        columns.setdefault(attribute, []).append(values.astype(np.float64) if values.dtype.kind == "f" else values)
+    found: dict[str, Any] = {
+        name: np.stack(parts, axis=1) if len(parts) > 1 else parts[0] for name, parts in columns.items()
+    }
+    return replace(Solution.failed(mesh, lights, "", np.zeros(0)), **found)
 
 
 def _error(future: Future[Measured]) -> BaseException | None:
