@@ -57,7 +57,7 @@ def test_a_numpy_stack_gives_the_bits_of_its_files(tmp_path):
 
 
 class Series:
-    """A series of one's own, which can all that the package's can: it is asked for the part of a frame that is needed."""
+    """A series of one's own, which can all that the package's can: it is asked for the part of a frame it needs."""
 
     def __init__(self, series):
         self.series, self.windows = series, []
