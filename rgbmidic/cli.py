@@ -314,8 +314,7 @@ def history(
         result,
         replace(kept, **stated),
         scale=None if settings is None else settings.scale,
-        channels=None if channels is None else Channels.read(channels),
-        offset=offset,
+        channels=None if channels is None else Channels.read(channels, offset),
         area=area,
         force=force,
     )

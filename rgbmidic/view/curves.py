@@ -94,7 +94,7 @@ NOW = {"dimension": "height", "level": "overlay", "line_color": "#8e5bd0", "line
 
 def places(result: Result) -> npt.NDArray[np.int64]:
     """Return the places of the frames' records, shape (T, 2): a frame that is measured again has another place."""
-    return np.stack([result.table.shard, result.table.start], axis=1)
+    return np.stack([result.table.places[name] for name in ("shard", "start")], axis=1)
 
 
 class Progress:

@@ -324,7 +324,7 @@ def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
     page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=50, y=40))
     file = next((made.path / "solution").glob("*.frames"))
     content = bytearray(file.read_bytes())
-    content[int(made.table.start[1]) + 3] ^= 255
+    content[int(made.table.places["start"][1]) + 3] ^= 255
     file.write_bytes(content)
     page.state.asked = 1
     assert "damaged in frame 1" in page.parts.description.text
