@@ -1,4 +1,4 @@
-"""Whether displacement and stated uncertainty hold without tuning: reflections, noise alone, spoiled frames.
+"""Whether displacement and stated uncertainty hold without tuning: reflections, noise alone, corrupted frames.
 
     python benchmarks/uncertainty.py [TABLE ...] [--quick] [--cache FOLDER]
 
@@ -348,11 +348,11 @@ def noise(quick: bool) -> None:
             row(name, f"{angle:g}°", draws, *cells)
 
 
-def spoiled(quick: bool) -> None:
+def corrupted(quick: bool) -> None:
     """Spoiled frames, sphere at 1 degree, start sought by the solver: the rest unharmed, what is lost flagged."""
     heading(
         "camera",
-        "spoiled by",
+        "corrupted by",
         "status",
         "ratio elsewhere",
         "elsewhere lost",
@@ -514,7 +514,7 @@ TABLES: dict[str, Callable[[bool], None]] = {
     "areas": areas,
     "scenes": scenes,
     "noise": noise,
-    "spoiled": spoiled,
+    "corrupted": corrupted,
     "texture": texture,
     "elements": elements,
     "probes": probes,

@@ -10,7 +10,6 @@ pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any, Self
 import numpy as np
 
 from rgbmidic.errors import CalibrationError, InputError
-from rgbmidic.illumination.calibration import read_json
+from rgbmidic.illumination.calibration import read_document, write_document
 from rgbmidic.typing import FloatArray
 
 __all__ = ["LENS_PARAMETERS", "CameraCalibration", "distorted", "undistorted"]
@@ -216,6 +215,12 @@ class CameraCalibration:
         slope -= (slopes[1] - slopes[0])[1] * across[0] + along[1] * (slopes[3] - slopes[2])[0]
         return scale, float(scale * np.sqrt(slope @ self.correlation @ slope) / (2 * area))
 
+    def summary(self) -> str:
+        """Return scale in the middle of the frame and tilt, with their standard uncertainties, as text."""
+        (scale, scale_std), (tilt, tilt_std) = self.scale(self.centre), self.tilt_deg
+        known = f"tilt {tilt:.2f} ± {tilt_std:.2f} degrees" if np.isfinite(tilt) else "tilt not known without a lens"
+        return f"{scale:.6g} ± {scale_std:.2g} mm per px in the middle of the frame, {known}"
+
     @classmethod
     def read(cls, path: Path | str) -> Self:
         """Read the file that ``rgbmidic-calibrate camera`` wrote.
@@ -225,20 +230,17 @@ class CameraCalibration:
         CalibrationError
             The file is missing, not JSON, of another schema or version, or damaged.
         """
-        path = Path(path)
-        try:
-            document = read_json(path)
-        except FileNotFoundError:
-            raise CalibrationError(f"camera calibration not found: {path}") from None
-        except (OSError, ValueError, RecursionError) as error:
-            raise CalibrationError(f"{path} is not a readable camera calibration: {error}") from None
-        if not isinstance(document, dict) or document.get("schema") != _SCHEMA:
-            raise CalibrationError(f'{path} is not a camera calibration: its "schema" is not "{_SCHEMA}"')
-        if document.get("schema_version") != _VERSION:
-            raise CalibrationError(
-                f"{path} has schema version {document.get('schema_version')!r}; "
-                f"this version of rgbmidic reads {_VERSION}"
-            )
+        return cls.from_document(read_document(path, "camera calibration", _SCHEMA, _VERSION), str(path))
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], name: str) -> Self:
+        """Take the content of such a file, as `to_document` gives it; `name` it in messages.
+
+        Raises
+        ------
+        CalibrationError
+            The content is damaged.
+        """
         try:
             rows, columns = (int(side) for side in document["shape"])
             lens = document.get("lens")
@@ -248,22 +250,15 @@ class CameraCalibration:
                 homography=document.get("homography"),
                 covariance=document["covariance"],
                 details=document.get("details") or {},
-                name=str(path),
+                name=name,
             )
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             reason = f"missing key {error}" if isinstance(error, KeyError) else error
-            raise CalibrationError(f"{path} is damaged: {reason}") from None
+            raise CalibrationError(f"{name} is damaged: {reason}") from None
 
-    def write(self, path: Path | str) -> None:
-        """Write the file; an existing one is replaced only once the new one is complete.
-
-        Raises
-        ------
-        CalibrationError
-            The file cannot be written.
-        """
-        path = Path(path)
-        document = {
+    def to_document(self) -> dict[str, Any]:
+        """Return the content of the file, in plain values."""
+        return {
             "schema": _SCHEMA,
             "schema_version": _VERSION,
             "shape": list(self.shape),
@@ -273,9 +268,7 @@ class CameraCalibration:
             "covariance": self.covariance.tolist(),
             "details": dict(self.details),
         }
-        temporary = path.with_name(path.name + ".part")
-        try:
-            temporary.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-            temporary.replace(path)
-        except OSError as error:
-            raise CalibrationError(f"{path} cannot be written: {error.strerror or error}") from None
+
+    def write(self, path: Path | str) -> None:
+        """Write the file; errors as `rgbmidic.illumination.calibration.write_document`."""
+        write_document(path, self.to_document())
