@@ -100,6 +100,7 @@ class _Report:
     history: TimeHistory
     floor: NoiseFloor | None
     shown: tuple[int, ...]
+    maps: figures.MapDrawer
 
     @classmethod
     def of(
@@ -112,7 +113,8 @@ class _Report:
         measured = figures.spread(figures.measured_frames(result), _SHOWN)
         shown = tuple(sorted({*measured, history.farthest})) if frames is None else tuple(frames)
         floor = noise_floor(physical)
-        return cls(physical=physical, setup=setup, probes=probes, history=history, floor=floor, shown=shown)
+        maps = figures.MapDrawer(result)
+        return cls(physical=physical, setup=setup, probes=probes, history=history, floor=floor, shown=shown, maps=maps)
 
     def page(self) -> Page:
         """Build the page, section by section."""
@@ -187,9 +189,9 @@ class _Report:
         for frame in self.shown:
             values = physical.frame(frame)
             maps = {f"{name} ({length})": (values[name], values[f"{name}_std"]) for name in ("u", "v")}
-            _show(page, figures.field_figure(physical.result, frame, maps), f"displacement, {self._when(frame)}")
+            _show(page, self.maps.fields(frame, maps), f"displacement, {self._when(frame)}")
             maps = {name: (values[name], values[f"{name}_std"]) for name in ("exx", "eyy", "exy")}
-            _show(page, figures.field_figure(physical.result, frame, maps), f"strain, {self._when(frame)}")
+            _show(page, self.maps.fields(frame, maps), f"strain, {self._when(frame)}")
         caption = "over the test: median of the nodes (line) and 5 to 95 % of them (band)"
         _show(page, field_history_figure(physical, self.history), f"displacement and strain {caption}")
 
@@ -228,7 +230,7 @@ class _Report:
         _show(page, uncertainty_figure(physical, self.history, self.floor), caption)
         frame, values = self.shown[-1], physical.frame(self.shown[-1])
         maps = {f"{name} ({length})": (values[name], values[name] * 0) for name in ("u_std", "v_std")}
-        figure = figures.field_figure(physical.result, frame, maps, positive=True)
+        figure = self.maps.fields(frame, maps, positive=True)
         _show(page, figure, f"standard uncertainty, {self._when(frame)}")
 
     def _lights(self, page: Page) -> None:
@@ -238,7 +240,7 @@ class _Report:
         _show(page, figures.residual_figure(result), "residual of each light, and its fraction in the nodes")
         if len(result.lights) > 1:
             caption = f"fraction of each light in what determines the nodes, {self._when(frame)}"
-            _show(page, figures.fraction_figure(result, frame), caption)
+            _show(page, self.maps.fractions(frame), caption)
         for caption, figure in (
             ("reflection index of each light", figures.reflection_figure(result, frame)),
             ("part of each light that the weights exclude", figures.mask_figure(result, frame)),
@@ -263,7 +265,7 @@ class _Report:
         else:
             page.text("Every node is measured in every frame.")
         _show(page, figures.convergence_figure(result), "convergence: largest motion of a node in each iteration")
-        _show(page, figures.map_figure(result, frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
+        _show(page, self.maps.of_kind(frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
 
     def _provenance(self, page: Page) -> None:
         kept = self.physical.result.provenance

@@ -15,17 +15,16 @@ from typing import TYPE_CHECKING
 from rgbmidic.errors import ResultError
 from rgbmidic.report.figures import (
     MAPS,
+    MapDrawer,
     brightness_figure,
     convergence_figure,
-    fraction_figure,
-    map_figure,
     mask_figure,
     measured_frames,
     reflection_figure,
     residual_figure,
     spread,
 )
-from rgbmidic.report.style import save_figure
+from rgbmidic.report.style import DPI, save_figure
 from rgbmidic.results import Result
 from rgbmidic.results.files import writing
 
@@ -44,15 +43,15 @@ _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
     "residual": residual_figure,
     "brightness": brightness_figure,
 }
-_OF_FRAME: Mapping[str, Callable[[Result, int], Figure | None]] = {
-    **{kind: partial(map_figure, kind=kind) for kind in MAPS},
-    "fractions": lambda result, frame: fraction_figure(result, frame) if len(result.lights) > 1 else None,
-    "masks": mask_figure,
-    "reflections": reflection_figure,
+_OF_FRAME: Mapping[str, Callable[[MapDrawer, int], Figure | None]] = {
+    **{kind: partial(MapDrawer.of_kind, kind=kind) for kind in MAPS},
+    "fractions": lambda maps, frame: maps.fractions(frame) if len(maps.result.lights) > 1 else None,
+    "masks": lambda maps, frame: mask_figure(maps.result, frame),
+    "reflections": lambda maps, frame: reflection_figure(maps.result, frame),
 }
 _NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)})_[0-9]{{6,}})\.png")
-_FEW = 5
-"""Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.5 s."""
+_FEW = 20
+"""Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.15 s."""
 
 _Picture = tuple[str, int | None]
 """Kind of a picture, and its frame if it is of one."""
@@ -114,9 +113,9 @@ def write_figures(
 
 def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
     """Write pictures one after the other, so that only one is in memory; return the files of those that exist."""
-    files = []
+    files, maps = [], MapDrawer(result, DPI)
     for kind, frame in pictures:
-        figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](result, frame)
+        figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](maps, frame)
         if figure is not None:
             files.append(_file(folder, kind, frame))
             save_figure(figure, files[-1])

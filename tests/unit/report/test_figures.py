@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from matplotlib.text import Text
@@ -79,6 +80,22 @@ def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_pa
     seen = shade.get_array()[..., 3] > 0
     assert places[seen.any(axis=0)].tolist() == [48.5, 50.5]
     assert rows[seen.any(axis=1)].tolist() == [24.5, 26.5]
+
+
+def test_axes_that_are_drawn_once_look_as_if_drawn_for_each_map(tmp_path: Path) -> None:
+    result = make_result(tmp_path / "out", frames=3, reference=np.stack([IMAGE] * 3))
+    maps = figures.MapDrawer(result, 60)
+    before = _pixels(maps.of_kind(1, "displacement"))
+    frozen, anew = _pixels(maps.of_kind(2, "displacement")), _pixels(figures.map_figure(result, 2, "displacement"))
+    changed = (np.abs(before - anew) > 30).mean()
+    assert (np.abs(frozen - anew) > 30).mean() < 0.01 < 0.1 < changed
+    assert maps.of_kind(2, "uncertainty") is maps.of_kind(1, "displacement")
+
+
+def _pixels(figure: Any) -> AnyArray:
+    file = io.BytesIO()
+    figure.savefig(file, dpi=60)
+    return cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_COLOR).astype(float)
 
 
 @pytest.mark.parametrize("kind", figures.MAPS)
