@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from rgbmidic.results.physical import Physical
 
-__all__ = ["Page", "write_report"]
-
 _MOST = 200
 """Frames that the time histories are drawn from at most: a panel is some 450 pixels wide, two for each."""
 _SHOWN = 3

@@ -10,25 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.report.style import (
-    BAR,
-    GAP,
-    LIGHT_COLOURS,
-    LINES,
-    NUMBERS,
-    STYLE,
-    add_colour_bar,
-    colour_scale,
-    draw_figure,
-    finish_picture,
-    finish_plot,
-    freeze_axes,
-    literal,
-    ordinary_values,
-    shade,
-    show_image,
-    view_limits,
-)
+from rgbmidic.report import style
 from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result, scale_of
 from rgbmidic.typing import FloatArray
 
@@ -36,21 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
-
-__all__ = [
-    "MAPS",
-    "MapDrawer",
-    "brightness_figure",
-    "convergence_figure",
-    "fraction_figure",
-    "map_figure",
-    "mask_figure",
-    "measured_frames",
-    "reflection_figure",
-    "residual_figure",
-    "shown_frames",
-    "spread",
-]
 
 MAPS = {
     "displacement": ("u", "v"),
@@ -254,18 +221,18 @@ def convergence_figure(result: Result) -> Figure:
         if len(frames) > _MANY_FRAMES:  # no legend, but a colour bar
             norm = Normalize(frames[0], frames[-1])
             colours = [colormaps["viridis"](norm(frame)) for frame in frames]
-            add_colour_bar(axis, norm, "viridis", label="frame")
+            style.add_colour_bar(axis, norm, "viridis", label="frame")
         for frame, history, colour in zip(frames, result.each("history", frames), colours, strict=True):
-            steps, name = np.arange(1, len(history) + 1), literal(result.names[frame])
+            steps, name = np.arange(1, len(history) + 1), style.literal(result.names[frame])
             axis.plot(steps, history, marker="o", markersize=2.5, linewidth=1, color=colour, label=name)
         if (tolerance := result.setting("solver", "tolerance")) is not None:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
         axis.set_yscale("log")
-        finish_plot(axis, "iteration", "largest motion of a measured node (px)")
+        style.finish_plot(axis, "iteration", "largest motion of a measured node (px)")
         if len(frames) <= _MANY_FRAMES:
             axis.legend(loc="upper right")
 
-    return draw_figure(draw, count=1, aspect=0.6, beside=BAR if len(frames) > _MANY_FRAMES else GAP)
+    return style.draw_figure(draw, count=1, aspect=0.6, beside=style.BAR if len(frames) > _MANY_FRAMES else style.GAP)
 
 
 def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
@@ -274,16 +241,16 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
 
     def draw(axes: list[Axes]) -> None:
         for axis, (label, values) in zip(axes, panels.items(), strict=True):
-            for light, line, series in zip(result.lights, cycle(LINES), values[frames].T, strict=False):
-                style: dict[str, Any] = {"linestyle": line, "color": LIGHT_COLOURS.get(light)}
-                style |= {"marker": "o", "markersize": 2.5, "linewidth": 1, "label": literal(light)}
-                axis.plot(result.number[frames], series, **style)
+            for light, line, series in zip(result.lights, cycle(style.LINES), values[frames].T, strict=False):
+                look: dict[str, Any] = {"linestyle": line, "color": style.LIGHT_COLOURS.get(light)}
+                look |= {"marker": "o", "markersize": 2.5, "linewidth": 1, "label": style.literal(light)}
+                axis.plot(result.number[frames], series, **look)
             if np.nanmin(values, initial=0) >= 0:
                 axis.set_ylim(bottom=0)
-            finish_plot(axis, "frame", label)
+            style.finish_plot(axis, "frame", label)
         axes[-1].legend(loc="best")
 
-    return draw_figure(draw, count=len(panels), aspect=0.75, beside=NUMBERS)
+    return style.draw_figure(draw, count=len(panels), aspect=0.75, beside=style.NUMBERS)
 
 
 class MapDrawer:
@@ -355,8 +322,8 @@ class MapDrawer:
         """
         maps = {}
         for label, (values, std) in fields.items():
-            ordinary = ordinary_values(values, std)
-            maps[label] = values, colour_scale(ordinary, positive=positive) if ordinary.size else None
+            ordinary = style.ordinary_values(values, std)
+            maps[label] = values, style.colour_scale(ordinary, positive=positive) if ordinary.size else None
         return self._draw(frame, maps, "plasma" if positive else "viridis")
 
     def fractions(self, frame: int) -> Figure:
@@ -365,7 +332,7 @@ class MapDrawer:
 
         fractions = self.result.frame(frame).light_fraction
         fractions = np.where(fractions.sum(axis=1, keepdims=True) > 0, fractions, np.nan)
-        titles = [literal(f"fraction of {light}") for light in self.result.lights]
+        titles = [style.literal(f"fraction of {light}") for light in self.result.lights]
         maps = {title: (part, Normalize(0, 1)) for title, part in zip(titles, fractions.T, strict=True)}
         return self._draw(frame, maps, "cividis")
 
@@ -377,7 +344,7 @@ class MapDrawer:
             self._figures[len(maps)] = self._panels(len(maps))
         figure, kept = self._figures[len(maps)], int(self._dpi is None and self.result.reference is not None)
         figure.texts[0].set_text(_frame_title(self.result, frame, self.result.frame(frame)))
-        with mpl.rc_context(STYLE):
+        with mpl.rc_context(style.STYLE):
             for axis, (label, (values, norm)) in zip(figure.axes, maps.items(), strict=True):
                 for artist in (*axis.images[kept:], *axis.lines, *axis.patches, *axis.texts, *axis.artists):
                     artist.remove()
@@ -393,12 +360,12 @@ class MapDrawer:
             reference = None if result.reference is None else result.reference.mean(axis=0, dtype=np.float32)
             for axis in axes:
                 if reference is not None:
-                    show_image(axis, reference, result.reference_origin)
-                finish_picture(axis, x, y, first=axis is axes[0])
+                    style.show_image(axis, reference, result.reference_origin)
+                style.finish_picture(axis, x, y, first=axis is axes[0])
 
-        figure = draw_figure(draw, count=count, aspect=np.ptp(y) / np.ptp(x), beside=BAR, title=" ")
+        figure = style.draw_figure(draw, count=count, aspect=np.ptp(y) / np.ptp(x), beside=style.BAR, title=" ")
         if self._dpi is not None:
-            freeze_axes(figure, self._dpi)
+            style.freeze_axes(figure, self._dpi)
         return figure
 
     def _show(self, axis: Axes, values: FloatArray, norm: Normalize | None, colours: str) -> None:
@@ -413,7 +380,7 @@ class MapDrawer:
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
         scaled = norm(values[np.isfinite(values)])
         beyond = bool(scaled.min() < -_EQUAL), bool(scaled.max() > 1 + _EQUAL)
-        add_colour_bar(axis, norm, colours, beyond=beyond)
+        style.add_colour_bar(axis, norm, colours, beyond=beyond)
 
 
 def _shaded(
@@ -435,18 +402,18 @@ def _shaded(
 
     def draw(axes: list[Axes]) -> None:
         for axis, image, part, light in zip(axes, reference, cover, result.lights, strict=True):
-            show_image(axis, image, origin)
-            shade(axis, part, step, origin)
-            axis.set_title(literal(f"{light}: {title_of(part[rows, columns])}"))
-            finish_picture(axis, x, y, first=axis is axes[0])
+            style.show_image(axis, image, origin)
+            style.shade(axis, part, step, origin)
+            axis.set_title(style.literal(f"{light}: {title_of(part[rows, columns])}"))
+            style.finish_picture(axis, x, y, first=axis is axes[0])
 
     title = f"{_frame_title(result, frame, record)}, over the reference image"
-    return draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=GAP, title=title)
+    return style.draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=style.GAP, title=title)
 
 
 def _view(result: Result, points: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the limits in x and in y of a picture around points (N, 2), inside the image."""
-    low, high = view_limits(points)
+    low, high = style.view_limits(points)
     if result.reference is not None:
         first, size = np.array(result.reference_origin), np.array(result.reference.shape[:0:-1])
         low, high = (np.clip(end, first - 0.5, first + size - 0.5) for end in (low, high))
@@ -458,4 +425,4 @@ def _frame_title(result: Result, frame: int, record: FrameRecord) -> str:
     blank = np.isnan(record.u).mean()
     missing = f", {blank:.1%} of the nodes not measured" if blank else ""
     end = QUANTITIES["status"].codes[record.status]
-    return f"frame {frame}: {literal(result.names[frame])} ({end}, {record.iterations} iterations{missing})"
+    return f"frame {frame}: {style.literal(result.names[frame])} ({end}, {record.iterations} iterations{missing})"

@@ -13,17 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rgbmidic.errors import ResultError
-from rgbmidic.report.figures import (
-    MAPS,
-    MapDrawer,
-    brightness_figure,
-    convergence_figure,
-    mask_figure,
-    measured_frames,
-    reflection_figure,
-    residual_figure,
-    spread,
-)
+from rgbmidic.report import figures
 from rgbmidic.report.style import DPI, save_figure
 from rgbmidic.results import Result
 from rgbmidic.results.files import writing
@@ -31,23 +21,21 @@ from rgbmidic.results.files import writing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["REPORT", "remove_figures", "remove_report", "write_figures"]
-
 REPORT = "report.html"
 """Name of the report that lies in a result's folder."""
 
 _FRAMES = 3
 """Frames that get pictures where none are named, as in the report."""
 _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
-    "convergence": convergence_figure,
-    "residual": residual_figure,
-    "brightness": brightness_figure,
+    "convergence": figures.convergence_figure,
+    "residual": figures.residual_figure,
+    "brightness": figures.brightness_figure,
 }
-_OF_FRAME: Mapping[str, Callable[[MapDrawer, int], Figure | None]] = {
-    **{kind: partial(MapDrawer.of_kind, kind=kind) for kind in MAPS},
+_OF_FRAME: Mapping[str, Callable[[figures.MapDrawer, int], Figure | None]] = {
+    **{kind: partial(figures.MapDrawer.of_kind, kind=kind) for kind in figures.MAPS},
     "fractions": lambda maps, frame: maps.fractions(frame) if len(maps.result.lights) > 1 else None,
-    "masks": lambda maps, frame: mask_figure(maps.result, frame),
-    "reflections": lambda maps, frame: reflection_figure(maps.result, frame),
+    "masks": lambda maps, frame: figures.mask_figure(maps.result, frame),
+    "reflections": lambda maps, frame: figures.reflection_figure(maps.result, frame),
 }
 _NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)})_[0-9]{{6,}})\.png")
 _FEW = 20
@@ -90,7 +78,7 @@ def write_figures(
     folder = Path(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    frames = spread(measured_frames(result), _FRAMES) if frames is None else frames
+    frames = figures.spread(figures.measured_frames(result), _FRAMES) if frames is None else frames
     for frame in frames:
         result.frame(frame)  # an error of one is raised before the first picture
     pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]
@@ -113,7 +101,7 @@ def write_figures(
 
 def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
     """Write pictures one after the other, so that only one is in memory; return the files of those that exist."""
-    files, maps = [], MapDrawer(result, DPI)
+    files, maps = [], figures.MapDrawer(result, DPI)
     for kind, frame in pictures:
         figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](maps, frame)
         if figure is not None:

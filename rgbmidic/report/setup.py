@@ -19,18 +19,6 @@ from rgbmidic.typing import FloatArray
 if TYPE_CHECKING:
     from rgbmidic.results.physical import Physical
 
-__all__ = [
-    "NoiseFloor",
-    "TimeHistory",
-    "analysis_rows",
-    "hardware_rows",
-    "noise_floor",
-    "noise_text",
-    "reference_text",
-    "settings_rows",
-    "speckle_size",
-]
-
 Rows = Iterator[tuple[str, str]]
 
 _PREFILTERS = {"none": "none", "binomial": "[1 2 1]/4 along x and y", "gaussian": "Gaussian, σ = 1 px"}

@@ -18,34 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-__all__ = [
-    "BAR",
-    "DPI",
-    "GAP",
-    "LEGEND",
-    "LIGHT_COLOURS",
-    "LINES",
-    "NUMBERS",
-    "OKABE_ITO",
-    "STYLE",
-    "add_colour_bar",
-    "colour_range",
-    "colour_scale",
-    "draw_figure",
-    "embedded",
-    "finish_picture",
-    "finish_plot",
-    "freeze_axes",
-    "literal",
-    "ordinary_values",
-    "save_figure",
-    "shade",
-    "show_image",
-    "time_axis",
-    "time_text",
-    "time_unit",
-    "view_limits",
-]
+__all__ = ["LIGHT_COLOURS", "OKABE_ITO", "STYLE", "colour_range", "finish_picture", "finish_plot", "literal"]
+__all__ += ["ordinary_values", "save_figure", "time_axis", "time_text", "view_limits"]
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,

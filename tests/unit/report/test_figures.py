@@ -153,7 +153,8 @@ def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gallery, "save_figure", lambda _, path: path.touch())
 
 
-def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:
+def test_all_figures_can_be_written_by_two_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gallery, "_FEW", 5)
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
     told_once = {"convergence", "residual", "brightness"}
     with_pictures = {*EVERY_FRAME, "masks", "reflections"}
