@@ -172,16 +172,24 @@ def freeze_axes(figure: Figure, dpi: int) -> None:
 
     The figure must then be written with as many pixels per inch; what is drawn into the axes later lies above.
     """
+    from matplotlib.artist import Artist
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    class Picture(Artist):
+        """The pixels as they are: matplotlib's figimage resamples them."""
+
+        def draw(self, renderer: Any) -> None:
+            renderer.draw_image(renderer.new_gc(), 0, 0, pixels)
 
     figure.set_dpi(dpi)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
+    pixels = np.array(canvas.buffer_rgba())[::-1]
     for axis in figure.axes:
         axis.set_axis_off()
         for image in axis.images:
             image.remove()
-    figure.figimage(np.array(canvas.buffer_rgba()), zorder=-1)
+    figure.add_artist(Picture()).set_zorder(-1)
 
 
 def save_figure(figure: Figure, path: Path | str, *, dpi: int = DPI) -> None:
