@@ -13,18 +13,9 @@ import numpy as np
 
 from rgbmidic.errors import legible
 from rgbmidic.report import figures
+from rgbmidic.report import setup as tables
 from rgbmidic.report.curves import field_history_figure, history_figure, status_figure, uncertainty_figure
-from rgbmidic.report.setup import (
-    NoiseFloor,
-    TimeHistory,
-    analysis_rows,
-    hardware_rows,
-    noise_floor,
-    noise_text,
-    reference_text,
-    settings_rows,
-)
-from rgbmidic.report.style import embedded, time_text
+from rgbmidic.report.style import PAGE_DPI, embedded, time_text
 from rgbmidic.results import QUANTITIES, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
@@ -95,8 +86,8 @@ class _Report:
     physical: Physical
     setup: SetupSettings
     probes: ProbeSettings
-    history: TimeHistory
-    floor: NoiseFloor | None
+    history: tables.TimeHistory
+    floor: tables.NoiseFloor | None
     shown: tuple[int, ...]
     maps: figures.MapDrawer
 
@@ -107,11 +98,11 @@ class _Report:
         result = physical.result
         for frame in frames or ():
             result.frame(frame)  # an error of one is raised before the long work
-        history = TimeHistory.of(physical, figures.spread(figures.shown_frames(result), _MOST))
+        history = tables.TimeHistory.of(physical, figures.spread(figures.shown_frames(result), _MOST))
         measured = figures.spread(figures.measured_frames(result), _SHOWN)
         shown = tuple(sorted({*measured, history.farthest})) if frames is None else tuple(frames)
-        floor = noise_floor(physical)
-        maps = figures.MapDrawer(result)
+        floor = tables.noise_floor(physical)
+        maps = figures.MapDrawer(result, PAGE_DPI)
         return cls(physical=physical, setup=setup, probes=probes, history=history, floor=floor, shown=shown, maps=maps)
 
     def page(self) -> Page:
@@ -122,8 +113,8 @@ class _Report:
         page.heading("Warnings")
         page.bullets(list(self._warnings()) or ["none"])
         page.heading("What was measured with what")
-        page.table(("set-up", ""), list(hardware_rows(self.physical, self.setup)))
-        page.table(("analysis", ""), list(analysis_rows(self.physical, self.floor)))
+        page.table(("set-up", ""), list(tables.hardware_rows(self.physical, self.setup)))
+        page.table(("analysis", ""), list(tables.analysis_rows(self.physical, self.floor)))
         self._fields(page)
         self._probes(page)
         self._uncertainty(page)
@@ -136,7 +127,7 @@ class _Report:
         """Summarise the test in a few sentences."""
         history, result, length = self.history, self.physical.result, self.physical.units.length
         x, y, x_std, y_std = *map(history.extreme, ("u", "v")), *map(history.median, ("u_std", "v_std"))
-        text = f"{len(result.deformed)} deformed frames against {reference_text(self.physical)}; "
+        text = f"{len(result.deformed)} deformed frames against {tables.reference_text(self.physical)}; "
         text += f"{len(result.nodes)} nodes, {history.fractions[:, 0].mean():.1%} of them measured. "
         if np.isfinite(x + y):
             text += f"The median node moves by up to {x:.4g} {length} in x and {y:.4g} {length} in y, known to "
@@ -211,7 +202,7 @@ class _Report:
     def _uncertainty(self, page: Page) -> None:
         physical, length = self.physical, self.physical.units.length
         page.heading("Uncertainty")
-        page.text(f"Noise floor: {noise_text(physical, self.floor)}.")
+        page.text(f"Noise floor: {tables.noise_text(physical, self.floor)}.")
         if physical.units.mm_per_pixel_std:
             page.text(
                 "The uncertainty of the image scale is part of that of every length in mm, the same in all of them."
@@ -275,7 +266,7 @@ class _Report:
             rows.append(("calibration", f"{calibration['file']}, SHA-256 {calibration['sha256']}"))
         rows += [(f"input {name}", text) for name, text in kept["inputs"].items()]
         page.table(("what", ""), rows)
-        page.table(("setting", "value"), list(settings_rows(kept.get("settings", {}))))
+        page.table(("setting", "value"), list(tables.settings_rows(kept.get("settings", {}))))
 
     def _when(self, frame: int) -> str:
         times = self.physical.times
