@@ -131,7 +131,7 @@ def write_cases(folder: Path, size: int, cases: list[str]) -> None:
     }
     write_raw_test(folder / "raw", frames["raw"], plain)
     write_raw_test(folder / "small", 2, plain[..., :128, :256])
-    if {"calibrated", "sequence, calibrated"} & set(cases):
+    if {"calibrated", "sequence, calibrated", "compiling"} & set(cases):
         write_raw_test(folder / "calibrated", frames["calibrated"], *registered_states(size, plain))
 
 
@@ -331,7 +331,7 @@ def _measures(name: str, folder: Path, threads: int) -> Callable[[str], dict[str
         if case in ("demo", "event"):
             return sequence(folder.parent / {"demo": "demo/test/test.toml", "event": "event/test.toml"}[case], 1)
         if case == "compiling":
-            return {"seconds": compiling(folder / "small" / "TEST.toml")}
+            return {"seconds": compiling(folder / "calibrated" / "TEST.toml")}
         if case in ("raw", "calibrated", "small"):
             work = frame(case)
         else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,35 +74,25 @@ def write_report(
     setup = read_section(SetupSettings, "setup", kept) if settings is None else settings.setup
     probes = probes_of(result) if settings is None else settings.probes
     physical = Physical.of(result, None if settings is None else settings.scale)
-    text = _Report.of(physical, setup, probes, frames).page().html
+    text = _Report(physical, setup, probes, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Report:
     """Data that all sections of a report are made from."""
 
-    physical: Physical
-    setup: SetupSettings
-    probes: ProbeSettings
-    history: tables.TimeHistory
-    floor: tables.NoiseFloor | None
-    shown: tuple[int, ...]
-    maps: figures.MapDrawer
-
-    @classmethod
-    def of(
-        cls, physical: Physical, setup: SetupSettings, probes: ProbeSettings, frames: Sequence[int] | None
-    ) -> _Report:
+    def __init__(
+        self, physical: Physical, setup: SetupSettings, probes: ProbeSettings, frames: Sequence[int] | None
+    ) -> None:
         result = physical.result
         for frame in frames or ():
             result.frame(frame)  # an error of one is raised before the long work
-        history = tables.TimeHistory.of(physical, figures.spread(figures.shown_frames(result), _MOST))
+        self.physical, self.setup, self.probes = physical, setup, probes
+        self.history = tables.TimeHistory(physical, figures.spread(figures.shown_frames(result), _MOST))
         measured = figures.spread(figures.measured_frames(result), _SHOWN)
-        shown = tuple(sorted({*measured, history.farthest})) if frames is None else tuple(frames)
-        floor = tables.noise_floor(physical)
-        maps = figures.MapDrawer(result, PAGE_DPI)
-        return cls(physical=physical, setup=setup, probes=probes, history=history, floor=floor, shown=shown, maps=maps)
+        self.shown = tuple(sorted({*measured, self.history.farthest})) if frames is None else tuple(frames)
+        self.floor = tables.noise_floor(physical)
+        self.maps = figures.MapDrawer(result, PAGE_DPI)
 
     def page(self) -> Page:
         """Build the page, section by section."""
