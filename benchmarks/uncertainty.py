@@ -275,7 +275,7 @@ def scenes(quick: bool) -> None:
         {"gloss": 3.0},
         {"speckle": 3.0},
         {"speckle": 8.0},
-        {"paint": "sparkling"},
+        {"wrinkles": 0.05},
     ]
     heading(
         "camera",
