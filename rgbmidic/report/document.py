@@ -27,12 +27,12 @@ from rgbmidic.report.setup import (
 from rgbmidic.report.style import embedded, time_text
 from rgbmidic.results import QUANTITIES, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rgbmidic.results.physical import Physical
 
 __all__ = ["Page", "write_report"]
 
@@ -78,8 +78,6 @@ def write_report(
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
     """
-    from rgbmidic.results.physical import Physical  # numba comes with it
-
     out = Path(out)
     check_file(out, overwrite=overwrite)
     kept = result.provenance.get("settings", {}).get("setup", {})

@@ -27,6 +27,7 @@ from rgbmidic.report.style import (
     view_limits,
 )
 from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result, scale_of
+from rgbmidic.results.physical import Physical
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -335,8 +336,6 @@ def _lengths(result: Result, record: FrameRecord) -> tuple[str, dict[str, FloatA
     scale, values = scale_of(result), {name: record.values[name] for name in ("u", "v", "u_std", "v_std")}
     if scale.mm_per_pixel is None:
         return "px", values
-    from rgbmidic.results.physical import Physical  # numba comes with it
-
     units = Physical.untimed(result, scale).units
     for name in ("u", "v"):
         values[name], values[f"{name}_std"] = units.lengths(values[name], values[f"{name}_std"])

@@ -34,7 +34,7 @@ class Counted:
         self.ranges = []
 
     @staticmethod
-    def py_func(start, stop, other, items): ...
+    def __wrapped__(start, stop, other, items): ...
 
     __name__ = "counted"
 

@@ -19,7 +19,7 @@ def kernels():
     names = [one.name for one in pkgutil.iter_modules(rgbmidic._kernels.__path__)]
     modules = [importlib.import_module(f"rgbmidic._kernels.{name}") for name in names]
     found = [getattr(value, "__wrapped__", value) for module in modules for value in vars(module).values()]
-    return {(one.py_func.__name__, form) for one in found if hasattr(one, "py_func") for form in one.signatures}
+    return {(one.__name__, form) for one in found if hasattr(one, "dispatcher") for form in one.dispatcher.signatures}
 
 for part in demo._SMALL_MEASUREMENTS.values():
     part()
