@@ -98,8 +98,10 @@ def over_ranges(
 
         @wraps(kernel)
         def call(*arguments: Any) -> None:
-            large = max(getattr(argument, "size", 0) for argument in arguments) >= least
-            _share(kernel, arguments, arguments[position].shape[axis], grain, threads() if large else 1)
+            most = threads()
+            if most > 1 and max(getattr(argument, "size", 0) for argument in arguments) < least:
+                most = 1
+            _share(kernel, arguments, arguments[position].shape[axis], grain, most)
 
         return call
 
