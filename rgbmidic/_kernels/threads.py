@@ -21,7 +21,7 @@ from threadpoolctl import ThreadpoolController
 
 from rgbmidic.errors import InputError
 
-__all__ = ["compiled", "helper", "one_blas_thread", "over_ranges", "set_threads", "start_threads", "threads"]
+__all__ = ["Kernel", "compiled", "helper", "one_blas_thread", "over_ranges", "set_threads", "start_threads", "threads"]
 
 _VARIABLE = "RGBMIDIC_THREADS"
 _chosen: list[int] = []
@@ -164,7 +164,7 @@ def _default() -> int:
     return int(given)
 
 
-class _Kernel:
+class Kernel:
     """A function that numba compiles when it is first called, or when a kernel that calls it is."""
 
     __wrapped__: Callable[..., Any]
@@ -192,7 +192,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorate a kernel; `options` are those of ``numba.njit``."""
     # a division by zero gives what the processor gives, and C callers are not catered for: less code, sooner compiled
     always = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    return partial(_Kernel, always | options)
+    return partial(Kernel, always | options)
 
 
 helper = partial(compiled, no_cpython_wrapper=True)
