@@ -31,23 +31,25 @@ def unmix(start, stop, channels, valid, grid, step, needed, out, out_valid):
         down = np.float32(y - gy * step) / np.float32(step)
         for light in range(lights):
             values, ok = out[light, y], out_valid[light, y]
-            for x in range(width):
-                values[x], ok[x] = 0.0, True
+            for x in range(np.uint64(width)):
+                values[x] = 0.0
+            for x in range(np.uint64(width)):
+                ok[x] = True
             for colour in range(colours):
                 given, known = channels[colour, y], valid[colour, y]
                 for gx in range((width + step - 1) // step):
-                    first, last = gx * step, min((gx + 1) * step, width)
+                    first, number = np.uint64(gx * step), np.uint64(min(step, width - gx * step))
                     above, below = grid[gy, gx, light, colour], grid[gy + 1, gx, light, colour]
                     left = above + (below - above) * down
                     above, below = grid[gy, gx + 1, light, colour], grid[gy + 1, gx + 1, light, colour]
                     slope = (above + (below - above) * down - left) / np.float32(step)
-                    for x in range(first, last):
-                        factor = left + slope * np.float32(np.int32(x - first))
-                        values[x] += factor * given[x] if np.isfinite(given[x]) else np.float32(0.0)
+                    for i in range(number):
+                        factor, value = left + slope * np.float32(np.int32(i)), given[first + i]
+                        values[first + i] += factor * value if np.isfinite(value) else np.float32(0.0)
                 if needed[light, colour]:
-                    for x in range(width):
+                    for x in range(np.uint64(width)):
                         ok[x] &= known[x]
-            for x in range(width):
+            for x in range(np.uint64(width)):
                 values[x] = values[x] if ok[x] else np.float32(np.nan)
 
 

@@ -137,7 +137,7 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
     values = np.asarray(weights)
     if values.shape not in (shape, shape[1:]) or values.dtype.kind not in "buif":
         raise InputError(f"{name} must have shape {shape[1:]} or {shape}; given is {values.dtype} {values.shape}")
-    if not np.isfinite(values).all() or values.min() < 0:
+    if not (values.min() >= 0 and values.max() < np.inf):  # NaN spreads to both
         raise InputError(f"{name} must be finite and not negative")
     return np.ascontiguousarray(np.broadcast_to(values, shape), dtype=np.float32)
 

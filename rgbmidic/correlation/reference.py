@@ -369,11 +369,11 @@ def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: s
     given = np.ones_like(images) if weights is None else weights
     usable, reach = np.zeros_like(images), usable_reach(prefilter)
     for image, weight, out in zip(images, given, usable, strict=True):
-        known = np.isfinite(image)
-        known &= weight > 0
-        if known.all():
+        if weight.min() > 0 and np.isfinite([image.min(), image.max()]).all():  # NaN spreads to both
             out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
         else:
+            known = np.isfinite(image)
+            known &= weight > 0
             cv2.copyTo(weight, usable_pixels(known, prefilter).view(np.uint8), out)
     return usable
 
@@ -440,7 +440,7 @@ def _regression(own: FloatImage, mean: FloatImage, used: FloatImage, pixels: Pix
         The coefficient (P,), at least 0, and the median of the correlation coefficient.
     """
     products = np.stack([(mean * own).sum(axis=0), (mean**2).sum(axis=0), (own**2).sum(axis=0)])
-    along, square, power = window_means(pixels, products, np.broadcast_to(used, products.shape))
+    along, square, power = window_means(pixels, products, used[None])
     known = (square > 0) & (power > 0)
     correlation = along[known] / np.sqrt(square[known] * power[known])
     contrast = np.divide(along, square, out=np.zeros_like(along), where=known)

@@ -17,12 +17,12 @@ from rgbmidic.report.curves import field_history_figure, history_figure, status_
 from rgbmidic.report.style import PAGE_DPI, embedded, time_text
 from rgbmidic.results import QUANTITIES, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rgbmidic.results.physical import Physical
 
 _MOST = 200
 """Frames that the time histories are drawn from at most: a panel is some 450 pixels wide, two for each."""
@@ -66,8 +66,6 @@ def write_report(
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
     """
-    from rgbmidic.results.physical import Physical  # numba comes with it
-
     out = Path(out)
     check_file(out, overwrite=overwrite)
     kept = result.provenance.get("settings", {}).get("setup", {})

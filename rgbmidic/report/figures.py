@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from rgbmidic.report import style
 from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result, scale_of
+from rgbmidic.results.physical import Physical
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -284,8 +285,6 @@ class MapDrawer:
         record = self.result.frame(frame)
         values, scale, unit = {**record.values}, scale_of(self.result), "px"
         if scale.mm_per_pixel is not None:
-            from rgbmidic.results.physical import Physical  # numba comes with it
-
             units = Physical.untimed(self.result, scale).units
             unit = units.length
             for name in ("u", "v"):

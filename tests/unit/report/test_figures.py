@@ -347,6 +347,6 @@ def test_impossible_frame_and_file(tmp_path: Path) -> None:
 
 
 def test_matplotlib_is_imported_only_for_a_figure() -> None:
-    code = "import sys, rgbmidic.report, rgbmidic.results; print({'matplotlib'} & set(sys.modules))"
+    code = "import sys, rgbmidic.report, rgbmidic.results; print({'matplotlib', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
