@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.correlation import element_vector
 from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.images import usable_reach
-from rgbmidic.correlation.precision import correlation
+from rgbmidic.correlation.nodes import correlation
 from rgbmidic.correlation.reference import Deformed, Reference, drawn
-from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.correlation.start import Start, track
 from rgbmidic.errors import InputError
@@ -82,11 +81,13 @@ class ReferenceUpdate:
             scores=None,
         )
 
-    def track(self, deformed: Deformed, start: Start, options: SolverSettings, *, statistics: bool = True) -> Solution:
+    def track(
+        self, deformed: Deformed, start: Start, options: SolverSettings, method: PrecisionMethod | None
+    ) -> Solution:
         """Solve for the displacement of a later frame on the first one, from a start on the first one; see `track`."""
         last = start.displacement
         own = replace(start, displacement=None if last is None else last - self.displacement)
-        return self.accumulated(track(self.reference, deformed, own, options, statistics=statistics), deformed)
+        return self.accumulated(track(self.reference, deformed, own, options, method), deformed)
 
     def accumulated(self, step: Solution, deformed: Deformed) -> Solution:
         """Return the solution on the first frame from that on this reference.
@@ -236,15 +237,9 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, 
     The sums are NaN where a node has no displacement.
     """
     residual, known = _residual(reference, deformed, displacement, rigid)
-    pixels = reference.pixels
-    total, parts = np.zeros((len(pixels.origin), 2)), np.zeros((len(pixels.origin), 3, 2))
-    geometry = pixels.positions
-    fields = residual.weights, residual.difference, reference.gradient_x, reference.gradient_y
-    for light in zip(*fields, strict=True):
-        element_vector(*light, *geometry, parts)
-        total += parts.sum(axis=1)
-    total[~known] = np.nan
-    return total
+    lights = zip(residual.weights, residual.difference, reference.gradient.swapaxes(0, 1), strict=True)
+    total = np.sum([reference.projected(*light).sum(axis=1) for light in lights], axis=0)
+    return np.where(known[:, None], total, np.nan)
 
 
 def _residual(

@@ -24,12 +24,12 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from rgbmidic.correlation import Status, correlate
+from rgbmidic.correlation import Deformed, Reference, Start, Status, track
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.fields import at_pixels, high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.settings import ELEMENT_SIZE, TestSettings
+from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = [
@@ -348,17 +348,12 @@ def _displacement(
     prefilter: str,
 ) -> list[tuple[str, FloatImage]]:
     """Displacement u and v (H, W) of one light alone, without weights; the smaller shows a disturbance best."""
-    solution = correlate(
-        reference.values[light],
-        deformed.values[light],
-        region=region,
-        element_size=element_size,
-        prefilter=prefilter,
-        statistics=False,
-    )
+    mesh = Tri3Mesh.from_region(region, element_size)
+    before = Reference.prepare(reference.values[light : light + 1], region, mesh=mesh, prefilter=prefilter)
+    after = Deformed.prepare(deformed.values[light : light + 1], prefilter=prefilter)
+    solution = track(before, after, Start(displacement=None), SolverSettings(), None)
     if solution.status is Status.FAILED:
         logger.info("%s alone, without weights: %s", reference.names[light], solution.reason)
         return []
-    mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
     fields = at_pixels(mesh, solution.displacement, reference.shape)
     return list(zip("uv", fields, strict=True))
