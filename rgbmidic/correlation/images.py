@@ -136,9 +136,9 @@ _COARSE = 4
 """Reduction of the grid on which that window is applied: half its standard deviation, to which it adds 1 %."""
 
 
-def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-    """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
-    return _means(pixels.block_sums(fields * weights, _COARSE), pixels.block_sums(weights, _COARSE))
+def window_means(pixels: PixelMap, weighted: FloatImage, weights: FloatImage) -> FloatImage:
+    """Weighted means (n, h, w) around each block of the grid, of fields that are given times their weights (n, P)."""
+    return _means(pixels.block_sums(weighted, _COARSE), pixels.block_sums(weights, _COARSE))
 
 
 def window_covariance(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:

@@ -68,6 +68,12 @@ class Residual:
         """Grey levels g(x + u), (k, P); those of f where it is not known."""
         return self.values - self.difference
 
+    @property
+    def contrast(self) -> float:
+        """Weighted variance of the reference's grey levels under all lights together."""
+        total, f, _, ff, _, _ = self.moments.sum(axis=(0, 1)) / max(self.moments[..., 0].sum(), 1e-30)
+        return max(float(ff - f * f), 0.0) if total else 0.0
+
     def difference_from(self, values: FloatImage) -> FloatImage:
         """Return the difference for other reference grey levels (k, P)."""
         return self.difference if values is self.values else self.difference + (values - self.values)

@@ -63,9 +63,9 @@ frames took 40 to 50 iterations over the most passes, a third of them did not co
 _SETTLED = 1e-3
 """Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
 change (benchmarks/constants.py)."""
-_LOOKED_AT = 16
-"""That change is the sum over one weight in so many. Chosen; with half or twice of it nothing changes
-(benchmarks/constants.py)."""
+_LOOKED_AT = 10_000
+"""That change is the sum over about so many pixels: a change of all weights by that fraction is known to 1 % of it
+(derived)."""
 _PASSES = 8
 """Most passes: each warps the weights with the latest displacement; `_RETURNS`, and the `_REFINED` ones after."""
 
@@ -162,7 +162,7 @@ def next_weighting(
 
 def settled(weighting: Weighting, equations: Equations) -> bool:
     """Whether the next pass would have the weights of the last one."""
-    some = slice(None, None, _LOOKED_AT)
+    some = slice(None, None, equations.weights.shape[1] // _LOOKED_AT + 1)
     weights = weighting.of(some)
     total = float(weights.sum())
     return total > 0 and float(np.abs(weights - equations.weights[:, some]).sum()) <= _SETTLED * total
