@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from rgbmidic import Tri3Mesh, correlate
+from rgbmidic import Tri3Mesh, correlate, measure_sequence
+from rgbmidic.correlation import Precision
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh import Region
+from rgbmidic.weights import MaskWeights, Statistics
 
 SIDE = 160
 REGION = (15, 15, SIDE - 16, SIDE - 16)
@@ -23,6 +25,50 @@ def white(seed, sigma):
 
 def measured(first, second):
     return correlate(np.stack(first), np.stack(second), region=REGION, initial=(0, 0), prefilter="binomial")
+
+
+class OneLight:
+    """A method of one's own: the second light counts nothing."""
+
+    def precision(self, residual):
+        factor = np.ones_like(residual.weights)
+        factor[1] = 0
+        return Precision(factor=factor, bend=np.ones_like(factor[0]))
+
+
+class Nothing:
+    """A method that learns nothing."""
+
+    def precision(self, residual):
+        return None
+
+
+class MasksOfOneLight(OneLight, MaskWeights):
+    """The same beside masks."""
+
+
+def three_noisy_lights():
+    a = speckle(1)
+    return [[a + white(3 * state + light, 20) for light in range(3)] for state in range(2)]
+
+
+def test_a_method_of_ones_own_takes_the_place_of_the_statistics():
+    options = {"region": REGION, "initial": (0, 0), "prefilter": "binomial"}
+    states = [np.stack(state) for state in three_noisy_lights()]
+    found = correlate(*states, statistics=OneLight(), **options)
+    np.testing.assert_allclose(found.weight_fraction, [0.5, 0, 0.5])
+    nothing, plain = (correlate(*states, statistics=choice, **options) for choice in (Nothing(), False))
+    np.testing.assert_allclose(nothing.displacement, plain.displacement, atol=1e-4)
+    default, named = (correlate(*states, statistics=choice, **options) for choice in (True, Statistics()))
+    np.testing.assert_array_equal(default.displacement, named.displacement)
+
+
+@pytest.mark.parametrize("statistics", [True, False])
+def test_weights_that_learn_are_asked_for_their_precision(statistics):
+    states = [np.stack(state) for state in three_noisy_lights()]
+    weights = MasksOfOneLight(np.ones((3, SIDE, SIDE)))
+    _, last = measure_sequence(states, region=REGION, statistics=statistics, weights=weights)
+    np.testing.assert_allclose(last.weight_fraction, [0.5, 0, 0.5])
 
 
 def test_two_copies_of_a_light_count_nearly_as_one():
