@@ -24,7 +24,6 @@ __all__ = [
     "LOST",
     "RULES",
     "Evidence",
-    "Rule",
     "correlation",
     "correlation_around",
     "judge",
@@ -75,49 +74,26 @@ class Evidence:
     misfit: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rule:
-    """A rule: a node to which it applies gets the status, unless an earlier rule applied."""
-
-    status: NodeStatus
-    because: str
-    applies: Callable[[Evidence], BoolArray]
-
-
-RULES = (
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="the elements around it do not match, and the others have too little texture",
-        applies=lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured),
-    ),
-    Rule(
-        status=NodeStatus.NOT_SEEN,
-        because="no light sees enough texture around it",
-        applies=lambda nodes: ~nodes.textured,
-    ),
-    Rule(
-        status=NodeStatus.NOT_SEEN,
-        because="the texture runs in one direction only: what lies along it cannot be measured",
-        applies=lambda nodes: nodes.one_sided,
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="its displacement is uncertain by half a pixel or more",
-        applies=lambda nodes: nodes.std.max(axis=1) > LOST,
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="elements near it do not match, and the residual around it is several times the usual one",
-        applies=lambda nodes: nodes.near_mismatch & (nodes.misfit > _MISFIT),
-    ),
+RULES: tuple[tuple[NodeStatus, Callable[[Evidence], BoolArray]], ...] = (
+    # the elements around it do not match, and the others have too little texture
+    (NodeStatus.DECORRELATED, lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured)),
+    # no light sees enough texture around it
+    (NodeStatus.NOT_SEEN, lambda nodes: ~nodes.textured),
+    # the texture runs in one direction only: what lies along it cannot be measured
+    (NodeStatus.NOT_SEEN, lambda nodes: nodes.one_sided),
+    # its displacement is uncertain by half a pixel or more
+    (NodeStatus.DECORRELATED, lambda nodes: nodes.std.max(axis=1) > LOST),
+    # elements near it do not match, and the residual around it is several times the usual one
+    (NodeStatus.DECORRELATED, lambda nodes: nodes.near_mismatch & (nodes.misfit > _MISFIT)),
 )
-"""In this order; a node to which none applies is measured."""
+"""Status of a node to which a rule applies, in this order; one to which none does is measured."""
 
 
 def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
     """`NodeStatus` of every node (N,) by the `RULES`."""
-    applied = [rule.applies(evidence) for rule in RULES]
-    return np.select(applied, [np.uint8(rule.status) for rule in RULES], np.uint8(NodeStatus.MEASURED))
+    status, applies = zip(*RULES, strict=True)
+    applied = [rule(evidence) for rule in applies]
+    return np.select(applied, [np.uint8(one) for one in status], np.uint8(NodeStatus.MEASURED))
 
 
 def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray, one_sided: BoolArray) -> BoolArray:

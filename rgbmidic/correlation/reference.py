@@ -9,14 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.correlation import (
-    BLOCK,
-    element_hessian,
-    element_right_side,
-    element_sums,
-    element_vector,
-    warp,
-)
+from rgbmidic._kernels.correlation import BLOCK, element_hessian, element_right_side, element_sums, element_vector, warp
 from rgbmidic._kernels.interpolation import pixel_gradient
 from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
 from rgbmidic.correlation.images import (
@@ -341,13 +334,7 @@ class Reference:
 
     def _geometry(self) -> tuple[AnyArray, ...]:
         pixels = self.pixels
-        return (
-            pixels.runs,
-            pixels.run_offsets,
-            pixels.origin,
-            self.mesh.elements,
-            pixels.barycentric,
-        )
+        return (pixels.runs, pixels.run_offsets, pixels.origin, self.mesh.elements, pixels.barycentric)
 
 
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:

@@ -248,10 +248,7 @@ _MANY = 400
 
 
 def brightness_change(
-    first: FloatImage,
-    second: FloatImage,
-    reference: Reference,
-    displacement: FloatArray,
+    first: FloatImage, second: FloatImage, reference: Reference, displacement: FloatArray
 ) -> FloatArray:
     """Gain and offset of every light, ``second = gain first + offset``, as the median over the elements.
 

@@ -19,6 +19,7 @@ from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.recovery import Functional, Recovery, displacement_functionals, functional_std
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Precision, Residual
+from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 __all__ = ["displacing_fraction", "light_covariances", "nodal_std", "score_covariance", "standard_uncertainty"]
@@ -54,9 +55,10 @@ def displacing_fraction(reference: Reference, difference: FloatImage, weight: Fl
     weight : ndarray, shape (P,), float32
         Its inverse variance.
     """
-    xx, _, yy = _score_ratios(reference, difference[None], weight[None], reference.texture[:, None], BLOCK)
+    pixels, (gx, gy) = reference.pixels, reference.texture
+    xx, _, yy = _averaged_ratios(*_unit_scores(pixels, BLOCK, difference, weight, gx, gy), BLOCK)
     fraction = np.maximum(xx + yy, _LEAST_RATIO)
-    return np.asarray(reference.pixels.from_blocks(fraction[None], BLOCK)[0])
+    return np.asarray(pixels.from_blocks(fraction[None], BLOCK)[0])
 
 
 def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArray) -> FloatArray:
@@ -73,10 +75,8 @@ def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArra
     """
     reference = residual.reference
     side = block_side(reference.pixels, reference.mesh.size)
-    ratios = _score_ratios(reference, residual.difference, weights, reference.gradient, side)
-    along_x, _, along_y = _per_element(reference, ratios, side) / reference.unfitted
-    fraction = _fraction_along_x(reference, texture)
-    along_x, along_y = along_x / fraction, along_y / (1 - fraction)
+    own = _unit_scores(reference.pixels, side, residual.difference, weights, *reference.gradient)
+    along_x, along_y = _axis_ratios(reference, own, texture, side) / reference.unfitted
     scale = np.stack([along_x, np.sqrt(along_x * along_y), along_y], axis=-1)
     return np.asarray(texture * scale[:, None, None])
 
@@ -107,12 +107,10 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     common = np.divide(fields[:2], fields[2], out=np.zeros_like(fields[:2]), where=fields[2] > 0)
     lost = np.float32(1 / np.sqrt(reference.unfitted) - 1)
     own, roots = [], []
-    for light, (difference, weight, gx, gy) in enumerate(zip(residual.difference, weights, *slopes, strict=True)):
+    for difference, weight, gx, gy in zip(residual.difference, weights, *slopes, strict=True):
         whole = difference + lost * (gx * common[0] + gy * common[1])
-        own.append(_unit_scores(reference, whole[None], weight[None], (gx[None], gy[None]), side))
-        along_x, _, along_y = _per_element(reference, _averaged_ratios(*own[light], side), side)
-        fraction = _fraction_along_x(reference, reference.blocks(weight, (gx, gy)))
-        roots.append(np.sqrt([along_x / fraction, along_y / (1 - fraction)]))
+        own.append(_unit_scores(reference.pixels, side, whole, weight, gx, gy))
+        roots.append(np.sqrt(_axis_ratios(reference, own[-1], reference.blocks(weight, (gx, gy)), side)))
     for a, b in combinations_with_replacement(range(len(weights)), 2):
         # the gradients of two lights are parallel
         slope = (np.copysign(np.sqrt(np.maximum(axis[a] * axis[b], 0)), axis[a]) for axis in slopes)
@@ -124,42 +122,32 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         yield a, b, texture * scale[:, None, None]
 
 
-def _fraction_along_x(reference: Reference, texture: FloatArray) -> FloatArray:
-    """Return the fraction (E,) of the gradients along x in the `texture` (E, 3, 3, 3) around each element."""
-    mesh = reference.mesh
-    own = texture.sum(axis=(1, 2))
-    x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (own[:, 0], own[:, 2]))
-    fraction = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
-    return np.asarray(np.clip(fraction, _LEAST_FRACTION, 1 - _LEAST_FRACTION))
-
-
-def _score_ratios(
-    reference: Reference,
-    difference: FloatImage,
-    weights: FloatImage,
-    gradient: FloatImage | tuple[FloatImage, FloatImage],
-    side: int,
+def _axis_ratios(
+    reference: Reference, own: tuple[FloatArray, FloatArray, FloatArray], texture: FloatArray, side: int
 ) -> FloatArray:
-    """Covariance (xx, xy, yy) of the scores of blocks over their information; shape (3, rows, columns).
+    """Variance of the scores in x and y over their information in that axis, (2, E).
 
-    The scores are those of all lights together, for fields (k, P) and their `gradient` in x and y. A light's precision
-    changes a hundredfold at the edge of a reflection, the scores' variance with it: what is smooth, and averaged, is
-    its ratio to the information; xx + yy is 1 for white noise and ideal weights.
+    The information is divided by the gradients along x and y in the `texture` (E, 3, 3, 3) around each element.
     """
-    return _averaged_ratios(*_unit_scores(reference, difference, weights, gradient, side), side)
+    mesh = reference.mesh
+    along_x, _, along_y = _per_element(reference, _averaged_ratios(*own, side), side)
+    xx, _, yy = texture.sum(axis=(1, 2)).T
+    x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (xx, yy))
+    fraction = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
+    fraction = np.clip(fraction, _LEAST_FRACTION, 1 - _LEAST_FRACTION)
+    return np.stack([along_x / fraction, along_y / (1 - fraction)])
 
 
-def _unit_scores(
-    reference: Reference,
-    difference: FloatImage,
-    weights: FloatImage,
-    gradient: FloatImage | tuple[FloatImage, FloatImage],
-    side: int,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scores in x and y of blocks over the root of their information, and their pixels; shape (rows, columns)."""
-    fields = np.empty((4, difference.shape[1]), dtype=np.float32)
-    scores(difference, weights, *gradient, fields)
-    x, y, information, count = reference.pixels.block_sums(fields, side).astype(np.float64)
+def _unit_scores(pixels: PixelMap, side: int, *fields: FloatImage) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Scores in x and y of blocks over the root of their information, and their pixels; shape (rows, columns).
+
+    The scores are those of all lights together; the `fields` are difference, weights and gradient in x and y, (k, P) or
+    (P,). A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
+    smooth, and averaged, is its ratio to the information.
+    """
+    sums = np.empty((4, pixels.local_x.size), dtype=np.float32)
+    scores(*(np.atleast_2d(field) for field in fields), sums)
+    x, y, information, count = pixels.block_sums(sums, side).astype(np.float64)
     level = _blur(information, _EVEN) / np.maximum(_blur(count, _EVEN), 1e-6)
     scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
     return x * scale, y * scale, count
@@ -168,7 +156,8 @@ def _unit_scores(
 def _averaged_ratios(x: FloatArray, y: FloatArray, count: FloatArray, side: int) -> FloatArray:
     """Products xx, xy, yy of such scores per pixel, averaged; shape (3, rows, columns).
 
-    They are raised where blocks are few, so that an error over its stated uncertainty has the variance 1.
+    xx + yy is 1 for white noise and ideal weights. They are raised where blocks are few, so that an error over its
+    stated uncertainty has the variance 1.
     """
     typical = _typical_square(x, y, count)
     around = _blur(count, _SCORE_RANGE / side)
