@@ -413,7 +413,7 @@ def _regression(own: FloatImage, mean: FloatImage, used: FloatImage, pixels: Pix
         The coefficient (P,), at least 0, and the median of the correlation coefficient.
     """
     products = np.stack([(mean * own).sum(axis=0), (mean**2).sum(axis=0), (own**2).sum(axis=0)])
-    along, square, power = window_means(pixels, products * used, np.broadcast_to(used, products.shape))
+    along, square, power = window_means(pixels, products, used[None])
     known = (square > 0) & (power > 0)
     correlation = along[known] / np.sqrt(square[known] * power[known])
     contrast = np.divide(along, square, out=np.zeros_like(along), where=known)
