@@ -216,8 +216,8 @@ def correlation_around(residual: Residual) -> FloatArray:
 
     It is NaN where the states show no texture together.
     """
-    to_nodes = residual.reference.mesh.to_nodes
-    fg, ff, gg = (to_nodes(part) for part in _centred_products(residual, _light_precision(residual, None)))
+    mesh = residual.reference.mesh
+    fg, ff, gg = (mesh.to_nodes(part) for part in _centred_products(residual, _light_precision(residual, None)))
     return np.where(ff > 1e-9 * ff.max(initial=0.0), correlation(fg, ff, gg), np.nan)
 
 

@@ -106,11 +106,11 @@ class ReferenceUpdate:
         both = np.isfinite(before + after)
         square = float((after[both] ** 2).sum())
         regression = float(np.clip(-(before[both] * after[both]).sum() / square, -1, 0.5)) if square > 0 else 0.0
-        own = 1 - 2 * regression
+        own, mesh = 1 - 2 * regression, self.first.mesh
         return replace(
             step,
-            nodes=self.first.mesh.nodes,
-            elements=self.first.mesh.elements,
+            nodes=mesh.nodes,
+            elements=mesh.elements,
             displacement=self.displacement + step.displacement,
             displacement_std=np.sqrt(self.variance + own * step.displacement_std**2),
             strain=self.strain + step.strain,

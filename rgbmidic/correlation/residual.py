@@ -83,8 +83,9 @@ class Residual:
 
         The result has the shape (k, E, 3).
         """
-        out = np.empty((len(weights), len(self.reference.mesh.elements), 3))
-        element_squares(self.difference, weights, self.reference.pixels.offsets, out)
+        pixels = self.reference.pixels
+        out = np.empty((len(weights), len(pixels.origin), 3))
+        element_squares(self.difference, weights, pixels.offsets, out)
         return out
 
     def centred_products(self) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -22,7 +22,6 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatImage
-from rgbmidic.weights.geometry import GeometryWeights
 from rgbmidic.weights.statistics import Statistics, ValidPixels
 from rgbmidic.weights.threshold import ThresholdWeights, automatic_weights
 
@@ -183,6 +182,8 @@ def prepare_weights(
     """
     weights = settings.weights
     if weights.method == "geometry":
+        from rgbmidic.weights.geometry import GeometryWeights  # the scene, which no other method needs
+
         return GeometryWeights.prepare(settings, lights=reference.names, shape=shape or reference.shape, frames=frames)
     if weights.method == "images":
         masks = MaskWeights.read(weights.images)
