@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 
 from rgbmidic._kernels import are_compiled
-from rgbmidic.correlation import correlate
 from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import Plan, Separation, measure
+from rgbmidic.pipeline import Plan, Separation, correlate, measure
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage

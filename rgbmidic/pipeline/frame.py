@@ -26,6 +26,7 @@ from rgbmidic.pipeline.separation import RawState, correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.weights import precision_method
 
 __all__ = ["failed_frame", "measure_frame", "next_reference", "read_state", "solve_frame"]
 
@@ -129,8 +130,8 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     with stage("preparation"):
         weights, ready = plan.frame_weights(images, index), correlated(images, settings.illumination)
         deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter, origin=window.origin)
-    statistics = settings.weights.method == "statistics"
-    solution = reference_update.track(deformed, start, settings.solver, statistics=statistics)
+    method = precision_method(plan.weights, settings.weights.method)
+    solution = reference_update.track(deformed, start, settings.solver, method)
     if solution.status is not Status.CONVERGED:
         there = state
         if not isinstance(state, IlluminationImages):
