@@ -221,6 +221,7 @@ class Plan:
             mesh=mesh,
             prefilter=settings.solver.prefilter,
             origin=window.origin,
+            registration=images.registration,
         )
         speckle = _speckle(images, region)
         if small := too_small(size, speckle, HARDLY_ENOUGH):

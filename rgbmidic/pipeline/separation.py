@@ -15,7 +15,6 @@ from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linear import LinearChannels, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmixing import align
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import FloatImage
 
@@ -53,7 +52,9 @@ class LightSeparation(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
-    """From what the camera recorded of one state to one image per light: linearise, demosaic, unmix, align.
+    """From what the camera recorded of one state to one image per light: linearise, demosaic, unmix.
+
+    The images stay where they are: the solve reads each where its registration says that it lies.
 
     Attributes
     ----------
@@ -84,10 +85,10 @@ class Separation:
         ConfigurationError
             Colour frames without a calibrated crosstalk, or settings that contradict the calibration.
         """
-        if window is not None and not window.is_whole:
-            known = self.calibration and self.calibration.cropped(window.origin, window.shape)
-            return replace(replace(self, calibration=known)(frames), origin=window.origin)
         known = self.calibration or Calibration()
+        if window is not None and not window.is_whole:
+            here = replace(self, calibration=self.calibration and known.cropped(window.origin, window.shape))
+            return replace(here(frames), origin=window.origin, registration=known.registration)
         linear = [linearise(frame, known.noise) for frame in frames]
         if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
             names = known.registration.lights if known.registration else ()
@@ -96,7 +97,7 @@ class Separation:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
         else:
             images = separate(linear[0], self._crosstalk(), self.demosaic, texture=self.texture)
-        return images if known.registration is None else align(images, known.registration)
+        return replace(images, registration=known.registration)
 
     def learnt(self, images: IlluminationImages) -> Separation:
         """The separation that takes the speckle's texture from the images of one state for all others."""

@@ -179,9 +179,7 @@ def inspect_frame(
     report(1, 3, "lights, and the errors of their separation")
     names = known.registration.lights if known.registration else ()
     separated, errors = _separated(linear, crosstalk, demosaic, samples.noise, names, np.random.default_rng(seed))
-    images = separated
-    if known.registration is not None:
-        images = align(images, known.registration.cropped(window.origin))
+    images = align(replace(separated, origin=window.origin, registration=known.registration))
     report(2, 3, "uncertainty to expect")
     level, contrast = level_and_contrast(images, contrast_window(samples.channels))
     index = _reflection_index(separated, contrast)
