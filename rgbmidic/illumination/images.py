@@ -7,7 +7,7 @@ reflection lifts the mean; dividing by the local mean leaves the texture, which 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -110,6 +110,11 @@ class IlluminationImages:
             or (("light",) if len(frames) == 1 else tuple(f"light {i + 1}" for i in range(len(frames)))),
             full_scale=frames[0].full_scale,
         )
+
+    def placed(self, origin: tuple[int, int]) -> IlluminationImages:
+        """Return the images as those of a part of the frame that begins at the pixel `origin` (column, row)."""
+        known = self.registration
+        return replace(self, origin=origin, registration=known and known.cropped((-origin[0], -origin[1])))
 
     def reflection_index(self, step: int = 1, within: tuple[slice, slice] | None = None) -> FloatImage | None:
         """Return the fraction of a light that is not diffuse, from a single frame.

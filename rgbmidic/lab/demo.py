@@ -23,6 +23,7 @@ from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.unmixing import align
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, measure
 from rgbmidic.results import Result
@@ -194,7 +195,7 @@ def _separated(settings: TestSettings) -> list[FloatImage]:
     calibration = Calibration.read(settings.calibration_file)
     separation = Separation(calibration=calibration)
     frames = open_series(settings.frames, settings.base, calibration)
-    return [separation(frames.read(index)).values for index in range(len(frames))]
+    return [align(separation(frames.read(index))).values for index in range(len(frames))]
 
 
 def _rms(values: FloatArray) -> float:
