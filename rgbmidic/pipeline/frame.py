@@ -129,6 +129,9 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     with stage("preparation"):
         weights, ready = plan.frame_weights(images, index), correlated(images, settings.illumination)
         deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter, origin=window.origin)
+        step = -(-max(plan.window.shape) // _THUMBNAIL)
+        thumbnail = _in_bytes(weights[:, *here][:, ::step, ::step])
+        del weights, ready  # a tenth of what a frame needs
     statistics = settings.weights.method == "statistics"
     solution = reference_update.track(deformed, start, settings.solver, statistics=statistics)
     if solution.status is not Status.CONVERGED:
@@ -144,7 +147,6 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     brightness = brightness_change(plan.images.values, images.values, reference, moved)
     _tell_dark(name, images.names, brightness)
     match, best, reference_updates = _compared(plan, index, start, reference_update, deformed, solution)
-    step = -(-max(plan.window.shape) // _THUMBNAIL)
     reflection = images.reflection_index(step, here)
     return {
         "solution": kept,
@@ -154,7 +156,7 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         "match": match,
         "best_match": best,
         "reference_updates": reference_updates,
-        "weights_thumbnail": _in_bytes(weights[:, *here][:, ::step, ::step]),
+        "weights_thumbnail": thumbnail,
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": inputs,
     }

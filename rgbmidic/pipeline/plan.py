@@ -175,35 +175,20 @@ class Plan:
             the settings.
         """
         _check_given(settings, source, separation, weights, mesh)
-        calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
-        series: Series
-        if source is None:
-            series = open_series(settings.frames, settings.base, calibration)
-        else:
-            series = open_sequence(source, settings.frames, calibration)
-        if calibration is not None:
-            calibration = calibration.cropped(settings.frames.crop_origin, series.shape)
+        series, calibration = _series_and_calibration(settings, source)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        if any(one is not None for one in (source, weights, mesh, region)) or not isinstance(
-            separate, WindowedSeparation
-        ):
+        whole = any(one is not None for one in (source, weights, mesh, region))
+        if whole or not isinstance(separate, WindowedSeparation):
             region, window = region or read_region(settings.region, series.shape), Window.whole(series.shape)
         else:
             region, window = _region_and_window(settings, series.shape)
         rest = _Rest.read(settings, series, separate, window)
         if separation is not None and isinstance(rest.states[0], IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
-        rest.check_calibrated(
-            calibration and (calibration if window.is_whole else calibration.cropped(window.origin, window.shape)),
-            region,
-            settings,
-        )
+        rest.check_calibrated(calibration, region, window, settings)
+        size = settings.element_size if mesh is None else mesh.size
         if mesh is None:
-            cracks = [np.subtract(path, window.origin) for path in settings.cracks]
-            mesh = Tri3Mesh.from_region(region, settings.element_size, cracks)
-            size = settings.element_size
-        else:
-            size = mesh.size
+            mesh = Tri3Mesh.from_region(region, size, [np.subtract(path, window.origin) for path in settings.cracks])
         weights = weights or prepare_weights(
             settings,
             rest.images,
@@ -284,11 +269,15 @@ class _Rest:
         images, learnt = reference_images(separation, chain(states, others), window)
         return cls(names=", ".join(map(series.name, indices)), states=states, images=images, separation=learnt)
 
-    def check_calibrated(self, calibration: Calibration | None, region: Region, settings: TestSettings) -> None:
-        """Refuse frames that contradict their `calibration`, cropped to them."""
+    def check_calibrated(
+        self, calibration: Calibration | None, region: Region, window: Window, settings: TestSettings
+    ) -> None:
+        """Refuse frames that contradict their `calibration`, of which they are a `window`."""
         raw = [state for state in self.states if not isinstance(state, IlluminationImages)]
         if calibration is None or not raw:
             return
+        if not window.is_whole:
+            calibration = calibration.cropped(window.origin, window.shape)
         repeat = raw[1] if len(raw) > 1 else None
         for found in check_state(raw[0], calibration, region.mask, self.names, accept=settings.accept, repeat=repeat):
             if not found.certain:
@@ -334,6 +323,17 @@ def _check_given(
             f'frames.kind = "{kind}" needs the lights\' crosstalk: state calibration.file, a file that '
             "rgbmidic-calibrate writes"
         )
+
+
+def _series_and_calibration(settings: TestSettings, source: FrameSequence | None) -> tuple[Series, Calibration | None]:
+    """The frames, of the settings or a `source`, and the calibration cropped to them."""
+    calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
+    series: Series
+    if source is None:
+        series = open_series(settings.frames, settings.base, calibration)
+    else:
+        series = open_sequence(source, settings.frames, calibration)
+    return series, calibration and calibration.cropped(settings.frames.crop_origin, series.shape)
 
 
 def _region_and_window(settings: TestSettings, frame: tuple[int, int]) -> tuple[Region, Window]:
