@@ -73,8 +73,9 @@ class Deformed:
 
         The others follow by the affine motion nearest to their registration: good enough to look at and search in.
         """
-        values, weights = spline_values(self.coefficients), self.weights.copy()
+        values, weights = spline_values(self.coefficients), self.weights
         if registration is not None:
+            weights = weights.copy()
             corners = np.array([[0, 0], [values.shape[2], 0], [0, values.shape[1]]], dtype=np.float32)
             for light, shift in enumerate(registration.displacement(corners + self.origin)):
                 there = cv2.getAffineTransform(corners, (corners + shift).astype(np.float32))
@@ -260,11 +261,12 @@ class Reference:
             inside *= usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
         geometry = ReferenceGeometry.of(mesh, region, origin, first)
         pixels, (ready, usable) = geometry.pixels, state.pictures(registration)
-        usable *= inside
+        usable = usable * inside
         if registration is None:
             values, weighted, own = pixels.gather(ready), pixels.gather(usable), _gradient(state.coefficients, pixels)
         else:
             values, weighted, own = _where_they_lie(state, geometry, pixels.gather(inside), registration)
+        del state  # before what needs most memory
         gradient = _common_gradient(own, weighted, pixels)
         return cls(
             geometry=geometry,
@@ -276,7 +278,7 @@ class Reference:
             gradient_y=gradient[1],
             pixel_weights=weighted,
             texture=gradient.sum(axis=1),
-            channel_specific=(own - gradient)[:, : len(images) if len(images) > 1 else 0],
+            channel_specific=own[:, :0] if gradient is own else np.subtract(own, gradient, out=own),
             prefilter=prefilter,
             registration=registration,
         )
@@ -418,14 +420,15 @@ def _where_they_lie(
     """
     pixels, elements = geometry.pixels, geometry.mesh.elements
     x, y = pixels.columns, pixels.rows
-    values, weights, *gradient = np.empty((4, len(state.weights), inside.size), dtype=np.float32)
-    unused, shift, moments = np.empty_like(inside), np.empty((2, inside.size), np.float32), np.empty((len(elements), 6))
+    values, weights = (np.empty((len(state.weights), inside.size), dtype=np.float32) for _ in range(2))
+    gradient, shift = (np.empty((2, *many, inside.size), dtype=np.float32) for many in (values.shape[:1], ()))
+    unused, moments = np.empty_like(inside), np.empty((len(elements), 6))
     for light, motion in enumerate(registration.displacement(geometry.mesh.nodes + geometry.origin)):
         images = state.coefficients[light], state.weights[light], state.partial[light]
         warp(*images, np.zeros_like(inside), inside, *geometry.parts, motion, values[light], weights[light], moments)
         interpolate_nodal(motion, elements, *pixels.positions, shift)
-        sample_with_gradient(images[0], x + shift[0], y + shift[1], unused, gradient[0][light], gradient[1][light])
-    return -values, weights, np.stack(gradient)
+        sample_with_gradient(images[0], x + shift[0], y + shift[1], unused, *gradient[:, light])
+    return np.negative(values, out=values), weights, gradient
 
 
 def _partial_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
@@ -477,7 +480,7 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
         if correlation < _SHARED:
             mean = everyone
             contrast, _ = _regression(own, mean, seen, pixels)
-        out[:, light] = mean * contrast
+        np.multiply(mean, contrast, out=out[:, light])
     return out
 
 
