@@ -35,9 +35,6 @@ _START = 180.0
 one that gets no memory for its threads never answers."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RGBMIDIC_THREADS")
 """What libraries read, when they start, for the number of their threads."""
-_KEPT = dict.fromkeys(("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"), str(2**30))
-"""For glibc: memory that a frame gives back stays with the process for the next frame. New pages, filled with zeros
-first, took 8 % of the CPU time of a raw frame of 1 Mpx and a quarter of one of 4 Mpx (measured)."""
 
 Updated = Sequence[tuple[int, Solution]]
 """Index and solution of frames that became the reference, see `measure_frame`."""
@@ -100,7 +97,7 @@ class Processes(Workers):
     def _begin(self) -> ProcessPoolExecutor:
         threads = max(available_cores() // self.slots, 1)
         others = set(multiprocessing.active_children())
-        with _environment(dict.fromkeys(_THREADS, str(threads)) | _KEPT):
+        with _environment(dict.fromkeys(_THREADS, str(threads))):
             spawn = multiprocessing.get_context("spawn")  # threads do not survive a fork
             pool = ProcessPoolExecutor(self.slots, spawn, initializer=_prepare, initargs=(self._plan, threads))
             # the processes must start while the environment says how many threads they have
