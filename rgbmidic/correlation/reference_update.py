@@ -176,7 +176,14 @@ class ReferenceUpdate:
         moved = Tri3Mesh(nodes=mesh.nodes + motion, elements=mesh.elements)
         region = _region(self.first, moved, measured, images.shape[1:])
         reference = Reference.prepare(
-            images, region, weights, mesh=moved, first=self.first.geometry, prefilter=prefilter, origin=origin
+            images,
+            region,
+            weights,
+            mesh=moved,
+            first=self.first.geometry,
+            prefilter=prefilter,
+            origin=origin,
+            registration=self.first.registration,
         )
         step, rigid = self._step(displacement, solution)
         gaps = np.where(measured[:, None], step, np.nan)

@@ -318,10 +318,10 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
     known = nodes if last is None else np.concatenate([nodes, nodes + last])
     there = Box.around(known - offset, search_reach(nodes), deformed.weights.shape[1:])
     most = int(min(_KEYPOINTS * there.area / here.area, _MOST))
-    best, images = 0.0, deformed.images
+    best, (images, weights) = 0.0, deformed.pictures(reference.registration)
     for reduction in _REDUCTIONS if side <= _SMALL else _REDUCTIONS[:-1]:
         f = Keypoints.find(reference.images, reference.weights, here, reduction, _KEYPOINTS)
-        g = Keypoints.find(images, deformed.weights, there, reduction, most)
+        g = Keypoints.find(images, weights, there, reduction, most)
         points, motion = pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
         if not len(points):
             continue
