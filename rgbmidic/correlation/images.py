@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, product_sums
 from rgbmidic.errors import InputError
+from rgbmidic.illumination.images import fill_holes
 from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -15,7 +16,6 @@ __all__ = [
     "PREFILTERS",
     "apply_prefilter",
     "as_light_stack",
-    "fill_holes",
     "spline_coefficients",
     "spline_values",
     "spread",
@@ -50,29 +50,6 @@ def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
     if stack.shape[0] == 0 or min(stack.shape[1:]) < 8:
         raise InputError(f"{name} must have at least one image of at least 8 x 8 px; given is shape {stack.shape}")
     return np.ascontiguousarray(stack, dtype=np.float32)
-
-
-def fill_holes(image: FloatImage, valid: BoolArray, sigma: float = 3.0) -> FloatImage:
-    """Replace invalid pixels by the Gaussian mean of the valid ones around, and by the overall mean farther away.
-
-    The values carry no weight in the solve; they only keep the spline's recursion finite and quiet.
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W), float32
-        Grey levels.
-    valid : ndarray, shape (H, W), bool
-        Pixels to keep.
-    sigma
-        Standard deviation of the mean's window, px.
-    """
-    if valid.all():
-        return image
-    known = np.where(valid, image, np.float32(0))
-    weight = cv2.GaussianBlur(valid.astype(np.float32), (0, 0), sigma)
-    mean = np.float32(known.sum(dtype=np.float64) / max(int(valid.sum()), 1))
-    local = cv2.GaussianBlur(known, (0, 0), sigma) / np.maximum(weight, np.float32(1e-3))
-    return np.where(valid, image, np.where(weight > 1e-3, local, mean)).astype(np.float32)
 
 
 def apply_prefilter(image: FloatImage, prefilter: str) -> FloatImage:
@@ -117,8 +94,7 @@ def spline_coefficients(images: FloatImage, prefilter: str = "none") -> FloatIma
     taps = _taps(prefilter)
     out = np.empty((len(images), *(side + 2 * PAD for side in images.shape[1:])), dtype=np.float32)
     for image, coefficients in zip(images, out, strict=True):
-        filled = fill_holes(image, np.isfinite(image))
-        bspline_coefficients(np.ascontiguousarray(filled), coefficients, taps[len(taps) // 2 :])
+        bspline_coefficients(fill_holes(image), coefficients, taps[len(taps) // 2 :])
     return out
 
 
@@ -137,7 +113,7 @@ _COARSE = 4
 
 
 def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-    """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
+    """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P) or (1, P)."""
     return _means(pixels.block_sums(fields * weights, _COARSE), pixels.block_sums(weights, _COARSE))
 
 
@@ -156,9 +132,10 @@ def window_covariance(pixels: PixelMap, fields: FloatImage, weights: FloatImage)
 
 
 def _means(totals: FloatImage, weights: FloatImage) -> FloatImage:
-    """Divide sums (n, h, w) by those of their weights, both blurred."""
-    both = zip(totals, weights, strict=True)
-    return np.stack([_blur(total) / np.maximum(_blur(weight), np.float32(1e-6)) for total, weight in both])
+    """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
+    means, around = (np.stack([_blur(grid) for grid in grids]) for grids in (totals, weights))
+    means /= np.maximum(around, np.float32(1e-6), out=around)
+    return means
 
 
 def spread(pixels: PixelMap, grids: FloatImage) -> FloatImage:

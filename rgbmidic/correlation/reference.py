@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import cv2
@@ -14,9 +15,10 @@ from rgbmidic._kernels.correlation import (
     element_right_side,
     element_sums,
     element_vector,
+    interpolate_nodal,
     warp,
 )
-from rgbmidic._kernels.interpolation import pixel_gradient
+from rgbmidic._kernels.interpolation import pixel_gradient, sample_with_gradient
 from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
 from rgbmidic.correlation.images import (
     spline_coefficients,
@@ -28,10 +30,13 @@ from rgbmidic.correlation.images import (
 )
 from rgbmidic.correlation.recovery import NodeColouring, linear_fit_offset
 from rgbmidic.errors import InputError
+from rgbmidic.illumination.registration import Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 __all__ = ["Deformed", "Reference", "drawn"]
+
+_WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 
 _SHARED = 0.85
 """Correlation of a light's gradient with the mean of the others', median over the region, from which theirs takes its
@@ -64,10 +69,20 @@ class Deformed:
         """Count the blocks with a weight other than 1."""
         object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
 
-    @property
-    def images(self) -> FloatImage:
-        """The images (k, H, W), holes filled and prefiltered."""
-        return spline_values(self.coefficients)
+    def pictures(self, registration: Registration | None = None) -> tuple[FloatImage, FloatImage]:
+        """Return the images, holes filled and prefiltered, and the weights, both (k, H, W) on the first light's pixels.
+
+        The others follow by the affine motion nearest to their registration: good enough to look at and search in.
+        """
+        values, weights = spline_values(self.coefficients), self.weights
+        if registration is not None:
+            weights = weights.copy()
+            corners = np.array([[0, 0], [values.shape[2], 0], [0, values.shape[1]]], dtype=np.float32)
+            for light, shift in enumerate(registration.displacement(corners + self.origin)):
+                there = cv2.getAffineTransform(corners, (corners + shift).astype(np.float32))
+                for image in (values[light], weights[light]):
+                    image[:] = cv2.warpAffine(image, there, image.shape[::-1], flags=_WARP)
+        return values, weights
 
     @classmethod
     def prepare(
@@ -149,6 +164,12 @@ class ReferenceGeometry:
             origin=origin,
         )
 
+    @property
+    def parts(self) -> tuple[AnyArray, ...]:
+        """Runs of pixels, elements and shape functions, for the kernels that follow a motion of the nodes."""
+        pixels = self.pixels
+        return pixels.runs, pixels.run_offsets, pixels.origin, self.mesh.elements, pixels.barycentric
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reference:
@@ -159,11 +180,16 @@ class Reference:
     geometry : ReferenceGeometry
         Mesh, pixels and what follows from them.
     images, weights : ndarray, shape (k, H, W), float32
-        Holes filled and prefiltered; 0 where excluded.
+        Holes filled and prefiltered; 0 where excluded. In pictures: all lights on the pixels of the first.
+    registration : Registration or None
+        Where in its own image, of this state and of the deformed ones, a light shows what the first one shows at a
+        pixel of the frame: there it is read; None: at the same pixel.
     unfitted : float
         Fraction of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
-    values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
-        The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
+    values, pixel_weights : ndarray, shape (k, P), float32
+        The same at the owned pixels.
+    gradient : ndarray, shape (2, k, P), float32
+        Gradient of the texture common to the lights, in grey levels per px of each.
     texture : ndarray, shape (2, P), float32
         Gradient of the lights' common texture: the sum of theirs.
     channel_specific : ndarray, shape (2, k, P), float32
@@ -177,12 +203,12 @@ class Reference:
     images: FloatImage
     weights: FloatImage
     values: FloatImage
-    gradient_x: FloatImage
-    gradient_y: FloatImage
+    gradient: FloatImage
     pixel_weights: FloatImage
     texture: FloatImage
     channel_specific: FloatImage
     prefilter: str
+    registration: Registration | None = None
 
     @classmethod
     def prepare(
@@ -195,6 +221,7 @@ class Reference:
         prefilter: str = "none",
         origin: tuple[int, int] = (0, 0),
         first: ReferenceGeometry | None = None,
+        registration: Registration | None = None,
     ) -> Reference:
         """Prepare the reference state.
 
@@ -214,6 +241,8 @@ class Reference:
             Column and row of the frame at which the images begin.
         first
             Geometry of the first frame, where this is a later one; its nodes are those of `mesh`.
+        registration
+            Of the lights, where their images do not lie on one grid; the region is then that of the first light.
 
         Returns
         -------
@@ -226,29 +255,33 @@ class Reference:
         """
         if region.mask.shape != images.shape[1:]:
             raise InputError(f"the region is for images of shape {region.mask.shape}, not {images.shape[1:]}")
-        coefficients, usable = spline_coefficients(images, prefilter), _usable_weights(images, weights, prefilter)
+        state = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
+        inside = np.ones(region.mask.shape, dtype=np.float32)
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
-            usable = usable * usable_pixels(region.mask, prefilter)
+            inside *= usable_pixels(region.mask, prefilter)
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
-            usable = usable * usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
+            inside *= usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
         geometry = ReferenceGeometry.of(mesh, region, origin, first)
-        pixels = geometry.pixels
-        ready = spline_values(coefficients)
-        weighted = pixels.gather(usable)
-        own = _gradient(coefficients, pixels)
+        pixels, (ready, usable) = geometry.pixels, state.pictures(registration)
+        usable = usable * inside
+        if registration is None:
+            values, weighted, own = pixels.gather(ready), pixels.gather(usable), _gradient(state.coefficients, pixels)
+        else:
+            values, weighted, own = _where_they_lie(state, geometry, pixels.gather(inside), registration)
+        del state  # before what needs most memory
         gradient = _common_gradient(own, weighted, pixels)
         return cls(
             geometry=geometry,
             unfitted=unfitted_fraction(pixels, geometry.assembly, gradient, weighted, block_side(pixels, mesh.size)),
             images=ready,
             weights=usable,
-            values=pixels.gather(ready),
-            gradient_x=gradient[0],
-            gradient_y=gradient[1],
+            values=values,
+            gradient=gradient,
             pixel_weights=weighted,
             texture=gradient.sum(axis=1),
-            channel_specific=(own - gradient)[:, : len(images) if len(images) > 1 else 0],
+            channel_specific=own[:, :0] if gradient is own else np.subtract(own, gradient, out=own),
             prefilter=prefilter,
+            registration=registration,
         )
 
     @property
@@ -275,16 +308,26 @@ class Reference:
         """Column and row of these images (2,) at which those of a deformed state begin."""
         return np.subtract(deformed.origin, self.origin).astype(np.float64)
 
-    def blocks(self, weight: FloatImage, gradient_x: FloatImage, gradient_y: FloatImage) -> FloatArray:
-        """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""
-        pixels = self.pixels
+    def motion(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatArray:
+        """Motion (N, 2) of the nodes from here to where a light's deformed image shows them, for a displacement.
+
+        A light's registration is part of it, as linear in each element as the displacement, here and in the reference's
+        own grey levels: what the elements do not follow of it cancels.
+        """
+        motion = displacement - self.offset(deformed)
+        if self.registration is None:
+            return motion
+        return np.asarray(motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin)[light])
+
+    def blocks(self, weight: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
+        """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,)."""
         out = np.zeros((len(self.mesh.elements), 3, 3, 3))
-        element_hessian(gradient_x, gradient_y, weight, *pixels.positions, out)
+        element_hessian(*gradient, weight, *self.pixels.positions, out)
         return out
 
-    def hessian_blocks(self, light: int, weight: FloatImage) -> FloatArray:
-        """Element blocks of a light's Hessian with the pixel weights (P,)."""
-        return self.blocks(weight, self.gradient_x[light], self.gradient_y[light])
+    def hessians(self, weights: FloatImage) -> list[FloatArray]:
+        """Element blocks of each light's Hessian for pixel weights (k, P)."""
+        return [self.blocks(*light) for light in zip(weights, self.gradient.swapaxes(0, 1), strict=True)]
 
     def warp(
         self,
@@ -315,37 +358,22 @@ class Reference:
             values,
             self.pixel_weights[light],
         )
-        motion = displacement - self.offset(deformed)
-        warp(*images, *self._geometry(), motion, *out)
+        warp(*images, *self.geometry.parts, self.motion(deformed, light, displacement), *out)
 
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
     ) -> FloatArray:
-        """Sum a light's right-hand side (2 N,) for reference grey levels `values` (P,)."""
+        """Sum a light's right-hand side over each element, (E, 3, 2), for reference grey levels `values` (P,)."""
+        parts, motion = np.empty((len(self.mesh.elements), 3, 2)), self.motion(deformed, light, displacement)
+        images = deformed.coefficients[light], values, *self.gradient[:, light], weight
+        element_right_side(*images, *self.geometry.parts, motion, parts)
+        return parts
+
+    def projected(self, weight: FloatImage, difference: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
+        """Sum the same for a difference that is known: ``sum w (f - g) grad f phi``, for fields (P,)."""
         parts = np.empty((len(self.mesh.elements), 3, 2))
-        gradient, motion = (self.gradient_x[light], self.gradient_y[light]), displacement - self.offset(deformed)
-        element_right_side(deformed.coefficients[light], values, *gradient, weight, *self._geometry(), motion, parts)
-        return self.assembly.vector(parts)
-
-    def projected(self, light: int, weight: FloatImage, difference: FloatImage) -> FloatArray:
-        """Sum the same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
-        parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
-        geometry = pixels.positions
-        element_vector(weight, difference, self.gradient_x[light], self.gradient_y[light], *geometry, parts)
-        return self.assembly.vector(parts)
-
-    def channel_specific_pulls(self, weights: FloatImage, difference: FloatImage) -> FloatArray:
-        """Sum the same of every light, (k, 2 N), with its channel-specific gradient.
-
-        `weights` and `difference` are (k, P); the result is empty where there is but one light.
-        """
-        parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
-        geometry = pixels.positions
-        pulls = np.empty((self.channel_specific.shape[1], self.assembly.size))
-        for light, pull in enumerate(pulls):
-            element_vector(weights[light], difference[light], *self.channel_specific[:, light], *geometry, parts)
-            pull[:] = self.assembly.vector(parts)
-        return pulls
+        element_vector(weight, difference, *gradient, *self.pixels.positions, parts)
+        return parts
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:
         """Sum fields (n, P) over each element, and their products with a `factor` (P,); shape (n, E, 2)."""
@@ -353,29 +381,39 @@ class Reference:
         element_sums(values, factor, self.pixels.offsets, out)
         return out
 
-    def _geometry(self) -> tuple[AnyArray, ...]:
-        pixels = self.pixels
-        return (
-            pixels.runs,
-            pixels.run_offsets,
-            pixels.origin,
-            self.mesh.elements,
-            pixels.barycentric,
-        )
-
 
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
     """Return the weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
     given = np.ones_like(images) if weights is None else weights
     usable, reach = np.zeros_like(images), usable_reach(prefilter)
     for image, weight, out in zip(images, given, usable, strict=True):
-        known = np.isfinite(image)
-        known &= weight > 0
-        if known.all():
+        if weight.min() > 0 and np.isfinite([image.min(), image.max()]).all():  # NaN spreads to both
             out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
         else:
+            known = np.isfinite(image)
+            known &= weight > 0
             cv2.copyTo(weight, usable_pixels(known, prefilter).view(np.uint8), out)
     return usable
+
+
+def _where_they_lie(
+    state: Deformed, geometry: ReferenceGeometry, inside: FloatImage, registration: Registration
+) -> tuple[FloatImage, FloatImage, FloatImage]:
+    """Grey levels and weights (k, P), gradient (2, k, P) of lights at what the first one shows at the owned pixels.
+
+    `inside` (P,) is the weight of these pixels themselves.
+    """
+    pixels, elements = geometry.pixels, geometry.mesh.elements
+    x, y = pixels.columns, pixels.rows
+    values, weights = (np.empty((len(state.weights), inside.size), dtype=np.float32) for _ in range(2))
+    gradient, shift = (np.empty((2, *many, inside.size), dtype=np.float32) for many in (values.shape[:1], ()))
+    unused, moments = np.empty_like(inside), np.empty((len(elements), 6))
+    for light, motion in enumerate(registration.displacement(geometry.mesh.nodes + geometry.origin)):
+        images = state.coefficients[light], state.weights[light], state.partial[light]
+        warp(*images, np.zeros_like(inside), inside, *geometry.parts, motion, values[light], weights[light], moments)
+        interpolate_nodal(motion, elements, *pixels.positions, shift)
+        sample_with_gradient(images[0], x + shift[0], y + shift[1], unused, *gradient[:, light])
+    return np.negative(values, out=values), weights, gradient
 
 
 def _partial_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
@@ -427,7 +465,7 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
         if correlation < _SHARED:
             mean = everyone
             contrast, _ = _regression(own, mean, seen, pixels)
-        out[:, light] = mean * contrast
+        np.multiply(mean, contrast, out=out[:, light])
     return out
 
 
@@ -440,7 +478,7 @@ def _regression(own: FloatImage, mean: FloatImage, used: FloatImage, pixels: Pix
         The coefficient (P,), at least 0, and the median of the correlation coefficient.
     """
     products = np.stack([(mean * own).sum(axis=0), (mean**2).sum(axis=0), (own**2).sum(axis=0)])
-    along, square, power = window_means(pixels, products, np.broadcast_to(used, products.shape))
+    along, square, power = window_means(pixels, products, used[None])
     known = (square > 0) & (power > 0)
     correlation = along[known] / np.sqrt(square[known] * power[known])
     contrast = np.divide(along, square, out=np.zeros_like(along), where=known)

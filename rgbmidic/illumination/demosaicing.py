@@ -204,25 +204,39 @@ def prediction_filters(
 
 
 def _solved(fraction: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int) -> FloatArray:
-    """Return filters (T, 4, 3, size²) for fractions (T, 3) of the common texture."""
+    """Return filters (T, 4, 3, size²) for fractions (T, 3) of the common texture.
+
+    Covariances and Bayer pattern are alike left and right of the centre, and above and below it, and so are the
+    filters: what is solved for is the sum of the samples that lie alike, of which there are 9 among 25.
+    """
     common, fine = _covariances(texture, size)
     # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
     specific = texture.specific * common + (1 - texture.specific) * fine
-    centre, count = size * size // 2, len(fraction)
-    taps = np.empty((count, 4, 3, size * size))
+    alike, first = _alike(size)
+    shared, centre = alike.T @ common @ alike, alike.T @ common[:, size * size // 2]
+    noisy, mine_centre = np.maximum(noise, 1e-8), alike.T @ specific[:, size * size // 2]
+    taps = np.empty((len(fraction), 4, 3, size * size))
     cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
     for phase, (p, q) in enumerate(np.ndindex(2, 2)):  # of the centre of the square
         channel = cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel()
+        own_part = alike.T @ ((channel[:, None] == channel) * specific) @ alike
+        channel = channel[first]
         root, own = np.sqrt(fraction[:, channel]), np.sqrt(1 - fraction[:, channel])
-        same = channel[:, None] == channel[None]
-        samples = root[:, :, None] * root[:, None] * common + own[:, :, None] * own[:, None] * (same * specific)
-        samples[:, np.arange(size * size), np.arange(size * size)] += np.maximum(noise, 1e-8)[channel]
-        mine = channel[:, None] == np.arange(3)
-        wanted = root[:, :, None] * np.sqrt(fraction)[:, None] * common[:, centre, None]
-        wanted += (1 - fraction)[:, None] * (mine * specific[:, centre, None])
-        solution = np.linalg.solve(samples, wanted)
-        taps[:, phase] = solution.transpose(0, 2, 1)
+        samples = root[:, :, None] * root[:, None] * shared + own[:, :, None] * own[:, None] * own_part
+        samples += np.diag(noisy[channel])
+        wanted = root[:, :, None] * np.sqrt(fraction)[:, None] * centre[:, None]
+        wanted += (1 - fraction)[:, None] * ((channel[:, None] == np.arange(3)) * mine_centre[:, None])
+        taps[:, phase] = (alike @ np.linalg.solve(samples, wanted)).transpose(0, 2, 1)
     return taps
+
+
+@lru_cache
+def _alike(size: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Return unit vectors (size², m) that are equal where samples lie alike about the centre, and one of these each."""
+    distance = np.abs(np.arange(size) - size // 2)
+    _, first, group = np.unique(distance[:, None] * size + distance, return_index=True, return_inverse=True)
+    alike = (group.reshape(-1, 1) == np.arange(first.size)).astype(np.float64)
+    return alike / np.sqrt(alike.sum(axis=0)), first
 
 
 @lru_cache(maxsize=64)

@@ -7,18 +7,19 @@ reflection lifts the mean; dividing by the local mean leaves the texture, which 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from rgbmidic._kernels.texture import divide_by_mean
-from rgbmidic.errors import InputError
+from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.linear import LinearChannels
+from rgbmidic.illumination.registration import Registration
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["DARK", "REFLECTING", "IlluminationImages", "local_mean", "normalise"]
+__all__ = ["DARK", "REFLECTING", "IlluminationImages", "fill_holes", "local_mean", "normalise"]
 
 REFLECTING = 0.2
 """Reflection index from which a light counts as reflecting."""
@@ -46,6 +47,8 @@ class IlluminationImages:
         the separation does not use it.
     origin : tuple of int
         Column and row of the frame at which the images begin.
+    registration : Registration or None
+        Where in its own image a light shows what the first one shows at a pixel of the frame; None: at the same pixel.
     """
 
     values: FloatImage
@@ -55,6 +58,7 @@ class IlluminationImages:
     reflection: FloatArray | None = None
     texture: TextureModel | None = None
     origin: tuple[int, int] = (0, 0)
+    registration: Registration | None = None
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
@@ -64,6 +68,11 @@ class IlluminationImages:
         valid = np.asarray(self.valid, dtype=bool) & np.isfinite(values)
         if len(self.names) != len(values):
             raise InputError(f"{len(values)} illumination images cannot carry the {len(self.names)} names {self.names}")
+        if self.registration is not None and self.registration.lights != self.names:
+            raise CalibrationError(
+                f"the registration is for the lights {', '.join(self.registration.lights)}, the images are of "
+                f"{', '.join(self.names)}"
+            )
         object.__setattr__(self, "values", values if valid.all() else np.where(valid, values, np.float32(np.nan)))
         object.__setattr__(self, "valid", valid)
 
@@ -101,6 +110,11 @@ class IlluminationImages:
             or (("light",) if len(frames) == 1 else tuple(f"light {i + 1}" for i in range(len(frames)))),
             full_scale=frames[0].full_scale,
         )
+
+    def placed(self, origin: tuple[int, int]) -> IlluminationImages:
+        """Return the images as those of a part of the frame that begins at the pixel `origin` (column, row)."""
+        known = self.registration
+        return replace(self, origin=origin, registration=known and known.cropped((-origin[0], -origin[1])))
 
     def reflection_index(self, step: int = 1, within: tuple[slice, slice] | None = None) -> FloatImage | None:
         """Return the fraction of a light that is not diffuse, from a single frame.
@@ -181,6 +195,25 @@ def local_mean(image: FloatImage, sigma: float) -> FloatImage:
     weight = _blur(finite.astype(np.float32), sigma)
     total = _blur(np.where(finite, image, np.float32(0)), sigma)
     return np.where(weight > 1e-3, total / np.maximum(weight, np.float32(1e-3)), np.float32(np.nan))
+
+
+def fill_holes(image: FloatImage, sigma: float = 3.0) -> FloatImage:
+    """Replace the NaN of an image (H, W) by the Gaussian mean of the finite pixels around, or farther away of all.
+
+    The values carry no weight in what is measured; they only keep the recursion of a spline finite and quiet.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W), float32
+        Grey levels.
+    sigma
+        Standard deviation of the mean's window, px.
+    """
+    finite = np.isfinite(image)
+    if finite.all():
+        return image
+    mean, everywhere = local_mean(image, sigma), image.sum(dtype=np.float64, where=finite) / max(finite.sum(), 1)
+    return np.where(finite, image, np.nan_to_num(mean, nan=everywhere))
 
 
 def _blur(image: FloatImage, sigma: float) -> FloatImage:

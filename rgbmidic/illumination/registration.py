@@ -107,21 +107,24 @@ class Registration:
         ndarray, shape (k, M, 2)
             In px; zero for the first light.
         """
-        basis = self._basis(points)
-        return np.asarray(np.einsum("mdp,kp->kmd", basis, self.parameters))
+        x, y = (_checked(points) - self.centre).T
+        along, down, turn, scale, radial = self.parameters.T[..., None]
+        growth = scale + radial * ((x * x + y * y) / self.radius**2)
+        return np.stack([along - turn * y + growth * x, down + turn * x + growth * y], axis=-1)
 
     def displacement_std(self, points: npt.ArrayLike) -> FloatArray | None:
         """Return the standard uncertainty (k, M, 2) in px of `displacement`; None where the covariance is not known."""
         if self.covariance is None:
             return None
-        basis = self._basis(points)
+        basis = registration_basis(_checked(points), self.centre, self.radius)
         return np.asarray(np.sqrt(np.einsum("mdp,kpq,mdq->kmd", basis, self.covariance, basis)))
 
-    def _basis(self, points: npt.ArrayLike) -> FloatArray:
-        place = np.asarray(points, dtype=np.float64)
-        if place.ndim != 2 or place.shape[1] != 2:
-            raise InputError(f"points have shape (M, 2), not {place.shape}")
-        return registration_basis(place, self.centre, self.radius)
+
+def _checked(points: npt.ArrayLike) -> FloatArray:
+    place = np.asarray(points, dtype=np.float64)
+    if place.ndim != 2 or place.shape[1] != 2:
+        raise InputError(f"points have shape (M, 2), not {place.shape}")
+    return place
 
 
 def frame_geometry(shape: tuple[int, int]) -> tuple[tuple[float, float], float]:

@@ -72,7 +72,7 @@ def separate(
     if isinstance(calibration, Calibration):
         linear = linearise(frame, calibration.noise) if isinstance(frame, Mosaic | ChannelFrame) else frame
         images = separate(linear, crosstalk, method, texture=texture)
-        return images if calibration.registration is None else align(images, calibration.registration)
+        return align(replace(images, registration=calibration.registration))
     linear = linearise(frame) if isinstance(frame, Mosaic | ChannelFrame) else frame
     if isinstance(linear, LinearChannels):
         return unmix(linear, crosstalk)

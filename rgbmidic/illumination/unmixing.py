@@ -1,8 +1,8 @@
 """Camera channels to one image per light, on one pixel grid: crosstalk and lateral registration undone.
 
 Where the camera sees ``channels = A lights``, the lights are ``A^-1 channels`` at every pixel (`unmix`). Light j sees
-at x + rho_j(x) what the first light sees at x (`Registration`), in the reference and in the deformed state alike;
-sampled there (`align`), its image shows every point where the first light's image shows it, before and after.
+at x + rho_j(x) what the first light sees at x (`Registration`), in the reference and in the deformed state alike; the
+solve reads it there. Sampled there (`align`), its image shows every point where the first light's image shows it.
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ import numpy as np
 
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic._kernels.lights import unmix as unmix_kernel
-from rgbmidic.errors import CalibrationError, InputError
+from rgbmidic.errors import InputError
 from rgbmidic.illumination.calibration import Crosstalk
-from rgbmidic.illumination.images import IlluminationImages, local_mean
+from rgbmidic.illumination.images import IlluminationImages, fill_holes
 from rgbmidic.illumination.linear import LinearChannels
-from rgbmidic.illumination.registration import Registration
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["NEGLIGIBLE", "align", "needed", "unmix"]
 
@@ -36,6 +35,8 @@ Chosen: a fifth of the noise floor of DIC in good images, .01 px.
 
 GRID = 32
 """Largest distance (px) of the points between which a matrix that varies over the field is interpolated."""
+_ROWS = 64
+"""Rows that are warped at a time: their positions take less memory than an image."""
 
 
 def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float = NEGLIGIBLE) -> IlluminationImages:
@@ -109,7 +110,7 @@ def needed(matrix: FloatArray, negligible: float = NEGLIGIBLE) -> BoolArray:
     return np.asarray(np.abs(matrix) > negligible * np.abs(matrix).max(axis=1, keepdims=True))
 
 
-def align(images: IlluminationImages, registration: Registration) -> IlluminationImages:
+def align(images: IlluminationImages) -> IlluminationImages:
     """Warp every light to the first one's pixels by cubic B-spline interpolation.
 
     Pixels whose neighbourhood of interpolation is invalid or outside the image become invalid.
@@ -117,46 +118,30 @@ def align(images: IlluminationImages, registration: Registration) -> Illuminatio
     Parameters
     ----------
     images
-        (k, H, W), one per light.
-    registration
-        Lateral registration of the same lights.
+        (k, H, W), each where its `registration` says.
 
     Returns
     -------
     IlluminationImages
-        On the pixel grid of the first light.
-
-    Raises
-    ------
-    CalibrationError
-        The registration is for other lights.
+        On the pixel grid of the first light, without a registration.
     """
-    if registration.lights != images.names:
-        raise CalibrationError(
-            f"the registration is for the lights {', '.join(registration.lights)}, the images are of "
-            f"{', '.join(images.names)}"
-        )
+    if (registration := images.registration) is None:
+        return images
     height, width = images.shape
-    y, x = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
-    shifts = registration.displacement(np.stack([x, y], axis=1))
-    values = images.values.copy()
-    for light, shift in enumerate(shifts):
-        if np.abs(shift).max() > _ALIGNED:
-            values[light] = _sample(images.values[light], x + shift[:, 0], y + shift[:, 1])
-    return replace(images, values=values, valid=np.isfinite(values))
-
-
-def _sample(image: FloatImage, x: FloatArray, y: FloatArray) -> FloatImage:
-    """Sample an image (H, W) at points (x, y), flat; NaN outside and where the interpolation would touch a NaN."""
-    height, width = image.shape
-    valid = np.isfinite(image)
-    filled = np.where(valid, image, np.nan_to_num(local_mean(image, 3.0), nan=float(np.nanmean(image))))
-    coefficients = np.empty((height + 2 * PAD, width + 2 * PAD), dtype=np.float32)
-    bspline_coefficients(np.ascontiguousarray(filled, dtype=np.float32), coefficients)
-    value, slope_x, slope_y = np.empty((3, x.size), dtype=np.float32)
-    sample_with_gradient(coefficients, x, y, value, slope_x, slope_y)
-    touched = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1).astype(bool)
-    column = np.clip(np.round(x), 0, width - 1).astype(np.intp)
-    row = np.clip(np.round(y), 0, height - 1).astype(np.intp)
-    usable = touched[row, column] & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    return np.where(usable, value, np.float32(np.nan)).reshape(image.shape)
+    values, spline = images.values.copy(), np.empty((height + 2 * PAD, width + 2 * PAD), dtype=np.float32)
+    for light, image in enumerate(images.values):
+        bspline_coefficients(fill_holes(image), spline)
+        near_hole = cv2.dilate(np.isnan(image).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        for top in range(0, height, _ROWS):
+            part = values[light, top : top + _ROWS]
+            y, x = np.mgrid[top : top + len(part), :width].reshape(2, -1).astype(np.float64)
+            shift = registration.displacement(np.stack([x, y], axis=1) + images.origin)[light].T
+            if np.abs(shift).max() > _ALIGNED:
+                x, y = x + shift[0], y + shift[1]
+                sampled = np.empty((3, x.size), dtype=np.float32)
+                sample_with_gradient(spline, x, y, *sampled)
+                inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+                row, column = (np.round(np.where(inside, at, 0)).astype(np.intp) for at in (y, x))
+                usable = inside & ~near_hole[row, column]
+                part[:] = np.where(usable, sampled[0], np.float32(np.nan)).reshape(part.shape)
+    return replace(images, values=values, valid=np.isfinite(values), registration=None)

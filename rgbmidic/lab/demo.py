@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from rgbmidic._kernels import are_compiled
-from rgbmidic.correlation import correlate
 from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.unmixing import align
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import Plan, Separation, measure
+from rgbmidic.pipeline import Plan, Separation, correlate, measure
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage
@@ -150,7 +150,7 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
     assert settings.calibration_file is not None
     calibration = Calibration.read(settings.calibration_file)
     separation, frames = Separation(calibration=calibration), open_series(settings.frames, settings.base, calibration)
-    images = [separation(frames.read(index)).values for index in range(len(frames))]
+    images = [align(separation(frames.read(index))).values for index in range(len(frames))]
     options: dict[str, Any] = {
         "region": settings.region.rectangle,
         "element_size": settings.element_size,

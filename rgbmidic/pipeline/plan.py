@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, combinations
 from threading import Lock
@@ -18,7 +18,6 @@ from threading import Lock
 import numpy as np
 
 from rgbmidic.correlation import Reference
-from rgbmidic.correlation.correlate import as_weights
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
@@ -30,10 +29,12 @@ from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.pair import as_weights
 from rgbmidic.pipeline.separation import (
     LightSeparation,
     RawState,
     Separation,
+    WindowedSeparation,
     correlated,
     light_images,
     reference_images,
@@ -174,65 +175,48 @@ class Plan:
             the settings.
         """
         _check_given(settings, source, separation, weights, mesh)
-        calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
-        series: Series
-        if source is None:
-            series = open_series(settings.frames, settings.base, calibration)
-        else:
-            series = open_sequence(source, settings.frames, calibration)
-        if any(one is not None for one in (source, separation, weights, mesh, region)):
-            region = region or read_region(settings.region, series.shape)
-            window = Window.whole(series.shape)
+        series, calibration = _series_and_calibration(settings, source)
+        separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
+        whole = any(one is not None for one in (source, weights, mesh, region))
+        if whole or not isinstance(separate, WindowedSeparation):
+            region, window = region or read_region(settings.region, series.shape), Window.whole(series.shape)
         else:
             region, window = _region_and_window(settings, series.shape)
-        first, others = series.read(settings.frames.reference[0], window), settings.frames.reference[1:]
-        if separation is not None and isinstance(first, IlluminationImages):
+        rest = _Rest.read(settings, series, separate, window)
+        if separation is not None and isinstance(rest.states[0], IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
-        if calibration is not None:
-            calibration = calibration.cropped(settings.frames.crop_origin, window.frame)
-        separation = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        states = chain([first], (series.read(index, window) for index in others))
-        images, learnt = reference_images(separation, states, window)
-        names = ", ".join(map(series.name, settings.frames.reference))
-        if calibration is not None and not isinstance(first, IlluminationImages):
-            again = series.read(others[0], window) if others else None
-            here = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
-            for found in check_state(first, here, region.mask, names, accept=settings.accept, repeat=again):
-                if not found.certain:
-                    logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration_file, found.text)
+        rest.check_calibrated(calibration, region, window, settings)
+        size = settings.element_size if mesh is None else mesh.size
         if mesh is None:
-            cracks = [np.subtract(path, window.origin) for path in settings.cracks]
-            mesh = Tri3Mesh.from_region(region, settings.element_size, cracks)
-            size = settings.element_size
-        else:
-            size = mesh.size
+            mesh = Tri3Mesh.from_region(region, size, [np.subtract(path, window.origin) for path in settings.cracks])
         weights = weights or prepare_weights(
             settings,
-            images,
+            rest.images,
             region,
             shape=window.frame,
             frames=len(series),
-            images_of=lambda index: light_images(learnt, series.read(index, window), window),
+            images_of=lambda index: light_images(rest.separation, series.read(index, window), window),
         )
         reference = Reference.prepare(
-            correlated(images, settings.illumination),
+            correlated(rest.images, settings.illumination),
             region,
-            as_weights(weights.reference(images), images.values.shape, "weights of the reference"),
+            as_weights(weights.reference(rest.images), rest.images.values.shape, "weights of the reference"),
             mesh=mesh,
             prefilter=settings.solver.prefilter,
             origin=window.origin,
+            registration=rest.images.registration,
         )
-        speckle = _speckle(images, region)
+        speckle = _speckle(rest.images, region)
         if small := too_small(size, speckle, HARDLY_ENOUGH):
             logger.warning("%s", small)
-        _check_seen(reference, first, region, names)
+        rest.check_seen(reference, region)
         return cls(
             settings=settings,
             series=series,
-            separation=learnt,
+            separation=rest.separation,
             region=region,
             weights=weights,
-            images=images,
+            images=rest.images,
             reference=reference,
             speckle=speckle,
             window=window,
@@ -267,6 +251,50 @@ class Plan:
         return _window(np.concatenate(places), search_reach(nodes), self.settings, self.window.frame)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rest:
+    """The reference frames: the first two as they were recorded, the mean images of all, the separation that learnt."""
+
+    names: str
+    states: Sequence[RawState]
+    images: IlluminationImages
+    separation: LightSeparation
+
+    @classmethod
+    def read(cls, settings: TestSettings, series: Series, separation: LightSeparation, window: Window) -> _Rest:
+        """Read and separate them one by one."""
+        indices = settings.frames.reference
+        states = [series.read(index, window) for index in indices[:2]]
+        others = (series.read(index, window) for index in indices[2:])
+        images, learnt = reference_images(separation, chain(states, others), window)
+        return cls(names=", ".join(map(series.name, indices)), states=states, images=images, separation=learnt)
+
+    def check_calibrated(
+        self, calibration: Calibration | None, region: Region, window: Window, settings: TestSettings
+    ) -> None:
+        """Refuse frames that contradict their `calibration`, of which they are a `window`."""
+        raw = [state for state in self.states if not isinstance(state, IlluminationImages)]
+        if calibration is None or not raw:
+            return
+        if not window.is_whole:
+            calibration = calibration.cropped(window.origin, window.shape)
+        repeat = raw[1] if len(raw) > 1 else None
+        for found in check_state(raw[0], calibration, region.mask, self.names, accept=settings.accept, repeat=repeat):
+            if not found.certain:
+                file = settings.calibration_file
+                logger.warning("%s may not be what %s calibrates: %s", self.names, file, found.text)
+
+    def check_seen(self, reference: Reference, region: Region) -> None:
+        """Refuse a reference that no light sees or that shows no texture."""
+        if not reference.pixel_weights.any():
+            fault = exposure_fault(self.states[0], region.mask)
+            raise FrameError(
+                f"no light sees the region in the reference ({self.names}): "
+                f"{fault or 'it is saturated, dark or excluded by the weights'}"
+            )
+        check_texture(self.states[0], region.mask, self.names)
+
+
 def _check_given(
     settings: TestSettings,
     source: FrameSequence | None,
@@ -297,6 +325,17 @@ def _check_given(
         )
 
 
+def _series_and_calibration(settings: TestSettings, source: FrameSequence | None) -> tuple[Series, Calibration | None]:
+    """The frames, of the settings or a `source`, and the calibration cropped to them."""
+    calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
+    series: Series
+    if source is None:
+        series = open_series(settings.frames, settings.base, calibration)
+    else:
+        series = open_sequence(source, settings.frames, calibration)
+    return series, calibration and calibration.cropped(settings.frames.crop_origin, series.shape)
+
+
 def _region_and_window(settings: TestSettings, frame: tuple[int, int]) -> tuple[Region, Window]:
     """The region, counted from where the window begins, and the part of the reference frames that is read."""
     region = read_region(settings.region, frame)
@@ -324,14 +363,6 @@ def _speckle(images: IlluminationImages, region: Region) -> float | None:
     known = [np.where(np.isfinite(one), one, np.nanmean(one)) for one in pictures if np.isfinite(one).any()]
     sizes = [size for one in known if (size := speckle_diameter(one.astype(np.float64))) is not None]
     return float(np.median(sizes)) if sizes else None
-
-
-def _check_seen(reference: Reference, state: RawState, region: Region, names: str) -> None:
-    """Refuse a reference that no light sees or that shows no texture; `state` is its first."""
-    if not reference.pixel_weights.any():
-        fault = exposure_fault(state, region.mask) or "it is saturated, dark or excluded by the weights"
-        raise FrameError(f"no light sees the region in the reference ({names}): {fault}")
-    check_texture(state, region.mask, names)
 
 
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:

@@ -21,11 +21,11 @@ import numpy.typing as npt
 
 from rgbmidic._kernels import are_compiled
 from rgbmidic.correlation import Solution, Start, Status
-from rgbmidic.correlation.correlate import solver_settings
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame
+from rgbmidic.pipeline.pair import solver_settings
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank
 from rgbmidic.pipeline.separation import LightSeparation

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,11 +15,18 @@ from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linear import LinearChannels, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmixing import align
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import FloatImage
 
-__all__ = ["LightSeparation", "RawState", "Separation", "correlated", "light_images", "reference_images"]
+__all__ = [
+    "LightSeparation",
+    "RawState",
+    "Separation",
+    "WindowedSeparation",
+    "correlated",
+    "light_images",
+    "reference_images",
+]
 
 RawState = tuple[Mosaic | ChannelFrame, ...] | IlluminationImages
 """What a series gives of one state: a raw frame, or one per light fired in succession; or the lights' images already,
@@ -51,9 +58,20 @@ class LightSeparation(Protocol):
         ...
 
 
+@runtime_checkable
+class WindowedSeparation(LightSeparation, Protocol):
+    """A separation of parts of frames, too; with another one frames are read whole."""
+
+    def within(self, window: Window) -> LightSeparation:
+        """The separation of a part of the frames."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
-    """From what the camera recorded of one state to one image per light: linearise, demosaic, unmix, align.
+    """From what the camera recorded of one state to one image per light: linearise, demosaic, unmix.
+
+    The images stay where they are: the solve reads each where its registration says that it lies.
 
     Attributes
     ----------
@@ -69,24 +87,14 @@ class Separation:
     demosaic: str = "auto"
     texture: TextureModel | None = None
 
-    def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...], window: Window | None = None) -> IlluminationImages:
+    def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...]) -> IlluminationImages:
         """Illumination images of one state from its frame, or its frames if lights fired in succession.
-
-        Parameters
-        ----------
-        frames
-            What the camera recorded, or the same `window` of all of it.
-        window
-            None: the whole frames.
 
         Raises
         ------
         ConfigurationError
             Colour frames without a calibrated crosstalk, or settings that contradict the calibration.
         """
-        if window is not None and not window.is_whole:
-            known = self.calibration and self.calibration.cropped(window.origin, window.shape)
-            return replace(replace(self, calibration=known)(frames), origin=window.origin)
         known = self.calibration or Calibration()
         linear = [linearise(frame, known.noise) for frame in frames]
         if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
@@ -96,7 +104,11 @@ class Separation:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
         else:
             images = separate(linear[0], self._crosstalk(), self.demosaic, texture=self.texture)
-        return images if known.registration is None else align(images, known.registration)
+        return replace(images, registration=known.registration)
+
+    def within(self, window: Window) -> Separation:
+        """The separation of a part of the frames."""
+        return replace(self, calibration=self.calibration and self.calibration.cropped(window.origin, window.shape))
 
     def learnt(self, images: IlluminationImages) -> Separation:
         """The separation that takes the speckle's texture from the images of one state for all others."""
@@ -121,8 +133,9 @@ def light_images(separation: LightSeparation, state: RawState, window: Window) -
     """
     if isinstance(state, IlluminationImages):
         return state
-    if isinstance(separation, Separation):  # which knows windows
-        return separation(state, window)
+    if not window.is_whole:
+        assert isinstance(separation, WindowedSeparation), "frames of another separation are read whole"
+        separation = separation.within(window)
     images = separation(state)
     if not isinstance(images, IlluminationImages) or images.shape != state[0].values.shape[-2:]:
         told = f"of shape {images.values.shape}" if isinstance(images, IlluminationImages) else ""
@@ -130,7 +143,7 @@ def light_images(separation: LightSeparation, state: RawState, window: Window) -
             f"the separation must give IlluminationImages of the size of the frame {state[0].values.shape[-2:]}; it "
             f"gives {type(images).__name__} {told}".rstrip()
         )
-    return images
+    return images if window.is_whole else images.placed(window.origin)
 
 
 def reference_images(

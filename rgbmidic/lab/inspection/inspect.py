@@ -155,7 +155,7 @@ def inspect_frame(
     samples = SampleSummary.of(channels, region.mask, known.noise, linear[0].full_scale)
     report(1, 3, "lights, and the errors of their separation")
     separated, errors = _separated(linear, known, demosaic, samples.noise, np.random.default_rng(seed))
-    images = separated if known.registration is None else align(separated, known.registration)
+    images = align(replace(separated, registration=known.registration))
     report(2, 3, "uncertainty to expect")
     shown = LocalContrast.of(images, [channel.speckle_px for channel in samples.channels])
     index = separated.reflection_index()

@@ -16,7 +16,6 @@ from small_tests import REGION, colour_test, grey_frame
 import rgbmidic
 from rgbmidic import cli
 from rgbmidic.command import execute
-from rgbmidic.correlation import correlate
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
@@ -31,6 +30,7 @@ from rgbmidic.lab.inspection.prediction import gaussian_field
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline import correlate
 from rgbmidic.scene.forecast import expected_std, node_constant
 
 Run = Callable[..., tuple[int, str, str]]

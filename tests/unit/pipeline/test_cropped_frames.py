@@ -59,8 +59,9 @@ def settings(tmp_path):
 
 def apart(settings):
     """Largest mean distance in px of the second and third light from the first, and largest rms."""
-    images = Plan.from_settings(settings).images.values
-    fields = [correlate(images[0], images[j], region=(15, 15, 155, 135), initial=(0, 0)) for j in (1, 2)]
+    reference = Plan.from_settings(settings).reference
+    images = [reference.pixels.scatter(values, np.nan) for values in reference.values]
+    fields = [correlate(images[0], images[j], region=(20, 20, 150, 130), initial=(0, 0)) for j in (1, 2)]
     return max(float(np.sqrt(np.nanmean(field.displacement**2))) for field in fields)
 
 
