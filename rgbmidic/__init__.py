@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rgbmidic.correlation import NodeStatus, Solution, Status
     from rgbmidic.errors import RgbmidicError
+    from rgbmidic.fields import CameraCalibration
     from rgbmidic.frames import read_frame
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.lab.inspection import Inspection, inspect_frame
@@ -24,6 +25,7 @@ from rgbmidic._version import __version__
 
 __all__ = [
     "Calibration",
+    "CameraCalibration",
     "Inspection",
     "NodeStatus",
     "Region",
@@ -44,6 +46,7 @@ __all__ = [
 
 _HOMES = {
     "Calibration": "rgbmidic.illumination.calibration",
+    "CameraCalibration": "rgbmidic.fields",
     "Inspection": "rgbmidic.lab.inspection",
     "NodeStatus": "rgbmidic.correlation",
     "Region": "rgbmidic.mesh",

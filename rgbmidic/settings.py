@@ -329,6 +329,8 @@ class ScaleSettings(_Checked):
         Millimetres on the specimen for a pixel; None: lengths are reported in px.
     mm_per_pixel_std
         Its standard uncertainty.
+    camera
+        In place of `mm_per_pixel`: file with lens and plane, which ``rgbmidic-calibrate camera`` writes.
     frame_rate
         Frames per second, for files that do not state when their frames were taken.
     """
@@ -337,9 +339,14 @@ class ScaleSettings(_Checked):
 
     mm_per_pixel: float | None = bounded(None, above=0)
     mm_per_pixel_std: float = bounded(0.0, at_least=0)
+    camera: Path | None = None
     frame_rate: float | None = bounded(None, above=0)
 
     def _check(self) -> None:
+        _require(
+            self.camera is None or self.mm_per_pixel is None,
+            f"scale.camera ({self.camera}) holds the scale, scale.mm_per_pixel states another: leave one of them out",
+        )
         _require(
             not self.mm_per_pixel_std or self.mm_per_pixel is not None,
             "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing",

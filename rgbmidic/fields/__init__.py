@@ -12,6 +12,7 @@ from rgbmidic.fields.nodal import (
     frame_covariance,
     reference_fraction,
 )
+from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import PROBES, Gauge, Mean, StrainGauge, make_probe
 from rgbmidic.fields.strain import StrainGauges, shortest_gauge, strain_of
 
@@ -20,6 +21,7 @@ __all__ = [
     "MEASURES",
     "PROBES",
     "SIGMA",
+    "CameraCalibration",
     "Gauge",
     "History",
     "Mean",
@@ -28,6 +30,7 @@ __all__ = [
     "Places",
     "Probe",
     "Rates",
+    "Rectification",
     "RigidMotion",
     "Strain",
     "StrainGauge",

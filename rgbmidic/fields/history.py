@@ -24,7 +24,6 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.rates import LOWEST, mean_rates
 from rgbmidic.errors import InputError
-from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["SIGMA", "History", "Nodal", "Probe", "Rates", "Units", "column", "high_pass", "rates"]
@@ -59,11 +58,6 @@ class Units:
     mm_per_pixel: float | None = None
     mm_per_pixel_std: float = 0.0
     timed: bool = False
-
-    @classmethod
-    def of(cls, scale: ScaleSettings, *, timed: bool) -> Self:
-        """Take the scale from ``[scale]``."""
-        return cls(mm_per_pixel=scale.mm_per_pixel, mm_per_pixel_std=scale.mm_per_pixel_std, timed=timed)
 
     @classmethod
     def from_points(

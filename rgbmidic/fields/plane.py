@@ -10,7 +10,7 @@ pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -18,22 +18,26 @@ from typing import Any, Self
 import numpy as np
 
 from rgbmidic.errors import CalibrationError, InputError
+from rgbmidic.fields.history import Units
 from rgbmidic.illumination.calibration import read_document, write_document
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import FloatArray
 
-__all__ = ["LENS_PARAMETERS", "CameraCalibration", "distorted", "undistorted"]
+__all__ = ["LENS_PARAMETERS", "CameraCalibration", "Rectification", "distorted", "undistorted"]
 
 LENS_PARAMETERS = ("f", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Focal length and principal point in px, then the distortion in OpenCV's order."""
 _PLANE_PARAMETERS = ("h11", "h12", "h13", "h21", "h22", "h23", "h31", "h32")
 _SCHEMA, _VERSION = "rgbmidic-camera", 1
-_INVERSE = 25
-"""Fixed-point iterations of the inverse of the distortion: 1e-9 px where each gains a factor of 3 (derived)."""
+_INVERSE, _EXACT = 25, 1e-10
+"""Most fixed-point iterations of the inverse of the distortion, 1e-9 px where each gains a factor of 3 (derived); they
+end where none moves a point by more than `_EXACT` px, which rounding leaves at 1000 px."""
 _SPAN = 10.0
 """Half the distance (px) over which the uncertainty of the local scale is taken: any that is short (derived)."""
 _STEP = 0.5
-"""Half step (px) of the central differences that make the Jacobian: its error is the third derivative of the map over
-24, 1e-8 of the scale at a distortion of 2 % over 500 px (derived)."""
+"""Half step (px) of the central differences of the distortion: their error is the third derivative of the map over 24,
+1e-8 of the scale at a distortion of 2 % over 500 px (derived)."""
 
 
 def distorted(lens: FloatArray, points: FloatArray) -> FloatArray:
@@ -64,7 +68,10 @@ def undistorted(lens: FloatArray, points: FloatArray) -> FloatArray:
     """
     straight = points
     for _ in range(_INVERSE):
-        straight = straight + points - distorted(lens, straight)
+        step = points - distorted(lens, straight)
+        straight = straight + step
+        if not (np.abs(step) > _EXACT).any():
+            break
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(np.abs(distorted(lens, straight) - points) < 1e-6, straight, np.nan))
 
@@ -154,9 +161,20 @@ class CameraCalibration:
 
     def jacobian(self, points: FloatArray) -> FloatArray:
         """Derivative (N, 2, 2) of `to_mm` by the pixel at points (N, 2): ``[n, mm axis, px axis]``, mm per px."""
-        steps = [np.array([_STEP, 0]), np.array([0, _STEP])]
-        parts = [(self.to_mm(points + step) - self.to_mm(points - step)) / (2 * _STEP) for step in steps]
-        return np.stack(parts, axis=2)
+        values = self.parameters
+        lens, homography = values[:8], np.r_[values[8:], 1.0].reshape(3, 3)
+        straight, bent = points, np.broadcast_to(np.eye(2), (len(points), 2, 2))
+        if self.lens is not None:
+            straight = undistorted(lens, points)
+            steps = [np.array([_STEP, 0]), np.array([0, _STEP])]
+            bent = np.stack(
+                [(distorted(lens, straight + step) - distorted(lens, straight - step)) / (2 * _STEP) for step in steps],
+                axis=2,
+            )
+        x, y, w = homography @ np.c_[straight - self.centre, np.ones(len(points))].T
+        places = np.stack([x / w, y / w], axis=1)
+        flat = (homography[:2, :2] - places[:, :, None] * homography[2, :2]) / w[:, None, None]
+        return np.asarray(flat @ np.linalg.inv(bent))
 
     def sensitivity(self, points: FloatArray) -> FloatArray:
         """Derivative (N, 2, 16) of `to_mm` by the `parameters`, scaled by the root of the covariance's diagonal."""
@@ -215,6 +233,23 @@ class CameraCalibration:
         slope -= (slopes[1] - slopes[0])[1] * across[0] + along[1] * (slopes[3] - slopes[2])[0]
         return scale, float(scale * np.sqrt(slope @ self.correlation @ slope) / (2 * area))
 
+    def check(self, shape: tuple[int, int]) -> None:
+        """Refuse frames of a `shape` (rows, columns) that it was not made with.
+
+        Raises
+        ------
+        CalibrationError
+            The shape is another one.
+        InputError
+            The calibration holds no plane.
+        """
+        if self.shape != tuple(shape):
+            raise CalibrationError(
+                f"{self.name} (scale.camera) was made with frames of {self.shape[1]} x {self.shape[0]} px, those of "
+                f"the test have {shape[1]} x {shape[0]} px: calibrate with frames of the size of the test's"
+            )
+        _ = self.parameters
+
     def summary(self) -> str:
         """Return scale in the middle of the frame and tilt, with their standard uncertainties, as text."""
         (scale, scale_std), (tilt, tilt_std) = self.scale(self.centre), self.tilt_deg
@@ -272,3 +307,71 @@ class CameraCalibration:
     def write(self, path: Path | str) -> None:
         """Write the file; errors as `rgbmidic.illumination.calibration.write_document`."""
         write_document(path, self.to_document())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rectification:
+    """Change of coordinates from px of the image to rectified px, in which a mm on the plane has one length everywhere.
+
+    A point x lies at ``camera.to_mm(x) / units.mm_per_pixel``, and a displacement u of it becomes the difference of
+    both ends. Strain, probes and rates are taken in rectified px as they are in px where no camera is stated: then
+    nothing is changed. The standard uncertainty of a displacement follows by the Jacobian. The camera's has a part that
+    all displacements have in common, `units.mm_per_pixel_std`, and one by which the scale differs from place to place;
+    the latter is left out: it is smaller (tests/truth/test_camera.py), and `CameraCalibration.sensitivity` gives it.
+
+    Attributes
+    ----------
+    camera
+        Lens and plane; None: not stated.
+    image
+        The mesh in px of the image.
+    mesh
+        The mesh in rectified px.
+    units
+        With the millimetres for a rectified px, or for a px where a scale is stated in place of a camera. Chosen such
+        that the median element of both meshes has one size.
+    """
+
+    camera: CameraCalibration | None
+    image: Tri3Mesh
+    mesh: Tri3Mesh
+    units: Units
+
+    @classmethod
+    def of(cls, mesh: Tri3Mesh, scale: ScaleSettings, camera: CameraCalibration | None = None) -> Self:
+        """Rectify a mesh in px of the image by a `camera`, or leave it with the `scale`.
+
+        Raises
+        ------
+        InputError
+            The camera holds no plane, or the mesh reaches where its distortion has no inverse.
+        """
+        if camera is None:
+            units = Units(mm_per_pixel=scale.mm_per_pixel, mm_per_pixel_std=scale.mm_per_pixel_std)
+            return cls(camera=None, image=mesh, mesh=mesh, units=units)
+        places = camera.to_mm(mesh.nodes)
+        if not np.isfinite(places).all():
+            raise InputError(f"the lens of {camera.name} does not image all of the mesh: its distortion has no inverse")
+        size = Tri3Mesh(nodes=places, elements=mesh.elements).size / mesh.size
+        local, std = camera.scale(mesh.nodes.mean(axis=0))
+        flat = Tri3Mesh(nodes=places / size, elements=mesh.elements)
+        units = Units(mm_per_pixel=size, mm_per_pixel_std=size * std / local)
+        return cls(camera=camera, image=mesh, mesh=flat, units=units)
+
+    def place(self, place: Sequence[float]) -> tuple[float, ...]:
+        """Rectify the numbers that place a probe: points (x, y) one after the other, then a length if it is odd."""
+        if self.camera is None or self.units.mm_per_pixel is None:
+            return tuple(place)
+        points = np.array(place[: len(place) // 2 * 2], dtype=np.float64).reshape(-1, 2)
+        return (*(self.camera.to_mm(points) / self.units.mm_per_pixel).ravel().tolist(), *place[2 * len(points) :])
+
+    def displacement(self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) -> FloatArray:
+        """Rectify the displacement of every node and its standard uncertainty, (N,) each in px; stacked (4, N)."""
+        field = np.stack([u, v, u_std, v_std]).astype(np.float64)
+        if self.camera is None or self.units.mm_per_pixel is None:
+            return field
+        moved = self.image.nodes + field[:2].T
+        slopes = self.camera.jacobian(moved) / self.units.mm_per_pixel
+        field[:2] = (self.camera.to_mm(moved) / self.units.mm_per_pixel - self.mesh.nodes).T
+        field[2:] = np.sqrt((slopes**2 @ (field[2:].T ** 2)[:, :, None])[:, :, 0]).T
+        return field

@@ -21,6 +21,7 @@ from rgbmidic.correlation import Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
+from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import Window, open_series, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
@@ -333,6 +334,8 @@ def _series_and_calibration(settings: TestSettings, source: FrameSequence | None
         series = open_series(settings.frames, settings.base, calibration)
     else:
         series = open_sequence(source, settings.frames, calibration)
+    if settings.scale.camera is not None:
+        CameraCalibration.read(settings.scale.camera).check(series.shape)
     return series, calibration and calibration.cropped(settings.frames.crop_origin, series.shape)
 
 

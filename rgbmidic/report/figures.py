@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.report import style
-from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result, scale_of
+from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result
 from rgbmidic.results.physical import Physical
 from rgbmidic.typing import FloatArray
 
@@ -283,12 +283,14 @@ class MapDrawer:
     def of_kind(self, frame: int, kind: str) -> Figure:
         """Draw one of `MAPS` of a frame, as `map_figure` does."""
         record = self.result.frame(frame)
-        values, scale, unit = {**record.values}, scale_of(self.result), "px"
-        if scale.mm_per_pixel is not None:
-            units = Physical.untimed(self.result, scale).units
-            unit = units.length
+        physical, values = Physical.untimed(self.result), {**record.values}
+        if physical.rectified.camera is not None:
+            values |= physical.frame(frame)
+        else:
             for name in ("u", "v"):
-                values[name], values[f"{name}_std"] = units.lengths(values[name], values[f"{name}_std"])
+                pair = physical.units.lengths(values[name], values[f"{name}_std"])
+                values[name], values[f"{name}_std"] = pair
+        unit = physical.units.length
         nothing, maps = np.zeros(len(record.u)), {}
         for name in MAPS[kind]:
             label = f"{name} ({unit})" if name.removesuffix("_std") in ("u", "v") else name

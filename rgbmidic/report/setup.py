@@ -48,6 +48,8 @@ def hardware_rows(physical: Physical, setup: SetupSettings) -> Rows:
         yield "image scale", f"{_missing('scale.mm_per_pixel')}: lengths are in px"
     else:
         yield "image scale", f"{scale:.6g} mm per px" + (f" ± {std:.2g} (one standard uncertainty)" if std else "")
+    if (plane := physical.rectified.camera) is not None:
+        yield "lens and plane", f"{plane.name}: {plane.summary()}"
     camera = result.provenance.get("frame_rate")
     if rate := camera or result.setting("scale", "frame_rate"):
         origin = "by the camera's file" if camera else "as stated"

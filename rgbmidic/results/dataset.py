@@ -7,7 +7,7 @@ Attributes follow the CF conventions: ``units`` ("1" where there is none), ``lon
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from rgbmidic._version import __version__
-from rgbmidic.results.physical import frame_times, scale_of
+from rgbmidic.results.physical import Physical, frame_times
 from rgbmidic.results.quantities import QUANTITIES, SHARED
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
@@ -39,10 +39,12 @@ class _Frames(BackendArray):
         It is read when the array is indexed.
     names
         Of one shape and type.
+    physical
+        Where they are read in the reader's units, not as the table has them.
     """
 
-    def __init__(self, result: Result, names: tuple[str, ...]) -> None:
-        self.result, self.names = result, names
+    def __init__(self, result: Result, names: tuple[str, ...], physical: Physical | None = None) -> None:
+        self.result, self.names, self.physical = result, names, physical
         blank = QUANTITIES[names[0]].unmeasured(result.table.layout.sizes)
         self.dtype = blank.dtype
         self.shape = (len(result), *blank.shape, *([len(names)] if len(names) > 1 else []))
@@ -63,15 +65,21 @@ class _Frames(BackendArray):
 
         blank = QUANTITIES[self.names[0]].unmeasured(self.result.table.layout.sizes)
         read = np.empty((frames.size, *part(dict.fromkeys(self.names, blank)).shape), dtype=self.dtype)
-        for row, values in enumerate(self.result.table.each(self.names, frames.reshape(-1).tolist())):
+        for row, values in enumerate(self._each(frames.reshape(-1).tolist(), blank)):
             read[row] = part(values)
         return read.reshape((*frames.shape, *read.shape[1:]))
+
+    def _each(self, frames: list[int], blank: Any) -> Iterable[Mapping[str, Any]]:
+        if self.physical is None:
+            return self.result.table.each(self.names, frames)
+        nothing, there = dict.fromkeys(self.names, blank), self.result.finished
+        return (self.physical.frame(frame) if there[frame] else nothing for frame in frames)
 
 
 def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset:
     """Make the Dataset that `Result.to_xarray` documents."""
-    scale = scale_of(result) if scale is None else scale
-    variables: dict[str, xr.Variable] = {}
+    physical, variables = Physical.untimed(result, scale), dict[str, xr.Variable]()
+    plane = None if physical.rectified.camera is None else physical
     for name, entry in QUANTITIES.items():
         dimension = _PARTS[name][0] if name in _PARTS else ""
         if not entry.stackable or name.removesuffix("_std") in _COMPONENTS or name == "number":
@@ -81,18 +89,26 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
     for end, meaning in {"": "small strain", "_std": "standard uncertainty of strain"}.items():
         names = tuple(f"{name}{end}" for name in _COMPONENTS)
         about = {"units": "1", "long_name": meaning}
-        if not end:
+        if plane is not None:
+            kind = f"{plane.measure_name} strain, virtual strain gauge of {plane.in_units(plane.gauges.length)}"
+            about["description"] = f"on the plane of the specimen: {kind}"
+        elif not end:
             about["description"] = "; ".join(f"{name}: {QUANTITIES[name].meaning}" for name in names)
-        read = indexing.LazilyIndexedArray(_Frames(result, names))
+        read = indexing.LazilyIndexedArray(_Frames(result, names, plane))
         variables[f"strain{end}"] = xr.Variable(("frame", "node", "component"), read, about)
+    for name in ("u", "v", "u_std", "v_std") if plane is not None else ():
+        about = QUANTITIES[name].attributes | {"units": "mm", "description": "on the plane of the specimen"}
+        read = indexing.LazilyIndexedArray(_Frames(result, (name,), plane))
+        variables[f"{name[0]}_mm{name[1:]}"] = xr.Variable(("frame", "node"), read, about)
     variables["elements"] = xr.Variable(("element", "corner"), result.elements, SHARED["elements"].attributes)
-    return xr.Dataset(variables, _coordinates(result, scale), _provenance(result, scale))
+    return xr.Dataset(variables, _coordinates(physical), _provenance(physical))
 
 
-def _coordinates(result: Result, scale: ScaleSettings) -> dict[str, xr.Variable]:
+def _coordinates(physical: Physical) -> dict[str, xr.Variable]:
     """Collect places in px and, where the scale is known, in mm; numbers, names and times of the frames."""
-    places = {"to the right": result.nodes[:, 0], "down": result.nodes[:, 1]}
-    factors = {"px": 1.0} | ({} if scale.mm_per_pixel is None else {"mm": scale.mm_per_pixel})
+    result, places = physical.result, {"px": ("the reference image", physical.result.nodes)}
+    if physical.units.length == "mm":
+        places["mm"] = physical.where("x"), physical.length * physical.mesh.nodes
     coordinates = {
         "frame": xr.Variable("frame", np.arange(len(result)), {"long_name": "place of the frame in the result"}),
         "number": xr.Variable("frame", result.number, QUANTITIES["number"].attributes),
@@ -101,22 +117,25 @@ def _coordinates(result: Result, scale: ScaleSettings) -> dict[str, xr.Variable]
         "component": xr.Variable("component", list(_COMPONENTS), {"long_name": "component of the strain tensor"}),
     }
     coordinates |= {dimension: xr.Variable(dimension, list(parts)) for dimension, parts in _PARTS.values()}
-    for unit, factor in factors.items():
-        for axis, (way, values) in zip("xy", places.items(), strict=True):
-            about = {"units": unit, "long_name": f"position of the node on the reference image, {way}"}
-            coordinates[axis if unit == "px" else f"{axis}_{unit}"] = xr.Variable("node", factor * values, about)
-    if (times := frame_times(result, scale)) is not None:
+    for unit, (where, nodes) in places.items():
+        for axis, way, values in zip("xy", ("to the right", "down"), nodes.T, strict=True):
+            about = {"units": unit, "long_name": f"position of the node on {where}, {way}"}
+            coordinates[axis if unit == "px" else f"{axis}_{unit}"] = xr.Variable("node", values, about)
+    if (times := frame_times(result, physical.scale)) is not None:
         about = {"units": "s", "long_name": "time of the frame from the trigger"}
         coordinates["time"] = xr.Variable("frame", times, about)
     return coordinates
 
 
-def _provenance(result: Result, scale: ScaleSettings) -> dict[str, Any]:
+def _provenance(physical: Physical) -> dict[str, Any]:
     """Collect the attributes of the Dataset as plain numbers and texts, which a file can hold."""
+    result, scale, camera = physical.result, physical.units, physical.rectified.camera
     kept, places = result.provenance, {"references": list(result.provenance["references"])}
     facts = {name: kept[name] for name in ("created", "finished", "frame_rate", "exposure_ns") if kept.get(name)}
     if scale.mm_per_pixel is not None:
         facts |= {"mm_per_pixel": scale.mm_per_pixel, "mm_per_pixel_std": scale.mm_per_pixel_std}
+    if camera is not None:
+        facts["camera"] = f"{camera.name}: {camera.summary()}"
     texts = {name: json.dumps(kept[name]) for name in ("settings", "calibration", "versions") if name in kept}
     about = {"title": f"result {result.path.name}", "source": f"rgbmidic {__version__}"}
     return {**about, **facts, **places, **texts}

@@ -143,6 +143,8 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     out.attrs.update({"title": f"result {result.path.name}", "source": f"rgbmidic {__version__}", "axes": _AXES})
     if units.mm_per_pixel is not None:
         out.attrs.update({"mm_per_pixel": units.mm_per_pixel, "mm_per_pixel_std": units.mm_per_pixel_std})
+    if (camera := physical.rectified.camera) is not None:
+        out.attrs["camera"] = f"{camera.name}: {camera.summary()}"
     out.create_dataset("provenance", data=json.dumps(dict(result.provenance)), dtype=text)
     meaning = "time of the frame" if units.timed else "place of the frame, counted from 0"
     scales: dict[str, tuple[AnyArray, str, str]] = {
@@ -154,12 +156,12 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     }
     for name, (values, unit, meaning) in scales.items():
         _add(out, name, values, (), unit, meaning).make_scale(name)
-    x, y = physical.length * mesh.nodes.T
     x_element, y_element = physical.length * mesh.nodes[mesh.elements].mean(axis=1).T
     node, element = ("node",), ("element",)
     _add(out, "name", np.array(result.names, dtype=text), ("time",), "1", "name of the frame")
-    _add(out, "x", x, node, units.length, "position of the node on the reference image, to the right")
-    _add(out, "y", y, node, units.length, "position of the node on the reference image, down")
+    for name, (unit, values) in physical.places.items():
+        way, where = ("to the right" if name[0] == "x" else "down"), physical.where(name)
+        _add(out, name, values, node, unit, f"position of the node on {where}, {way}")
     _add(out, "elements", mesh.elements, ("element", "corner"), "1", "nodes of the element, counted from 0")
     _add(out, "x_element", x_element, element, units.length, "middle of the element, to the right")
     _add(out, "y_element", y_element, element, units.length, "middle of the element, down")
@@ -297,15 +299,20 @@ def _write_csv(physical: Physical, file: BinaryIO) -> None:
     result, text = physical.result, io.TextIOWrapper(file, encoding="utf-8", newline="")
     fields = {name: entry.unit for name, entry in physical.quantities.items() if entry.axes == ("node",)}
     del fields["node_status"]  # a whole number
-    length, writer = physical.units.length, csv.writer(text)
-    places = [column(name, length) for name in ("x", "y")]
+    places, writer = physical.places, csv.writer(text)
     time = ["time_s"] if physical.units.timed else []
     head = ["frame", "number", "name", *time, "status", "node", "node_status"]
-    writer.writerow([*head, *places, *(column(name, unit) for name, unit in fields.items())])
+    writer.writerow(
+        [
+            *head,
+            *(column(name, unit) for name, (unit, _) in places.items()),
+            *(column(name, unit) for name, unit in fields.items()),
+        ]
+    )
     for index, seconds in enumerate(physical.times.tolist()):
         values = physical.frame(index)
         start = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if time else []), values["status"]]
-        numbers = np.column_stack([physical.length * result.nodes, *(values[name] for name in fields)])
+        numbers = np.column_stack([*(place for _, place in places.values()), *(values[name] for name in fields)])
         for node, (code, row) in enumerate(zip(values["node_status"].tolist(), numbers.tolist(), strict=True)):
             writer.writerow([*start, node, code, *("" if number != number else f"{number:.9g}" for number in row)])
     text.detach()  # leaves the file open for whoever opened it

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,18 +18,19 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.fields import (
     EQUIVALENT,
+    CameraCalibration,
     History,
     Nodal,
     NodalCovariance,
     Probe,
+    Rectification,
     RigidMotion,
     Units,
     make_probe,
     rates,
 )
-from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.files import check_file, write_complete
-from rgbmidic.results.physical import Channels, exposure, frame_times, reference_frames, scale_of, shared_part
+from rgbmidic.results.physical import Channels, exposure, frame_times, rectification_of, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
@@ -175,23 +176,22 @@ def read_histories(
     """
     if not probes.places and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
-    scale = scale_of(result) if scale is None else scale
-    times = frame_times(result, scale)
-    units = Units.of(scale, timed=times is not None)
+    times, rectified = frame_times(result, scale), rectification_of(result, scale)
+    units = replace(rectified.units, timed=times is not None)
     there = np.flatnonzero(result.finished)
     if not len(there):
         raise InputError(f"no frame of {result.path} is measured yet")
     if probes.window > len(there):
         raise InputError(f"rates over a window of {probes.window} frames need as many; {len(there)} are measured")
     times = None if times is None else times[there]
-    covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=result.nodes, elements=result.elements))
+    covariance = NodalCovariance.from_mesh(rectified.mesh)
     counts: dict[str, int] = {}
     made = []
     for kind, place in probes.places:
         counts[kind] = counts.get(kind, 0) + 1
-        made.append(make_probe(covariance, kind, counts[kind], place, probes.measure))
+        made.append(make_probe(covariance, kind, counts[kind], rectified.place(place), probes.measure))
     clock = result.number[there].astype(np.float64) if times is None else times
-    nodal, rigid, speed = _read(result, there, covariance, made, probes.rigid_motion, clock)
+    nodal, rigid, speed = _read(result, there, rectified, covariance, made, probes.rigid_motion, clock)
     by_probe = {probe.name: probe.histories(part) for probe, part in zip(made, nodal, strict=True)}
     for name, histories in by_probe.items():
         if not any(np.isfinite(history.values).any() for history in histories):
@@ -216,13 +216,14 @@ def read_histories(
         quantities=(*quantities, *beside, *stress),
         stress_strain=(strain, stress[0].name) if stress and strain else None,
         units=units,
-        remarks=tuple(_remarks(units, speed, exposure(result), there, by_probe, beside)),
+        remarks=tuple(_remarks(rectified.camera, units, speed, exposure(result), there, by_probe, beside)),
     )
 
 
 def _read(
     result: Result,
     frames: npt.NDArray[np.int64],
+    rectified: Rectification,
     covariance: NodalCovariance,
     probes: list[Probe],
     rigid: str,
@@ -233,7 +234,7 @@ def _read(
     motions = np.full((len(frames), 3, 2), np.nan)
     speed, before = np.full(len(frames), np.nan), np.full((2, len(result.nodes)), np.nan)
     for row, values in enumerate(result.table.each(["u", "v", "u_std", "v_std"], frames.tolist())):
-        field = np.stack([values[name] for name in ("u", "v", "u_std", "v_std")]).astype(np.float64)
+        field = rectified.displacement(*(values[name] for name in ("u", "v", "u_std", "v_std")))
         moved = np.hypot(*(field[:2] - before))
         if row and np.isfinite(moved).any():
             speed[row] = np.nanpercentile(moved, _FAST) / (clock[row] - clock[row - 1])
@@ -241,7 +242,7 @@ def _read(
         if rigid != "none" and np.isfinite(field).all(axis=0).sum() > 1:
             motion = RigidMotion.of(covariance, *field)
             motions[row] = [*zip(motion.shift, motion.shift_std, strict=True), (motion.rotation, motion.rotation_std)]
-            field = motion.removed(result.nodes, field) if rigid == "remove" else field
+            field = motion.removed(rectified.mesh.nodes, field) if rigid == "remove" else field
         for fields, probe in zip(kept, probes, strict=True):
             fields.append(field[:, probe.nodes])
     stacked = [np.stack(fields, axis=1) for fields in kept]
@@ -302,6 +303,7 @@ def _beside(
 
 
 def _remarks(
+    camera: CameraCalibration | None,
     units: Units,
     speed: FloatArray,
     exposed: float | None,
@@ -309,6 +311,8 @@ def _remarks(
     read: Mapping[str, list[History]],
     beside: list[HistoryColumn],
 ) -> Iterator[str]:
+    if camera is not None:
+        yield f"lengths and strains are those on the plane of {camera.name}: {camera.summary()}"
     if units.mm_per_pixel is None:
         yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"
     if not units.timed:

@@ -23,7 +23,9 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields import (
     EQUIVALENT,
     MEASURES,
+    CameraCalibration,
     NodalCovariance,
+    Rectification,
     StrainGauges,
     Units,
     reference_fraction,
@@ -41,6 +43,7 @@ __all__ = [
     "exposure",
     "frame_times",
     "probes_of",
+    "rectification_of",
     "reference_frames",
     "scale_of",
     "shared_part",
@@ -68,10 +71,36 @@ def probes_of(result: Result) -> ProbeSettings:
     return read_section(ProbeSettings, "probes", result.provenance.get("settings", {}).get("probes", {}))
 
 
+def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rectification:
+    """Return the change from px of the image to rectified px, and the scale.
+
+    Parameters
+    ----------
+    result
+        The result; its provenance holds the camera that its ``[scale]`` names.
+    scale
+        It replaces the ``[scale]`` that was kept with the result; None: that one.
+
+    Raises
+    ------
+    CalibrationError
+        The camera's file is not usable, or was made with frames of another shape.
+    InputError
+        The camera holds no plane.
+    """
+    mesh, camera = Tri3Mesh(nodes=result.nodes, elements=result.elements), None
+    if scale is not None and scale.camera is not None:
+        camera = CameraCalibration.read(scale.camera)
+    elif scale is None and (kept := result.provenance.get("camera")) is not None:
+        camera = CameraCalibration.from_document(kept, str(scale_of(result).camera))
+    if camera is not None:
+        camera.check(result.frame_shape or camera.shape)
+    return Rectification.of(mesh, scale_of(result) if scale is None else scale, camera)
+
+
 def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
     """Return the units of a result, with its own ``[scale]`` or another one in its place."""
-    scale = scale_of(result) if scale is None else scale
-    return Units.of(scale, timed=frame_times(result, scale) is not None)
+    return replace(rectification_of(result, scale).units, timed=frame_times(result, scale) is not None)
 
 
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
@@ -289,36 +318,52 @@ class Physical:
     result
         The result.
     scale
-        Its ``[scale]``, or the one that replaces it.
+        What replaces its ``[scale]``; None: nothing.
     units
         Of lengths and times.
     times : ndarray, shape (T,)
         Of the frames: seconds where all are known and each is later than the one before, else places in the result.
-    mesh
-        In px.
+    rectified
+        Change to rectified px, where a camera is stated.
     """
 
     result: Result
-    scale: ScaleSettings
+    scale: ScaleSettings | None
     units: Units
     times: FloatArray
-    mesh: Tri3Mesh
+    rectified: Rectification
 
     @classmethod
     def of(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
-        scale = scale_of(result) if scale is None else scale
         untimed, times = cls.untimed(result, scale), frame_times(result, scale)
         if times is None or not (np.diff(times) > 0).all():
             return untimed
         return replace(untimed, times=times, units=replace(untimed.units, timed=True))
 
     @classmethod
-    def untimed(cls, result: Result, scale: ScaleSettings) -> Self:
+    def untimed(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Leave out the times, for which every frame is read: for single frames, or a result that still grows."""
-        mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-        times = np.arange(len(result), dtype=np.float64)
-        return cls(result=result, scale=scale, units=Units.of(scale, timed=False), times=times, mesh=mesh)
+        rectified, times = rectification_of(result, scale), np.arange(len(result), dtype=np.float64)
+        return cls(result=result, scale=scale, units=rectified.units, times=times, rectified=rectified)
+
+    @property
+    def mesh(self) -> Tri3Mesh:
+        """The mesh in rectified px; in px where no camera is stated."""
+        return self.rectified.mesh
+
+    def where(self, name: str) -> str:
+        """Say what one of the `places` lies on."""
+        plane = self.rectified.camera is not None and not name.endswith("_image")
+        return "the plane of the specimen at the reference" if plane else "the reference image"
+
+    @property
+    def places(self) -> dict[str, tuple[str, FloatArray]]:
+        """Coordinates of the nodes by name, with unit and values (N,): with a camera those on the image too."""
+        found = {name: (self.units.length, self.length * x) for name, x in zip("xy", self.mesh.nodes.T, strict=True)}
+        if self.rectified.camera is not None:
+            found |= {f"{name}_image": ("px", x) for name, x in zip("xy", self.result.nodes.T, strict=True)}
+        return found
 
     @cached_property
     def gauges(self) -> StrainGauges:
@@ -360,15 +405,15 @@ class Physical:
         """Return the `quantities` of one frame, each in its type; errors as `Result.frame`."""
         record = self.result.frame(index)
         values = {name: record.values[name] for name in self.quantities if name in record.values}
-        for component in ("u", "v"):
-            pair = self.units.lengths(record.values[component], record.values[f"{component}_std"])
-            values |= zip((component, f"{component}_std"), pair, strict=True)
-        values |= self.strain(record.u, record.v, record.u_std, record.v_std)
-        gradient = self.mesh.element_gradient(np.stack([record.u, record.v], axis=1))
+        u, v, u_std, v_std = self.rectified.displacement(record.u, record.v, record.u_std, record.v_std)
+        for component, pair in {"u": (u, u_std), "v": (v, v_std)}.items():
+            values |= zip((component, f"{component}_std"), self.units.lengths(*pair), strict=True)
+        values |= self.strain(u, v, u_std, v_std)
+        gradient = self.mesh.element_gradient(np.stack([u, v], axis=1))
         elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)))
         return values | {entry.name: entry.of(elements) for entry in _ELEMENT_STRAIN}
 
     def strain(self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) -> dict[str, FloatArray]:
-        """Return the strain at the nodes by name, from the displacements (N,) of one frame in px."""
+        """Return the strain at the nodes by name, from the displacements (N,) of one frame in rectified px."""
         strain = self.gauges.strain(u, v, u_std, v_std)
         return {entry.name: entry.of(strain) for entry in _STRAIN}

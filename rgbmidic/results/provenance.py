@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
+from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import file_hash
 from rgbmidic.results.files import read_json
 from rgbmidic.results.quantities import SHARED
@@ -103,6 +104,8 @@ class Origin:
             document |= {"settings": self.settings.to_mapping(), "base": str(self.settings.base)}
             if (file := self.settings.calibration_file) is not None:
                 document["calibration"] = {"file": str(file), "sha256": file_hash(file)}
+            if (file := self.settings.scale.camera) is not None:
+                document["camera"] = CameraCalibration.read(file).to_document()
         document |= {**self.notes, "lights": list(self.lights), "references": list(self.references)}
         document["frames"] = {"count": len(self.names), "sha256": digest(list(self.names))}
         document |= {"mesh": digest(self.mesh), "inputs": dict(self.inputs)}

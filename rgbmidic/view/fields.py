@@ -18,7 +18,7 @@ from rgbmidic.errors import RgbmidicError
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import spread
 from rgbmidic.report.style import colour_range, ordinary_values, time_text
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Result, scale_of
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Result
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatArray
@@ -148,7 +148,7 @@ class Fields:
     @classmethod
     def of(cls, result: Result) -> Self:
         """Return the fields of a result."""
-        return cls(result=result, physical=Physical.untimed(result, scale_of(result)))
+        return cls(result=result, physical=Physical.untimed(result))
 
     @cached_property
     def all(self) -> dict[str, Field]:
@@ -191,6 +191,7 @@ class Fields:
         read = next(self.result.table.each([*_MOVED, *stored, *more], [frame]))
         u, v, u_std, v_std = (np.asarray(read[part], dtype=np.float64) for part in _MOVED)
         moved = self.result.nodes + np.stack([u, v], axis=1)
+        u, v, u_std, v_std = self.physical.rectified.displacement(u, v, u_std, v_std)
         nothing = np.full(len(u), np.nan)
         if name == "magnitude":
             length = np.hypot(u, v)
