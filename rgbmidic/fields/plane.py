@@ -35,6 +35,8 @@ _INVERSE, _EXACT = 25, 1e-10
 end where none moves a point by more than `_EXACT` px, which rounding leaves at 1000 px."""
 _SPAN = 10.0
 """Half the distance (px) over which the uncertainty of the local scale is taken: any that is short (derived)."""
+_SOME = 200
+"""Nodes, at most, that the camera's uncertainty is averaged over: it is a polynomial of low degree (chosen)."""
 _STEP = 0.5
 """Half step (px) of the central differences of the distortion: their error is the third derivative of the map over 24,
 1e-8 of the scale at a distortion of 2 % over 500 px (derived)."""
@@ -256,6 +258,16 @@ class CameraCalibration:
         known = f"tilt {tilt:.2f} ± {tilt_std:.2f} degrees" if np.isfinite(tilt) else "tilt not known without a lens"
         return f"{scale:.6g} ± {scale_std:.2g} mm per px in the middle of the frame, {known}"
 
+    def jacobian_std(self, points: FloatArray) -> FloatArray:
+        """Standard uncertainty (N,), mm per px, that the calibration leaves in a displacement of one px at points (N, 2).
+
+        Both components of its error together, as the rms over the displacement's directions.
+        """
+        steps = _SPAN * np.eye(2)
+        slopes = [(self.sensitivity(points + step) - self.sensitivity(points - step)) / (2 * _SPAN) for step in steps]
+        total = sum(np.einsum("nip,pq,niq->n", slope, self.correlation, slope) for slope in slopes)
+        return np.asarray(np.sqrt(total / 2))
+
     @classmethod
     def read(cls, path: Path | str) -> Self:
         """Read the file that ``rgbmidic-calibrate camera`` wrote.
@@ -315,9 +327,9 @@ class Rectification:
 
     A point x lies at ``camera.to_mm(x) / units.mm_per_pixel``, and a displacement u of it becomes the difference of
     both ends. Strain, probes and rates are taken in rectified px as they are in px where no camera is stated: then
-    nothing is changed. The standard uncertainty of a displacement follows by the Jacobian. The camera's has a part that
-    all displacements have in common, `units.mm_per_pixel_std`, and one by which the scale differs from place to place;
-    the latter is left out: it is smaller (tests/truth/test_camera.py), and `CameraCalibration.sensitivity` gives it.
+    nothing is changed. The standard uncertainty of a displacement follows by the Jacobian; the camera's own is
+    stated beside it as that of a scale is, a fraction of every length: `CameraCalibration.jacobian_std`, the rms over
+    the mesh, over the scale. In strain it is left out, as a scale's is; tests/truth/test_camera.py has what it leaves.
 
     Attributes
     ----------
@@ -353,9 +365,10 @@ class Rectification:
         if not np.isfinite(places).all():
             raise InputError(f"the lens of {camera.name} does not image all of the mesh: its distortion has no inverse")
         size = Tri3Mesh(nodes=places, elements=mesh.elements).size / mesh.size
-        local, std = camera.scale(mesh.nodes.mean(axis=0))
+        some = mesh.nodes[:: len(mesh.nodes) // _SOME + 1]
+        std = float(np.sqrt(np.mean(camera.jacobian_std(some) ** 2)))
         flat = Tri3Mesh(nodes=places / size, elements=mesh.elements)
-        units = Units(mm_per_pixel=size, mm_per_pixel_std=size * std / local)
+        units = Units(mm_per_pixel=size, mm_per_pixel_std=std)
         return cls(camera=camera, image=mesh, mesh=flat, units=units)
 
     def place(self, place: Sequence[float]) -> tuple[float, ...]:

@@ -127,9 +127,10 @@ class ResultStore:
         read_provenance(Path(path))
         store = cls.join(path, origin, frames=frames)
         with _releasing(store):
-            kept, stated = read_provenance(store.path), origin.provenance().get("settings")
-            if kept.get("settings") != stated:
-                write_json(store.path / PROVENANCE, sealed({**kept, "settings": stated}))
+            kept, now = read_provenance(store.path), origin.provenance()
+            stated = {name: now.get(name) for name in ("settings", "camera")}
+            if stated != {name: kept.get(name) for name in stated}:
+                write_json(store.path / PROVENANCE, sealed({**kept, **stated}))
         return store
 
     @classmethod

@@ -195,6 +195,7 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST + "[solver]\ncurvature = true", r'unknown key "curvature" in \[solver\]'),
         (LEAST + "[solver]\ntolerance = inf", r"solver\.tolerance must be finite"),
         (LEAST + "[scale]\nmm_per_pixel = 0", r"scale\.mm_per_pixel must be above 0"),
+        (LEAST + '[scale]\nmm_per_pixel = 1\ncamera = "c.json"', r"scale\.camera \(.*c\.json\).*scale\.mm_per_pixel"),
         (LEAST + "[calibration]\nfile = 1", r"calibration\.file must be a file name in quotes, not 1"),
         ("[frames\n", r"not a readable settings file \(TOML\)"),
     ],
@@ -288,6 +289,7 @@ BUILT: dict[str, Any] = {
         prefilter="gaussian", rigid="translation", brightness="local", fill=50, tolerance=0.5, max_iterations=7
     ),
     "scale": ScaleSettings(mm_per_pixel=0.5, mm_per_pixel_std=0.25, frame_rate=1000),
+    "scale by a camera": ScaleSettings(camera=Path("camera.json")),
     "probes": ProbeSettings(
         points=((1.0, 2.0),),
         lines=(PLACE,),

@@ -22,12 +22,14 @@ from textures import Affine, Texture
 
 from rgbmidic.correlation import Start, Status
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, ResultError, RgbmidicError
+from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import read_frame, write_tiff
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import measure, run, schedule, workers
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import UpdatedReferences
 from rgbmidic.results import Result, finish_result, scale_of
+from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
 
 COUNT, SHAPE = 36, (72, 80)
@@ -396,6 +398,13 @@ def test_how_a_result_is_read_is_stated_anew_by_going_on_with_it(movie: Path, wh
     assert (scale_of(whole).mm_per_pixel, scale_of(result).mm_per_pixel) == (None, 0.02)
     assert result.provenance["finished"] == whole.provenance["finished"]
     same(result, whole)
+    camera = CameraCalibration(shape=SHAPE[-2:], homography=np.diag([0.02, 0.02, 1]))
+    camera.write(tmp_path / "camera.json")
+    plane = TestSettings.from_mapping(
+        {**settings(movie).to_mapping(), "scale": {"camera": str(tmp_path / "camera.json")}}, movie
+    )
+    (u,), (again,) = (np.array([Physical.of(one).frame(3)["u"]]) for one in (result, measure(plane, out, resume=True)))
+    np.testing.assert_allclose(again, u, rtol=1e-6, atol=1e-9)
 
 
 def test_going_on_with_something_else_is_refused_by_name(movie: Path, whole: Result, tmp_path: Path) -> None:
