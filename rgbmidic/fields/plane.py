@@ -255,13 +255,13 @@ class CameraCalibration:
     def summary(self) -> str:
         """Return scale in the middle of the frame and tilt, with their standard uncertainties, as text."""
         (scale, scale_std), (tilt, tilt_std) = self.scale(self.centre), self.tilt_deg
-        known = f"tilt {tilt:.2f} ± {tilt_std:.2f} degrees" if np.isfinite(tilt) else "tilt not known without a lens"
+        known = f"tilt {tilt:.3f} ± {tilt_std:.2g} degrees" if np.isfinite(tilt) else "tilt not known without a lens"
         return f"{scale:.6g} ± {scale_std:.2g} mm per px in the middle of the frame, {known}"
 
     def jacobian_std(self, points: FloatArray) -> FloatArray:
-        """Standard uncertainty (N,), mm per px, that the calibration leaves in a displacement of one px at points (N, 2).
+        """Standard uncertainty (N,) that the calibration leaves in a displacement of one px at points (N, 2), mm.
 
-        Both components of its error together, as the rms over the displacement's directions.
+        Of both components of its error together, as the rms over the displacement's directions.
         """
         steps = _SPAN * np.eye(2)
         slopes = [(self.sensitivity(points + step) - self.sensitivity(points - step)) / (2 * _SPAN) for step in steps]
