@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -18,7 +18,6 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.fields import (
     EQUIVALENT,
-    CameraCalibration,
     History,
     Nodal,
     NodalCovariance,
@@ -177,7 +176,7 @@ def read_histories(
     if not probes.places and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
     times, rectified = frame_times(result, scale), rectification_of(result, scale)
-    units = replace(rectified.units, timed=times is not None)
+    rectified = replace(rectified, units=(units := replace(rectified.units, timed=times is not None)))
     there = np.flatnonzero(result.finished)
     if not len(there):
         raise InputError(f"no frame of {result.path} is measured yet")
@@ -191,7 +190,8 @@ def read_histories(
         counts[kind] = counts.get(kind, 0) + 1
         made.append(make_probe(covariance, kind, counts[kind], rectified.place(place), probes.measure))
     clock = result.number[there].astype(np.float64) if times is None else times
-    nodal, rigid, speed = _read(result, there, rectified, covariance, made, probes.rigid_motion, clock)
+    each = result.table.each(["u", "v", "u_std", "v_std"], there.tolist())
+    nodal, rigid, speed = _read(each, rectified, covariance, made, probes.rigid_motion, clock)
     by_probe = {probe.name: probe.histories(part) for probe, part in zip(made, nodal, strict=True)}
     for name, histories in by_probe.items():
         if not any(np.isfinite(history.values).any() for history in histories):
@@ -216,13 +216,12 @@ def read_histories(
         quantities=(*quantities, *beside, *stress),
         stress_strain=(strain, stress[0].name) if stress and strain else None,
         units=units,
-        remarks=tuple(_remarks(rectified.camera, units, speed, exposure(result), there, by_probe, beside)),
+        remarks=tuple(_remarks(rectified, speed, exposure(result), there, by_probe, beside)),
     )
 
 
 def _read(
-    result: Result,
-    frames: npt.NDArray[np.int64],
+    each: Iterable[Mapping[str, FloatArray]],
     rectified: Rectification,
     covariance: NodalCovariance,
     probes: list[Probe],
@@ -231,9 +230,9 @@ def _read(
 ) -> tuple[list[Nodal], list[History], FloatArray]:
     """Read the displacements that each probe needs, the rigid motion and the speed (T,) of the fast nodes."""
     kept: list[list[FloatArray]] = [[] for _ in probes]
-    motions = np.full((len(frames), 3, 2), np.nan)
-    speed, before = np.full(len(frames), np.nan), np.full((2, len(result.nodes)), np.nan)
-    for row, values in enumerate(result.table.each(["u", "v", "u_std", "v_std"], frames.tolist())):
+    motions = np.full((len(clock), 3, 2), np.nan)
+    speed, before = np.full(len(clock), np.nan), np.full((2, len(rectified.mesh.nodes)), np.nan)
+    for row, values in enumerate(each):
         field = rectified.displacement(*(values[name] for name in ("u", "v", "u_std", "v_std")))
         moved = np.hypot(*(field[:2] - before))
         if row and np.isfinite(moved).any():
@@ -303,14 +302,14 @@ def _beside(
 
 
 def _remarks(
-    camera: CameraCalibration | None,
-    units: Units,
+    rectified: Rectification,
     speed: FloatArray,
     exposed: float | None,
     frames: npt.NDArray[np.int64],
     read: Mapping[str, list[History]],
     beside: list[HistoryColumn],
 ) -> Iterator[str]:
+    camera, units = rectified.camera, rectified.units
     if camera is not None:
         yield f"lengths and strains are those on the plane of {camera.name}: {camera.summary()}"
     if units.mm_per_pixel is None:

@@ -123,13 +123,13 @@ def test_stated_uncertainty_is_that_of_noise_and_of_the_calibration(tmp_path: Pa
     rectified = Rectification.of(MESH, ScaleSettings(), calibrated(where, lens, seed=0))
     draws = [
         rectified.displacement(*(field + np.array(STD)[:, None] * random.normal(size=field.shape)), one, one)[:2]
-        for _ in range(300)
+        for _ in range(200)
     ]
     stated = rectified.displacement(*field, STD[0] * one, STD[1] * one)[2:]
     ratio = np.std(draws, axis=0) / stated
     assert np.abs(ratio.mean(axis=1) - 1).max() < 0.02
     # the camera's own: calibrations that differ by the noise of their corners alone
-    found = [Rectification.of(MESH, ScaleSettings(), calibrated(where, lens, seed)) for seed in range(12)]
+    found = [Rectification.of(MESH, ScaleSettings(), calibrated(where, lens, seed)) for seed in range(8)]
     exact = MOTIONS["translation"][0](np.zeros((1, 2)))[0]
     axes = turn_of(where, lens)
     errors = [
@@ -178,7 +178,7 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
     extension = found["gauge_1_extension_mm"].values[1]
     assert extension / length == pytest.approx(found["gauge_1_strain"].values[1], rel=1e-9)
     assert found["strain_gauge_1_e1"].values == pytest.approx([0, 0.01005], abs=2 * LEFT)
-    assert any("camera.json" in remark and "tilt 5.0" in remark for remark in found.remarks)
+    assert any("camera.json" in remark and camera.summary() in remark for remark in found.remarks)
 
     export_result(result, "csv", folder / "out.csv")
     with (folder / "out.csv").open(encoding="utf-8") as file:
@@ -192,7 +192,7 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
         assert file["x"][node] == pytest.approx(camera.to_mm(place[None])[0, 0])
         assert file["x_image"][node] == pytest.approx(place[0])
         np.testing.assert_allclose(file["VTKHDF/Points"][:, 0], camera.to_mm(MESH.nodes)[:, 0])
-        assert "tilt 5.0" in file.attrs["camera"]
+        assert camera.summary() in file.attrs["camera"]
         assert float(np.sum(file["area"])) == pytest.approx(physical.length**2 * physical.mesh.areas.sum())
     data = result.to_xarray()
     assert float(data.u_mm[1, node]) == pytest.approx(u, abs=1e-6)
