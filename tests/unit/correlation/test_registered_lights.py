@@ -15,6 +15,7 @@ from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import find_start
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.settings import SolverSettings
+from rgbmidic.weights import Statistics
 
 SHAPE = (240, 300)
 REGION = Region.from_rectangle((70, 50, 220, 190), SHAPE)
@@ -53,7 +54,7 @@ def solved(first, second, registration, **place):
     """Solution with equal weights from the exact displacement."""
     deformed = Deformed.prepare(second, prefilter="binomial", **place)
     start = MOTION.displacement(Tri3Mesh.from_region(REGION, 20).nodes, SHAPE)
-    return solve(prepared(first, registration), deformed, start, SolverSettings(), statistics=False)
+    return solve(prepared(first, registration), deformed, start, SolverSettings(), None)
 
 
 def error(solution):
@@ -103,7 +104,7 @@ def test_a_reference_update_reads_the_lights_where_they_lie(pair):
     first, second = pair
     deformed, options = Deformed.prepare(second, prefilter="binomial"), SolverSettings()
     none = ReferenceUpdate.none(prepared(first, registered()))
-    solution = none.track(deformed, Start(displacement=None), options, statistics=True)
+    solution = none.track(deformed, Start(displacement=None), options, Statistics())
     later = none.updated(solution, second, np.ones_like(second))
-    again = later.track(deformed, Start(displacement=solution.displacement), options, statistics=True)
+    again = later.track(deformed, Start(displacement=solution.displacement), options, Statistics())
     np.testing.assert_allclose(again.displacement, solution.displacement, atol=1e-3)
