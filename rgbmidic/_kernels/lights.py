@@ -10,7 +10,7 @@ import numpy as np
 from rgbmidic._kernels.interpolation import _FAST
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
-__all__ = ["PAD", "best_mean", "malvar", "pad_mosaic", "robust_weights", "scores", "unmix"]
+__all__ = ["PAD", "best_mean", "gradient_of_others", "malvar", "pad_mosaic", "robust_weights", "scores", "unmix"]
 
 BLOCK = 4096
 """Pixels at a time: what a core's fastest cache holds."""
@@ -113,6 +113,51 @@ def malvar(start, stop, padded, red_row, red_column, out):
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+
+
+@over_ranges("mean", axis=1, grain=BLOCK)
+@compiled(fastmath=_FAST)
+def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, products):
+    """Mean gradient of the lights other than `light`, and its products with that light's own.
+
+    For gradients (2, k, P) and weights (k, P): `mean` (2, P) receives the mean of the others that have weight; where
+    they are fewer than `fewest`, that of all that have. `products` (4, P) receives own times mean, mean times mean, own
+    times own and 1, all 0 where the light has no weight.
+    """
+    count, others = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
+    total = np.empty(BLOCK, dtype=np.float32)
+    for first in range(start, stop, BLOCK):
+        chunk = slice(first, min(first + BLOCK, stop))
+        along, square, power, seen = products[0, chunk], products[1, chunk], products[2, chunk], products[3, chunk]
+        products[:, chunk] = 0
+        for i in range(np.uint64(seen.size)):
+            count[i] = _ZERO
+        for j in range(len(weights)):
+            weight = weights[j, chunk]
+            for i in range(np.uint64(seen.size)):
+                count[i] += _ONE if weight[i] > _ZERO else _ZERO
+        weight = weights[light, chunk]
+        for i in range(np.uint64(seen.size)):
+            seen[i] = _ONE if weight[i] > _ZERO else _ZERO
+        for i in range(np.uint64(seen.size)):
+            others[i] = _ONE if count[i] - seen[i] >= fewest else _ZERO
+        for axis in range(2):
+            own, result = gradient[axis, light, chunk], mean[axis, chunk]
+            for i in range(np.uint64(seen.size)):
+                total[i] = _ZERO
+            for j in range(len(weights)):
+                weight, slope = weights[j, chunk], gradient[axis, j, chunk]
+                for i in range(np.uint64(seen.size)):
+                    total[i] += slope[i] if weight[i] > _ZERO else _ZERO
+            for i in range(np.uint64(seen.size)):
+                less = others[i] * seen[i]
+                result[i] = (total[i] - less * own[i]) / max(count[i] - less, _ONE)
+            for i in range(np.uint64(seen.size)):
+                along[i] += seen[i] * own[i] * result[i]
+            for i in range(np.uint64(seen.size)):
+                square[i] += seen[i] * result[i] * result[i]
+            for i in range(np.uint64(seen.size)):
+                power[i] += seen[i] * own[i] * own[i]
 
 
 @over_ranges("fraction", axis=1, grain=BLOCK)
