@@ -23,7 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from solver import speckle
+from peers import speckle
 
 from rgbmidic import Tri3Mesh, correlate, read_frame
 from rgbmidic.correlation import Solution

@@ -32,7 +32,6 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from rgbmidic._kernels.threads import threads
-from rgbmidic.correlation import correlate
 from rgbmidic.fields import at_pixels
 from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
@@ -41,6 +40,7 @@ from rgbmidic.illumination.separation import DEMOSAICERS, separate
 from rgbmidic.illumination.unmixing import align, unmix
 from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline import correlate
 from rgbmidic.scene.camera import PIXEL
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import threshold_weights

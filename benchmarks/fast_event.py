@@ -44,6 +44,7 @@ from rgbmidic.pipeline.separation import Separation, correlated, reference_image
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE, IlluminationSettings, SolverSettings
 from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.weights import Statistics
 
 CROSSTALK = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 CFA, BLACK, WHITE, GAIN, READ_NOISE = "GBRG", 64, 4095, 4.0, 3.0
@@ -322,7 +323,7 @@ def glare(draws: int) -> None:
         start, errors, stated = Start(displacement=np.zeros_like(mesh.nodes)), [], []
         for number in range(plate.rest, len(frames)):
             ready = correlated(separation(frames[number]), settings)
-            found = track(reference, Deformed.prepare(ready, prefilter=solver.prefilter), start, solver)
+            found = track(reference, Deformed.prepare(ready, prefilter=solver.prefilter), start, solver, Statistics())
             start = start.after(mesh, found.displacement, found.measured)
             errors.append(found.displacement - plate.displacement(mesh.nodes, number))
             stated.append(found.displacement_std)

@@ -77,7 +77,7 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     return [
         ("right-hand side", owned, 20, lambda: reference.right_side(deformed, 0, values, weights, motion)),
         ("comparison", owned, 20, lambda: reference.warp(deformed, 0, *compared[:2], compared[2:])),
-        ("Hessian", owned, 20, lambda: reference.hessian_blocks(0, weights)),
+        ("Hessian", owned, 20, lambda: reference.blocks(weights, reference.gradient[:, 0])),
         ("spline coefficients", count, 16, lambda: bspline_coefficients(image[0], coefficients)),
         ("unmixing, 3 lights", count, 30, lambda: unmix(channels, known, grid, size, needed, lights, lit)),
     ]

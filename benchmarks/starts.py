@@ -21,7 +21,7 @@ import numpy as np
 
 from rgbmidic import Region, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference
-from rgbmidic.correlation.precision import correlation_around
+from rgbmidic.correlation.nodes import correlation_around
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.start import FoundStart, find_start
 from rgbmidic.typing import FloatArray, FloatImage

@@ -1,9 +1,9 @@
-"""Whether displacement and stated uncertainty hold without tuning: reflections, noise alone, spoiled frames.
+"""Whether displacement and stated uncertainty hold without tuning: reflections, noise alone, corrupted frames.
 
     python benchmarks/uncertainty.py [TABLE ...] [--quick] [--cache FOLDER]
 
 Scenes of `rgbmidic.lab.virtual` with exact truth, seen by a raw Bayer camera (reflection-aware) and by an ideal
-3-CCD one; every setting is the default of `rgbmidic.correlation.correlate` with images divided by their local mean
+3-CCD one; every setting is the default of `rgbmidic.correlate` with images divided by their local mean
 (sigma 10 px). The opponent is the paper's binary mask with the threshold that gives the smallest true error, sought
 anew for every scene and state, everything else equal: a choice nobody can make in a laboratory.
 
@@ -38,7 +38,8 @@ from uncertainty_scenes import (
     turn,
 )
 
-from rgbmidic.correlation import Solution, correlate
+from rgbmidic import correlate
+from rgbmidic.correlation import Solution
 from rgbmidic.fields import (
     MEASURES,
     Nodal,
@@ -275,7 +276,7 @@ def scenes(quick: bool) -> None:
         {"gloss": 3.0},
         {"speckle": 3.0},
         {"speckle": 8.0},
-        {"paint": "sparkling"},
+        {"wrinkles": 0.05},
     ]
     heading(
         "camera",
@@ -348,11 +349,11 @@ def noise(quick: bool) -> None:
             row(name, f"{angle:g}°", draws, *cells)
 
 
-def spoiled(quick: bool) -> None:
+def corrupted(quick: bool) -> None:
     """Spoiled frames, sphere at 1 degree, start sought by the solver: the rest unharmed, what is lost flagged."""
     heading(
         "camera",
-        "spoiled by",
+        "corrupted by",
         "status",
         "ratio elsewhere",
         "elsewhere lost",
@@ -514,7 +515,7 @@ TABLES: dict[str, Callable[[bool], None]] = {
     "areas": areas,
     "scenes": scenes,
     "noise": noise,
-    "spoiled": spoiled,
+    "corrupted": corrupted,
     "texture": texture,
     "elements": elements,
     "probes": probes,

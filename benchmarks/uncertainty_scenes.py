@@ -47,7 +47,7 @@ class Setting:
     seed: int = 11
     gloss: float = 1.5
     speckle: float = 4.2
-    paint: str = "smooth"
+    wrinkles: float = 0.025  # their spacing in mm
 
     def scene(self, gloss: float | None = None) -> Scene:
         """The scene; another `gloss` for its mat twin."""
@@ -59,7 +59,7 @@ class Setting:
             scene = sphere_scene(**options)
         if self.body == "cylinder":
             scene = replace(scene, body=Cylinder(radius=30.0, centre=(0.0, 0.0, 630.0)))
-        return painted(scene, self.paint)
+        return painted(scene, self.wrinkles)
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rgbmidic.correlation import NodeStatus, Solution, Status, correlate
+    from rgbmidic.correlation import NodeStatus, Solution, Status
     from rgbmidic.errors import RgbmidicError
     from rgbmidic.frames import read_frame
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.lab.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import Region, Tri3Mesh
-    from rgbmidic.pipeline import measure, measure_sequence
+    from rgbmidic.pipeline import correlate, measure, measure_sequence
     from rgbmidic.results import Result
     from rgbmidic.settings import TestSettings, read_test
 
@@ -53,7 +53,7 @@ _HOMES = {
     "Status": "rgbmidic.correlation",
     "TestSettings": "rgbmidic.settings",
     "Tri3Mesh": "rgbmidic.mesh",
-    "correlate": "rgbmidic.correlation",
+    "correlate": "rgbmidic.pipeline",
     "inspect_frame": "rgbmidic.lab.inspection",
     "measure": "rgbmidic.pipeline",
     "measure_sequence": "rgbmidic.pipeline",

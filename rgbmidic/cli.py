@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
     from rgbmidic.results import Result
+    from rgbmidic.settings import TestSettings
 
 __all__ = ["app", "main"]
 
@@ -31,6 +32,18 @@ that breaks or leaves the picture halfway through is an ordinary test, a run tha
 
 app = typer.Typer(name="rgbmidic", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 _messages = Console(stderr=True)
+
+
+def _note(text: str) -> None:
+    """Print a line on stderr as it is, however long."""
+    _messages.print(text, soft_wrap=True, markup=False, highlight=False)
+
+
+def _settings(test: Path | None) -> TestSettings | None:
+    from rgbmidic.settings import read_test
+
+    return None if test is None else read_test(test)
+
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
@@ -164,7 +177,7 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
     _print_summary(result, time.perf_counter() - started)
     failed = [index for index in result.deformed if result.status[index] != _CONVERGED]
     if unread := int(result.unread.sum()):
-        _messages.print(f"note: frames that could not be read: {unread}; --resume tries them again", soft_wrap=True)
+        _note(f"note: frames that could not be read: {unread}; --resume tries them again")
     if len(failed) > _TOO_MANY * len(result.deformed) or not result.deformed:
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
         count = f"{len(failed)} of {len(result.deformed)} deformed frames failed or did not converge"
@@ -179,20 +192,16 @@ def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> I
     def begun() -> bytes:
         return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""
 
-    def interrupt(*_: object) -> None:
-        """Act as Ctrl-C, which a command in the background of a script ignores."""
-        raise KeyboardInterrupt
-
     before_it = begun()
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which a background job ignores
     try:
         yield
     except KeyboardInterrupt:
         if frames or resume or begun() != before_it:
             part = f"--frames {frames}" if frames else "--resume"
-            _messages.print(f"go on with: rgbmidic run {test} --out {out} {part}", soft_wrap=True, markup=False)
+            _note(f"go on with: rgbmidic run {test} --out {out} {part}")
         else:
-            _messages.print("nothing was begun: run the same command again", soft_wrap=True)
+            _note("nothing was begun: run the same command again")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)
@@ -212,9 +221,8 @@ def figures(
     from rgbmidic.report import write_figures
     from rgbmidic.results import Result
 
-    chosen = _whole_numbers(frames, "--frames") if frames else None
-    opened, folder = Result.open(result, partial=partial), out or result / "figures"
-    for file in write_figures(opened, folder, chosen, processes=threads()):
+    chosen, folder = _frames(frames), out or result / "figures"
+    for file in write_figures(Result.open(result, partial=partial), folder, chosen, processes=threads()):
         print(file)
 
 
@@ -229,9 +237,9 @@ def export(
 ) -> None:
     """Write a result into one file for another program: ParaView, MATLAB, xarray, a spreadsheet."""
     from rgbmidic.results import Result, export_result
-    from rgbmidic.settings import read_test
 
-    scale = None if test is None else read_test(test).scale
+    settings = _settings(test)
+    scale = None if settings is None else settings.scale
     export_result(Result.open(result, partial=partial), to, out, scale=scale, overwrite=overwrite)
 
 
@@ -247,10 +255,8 @@ def report(
     """Write the report of a test: one HTML page, to be read in any browser and printed."""
     from rgbmidic.report import REPORT, write_report
     from rgbmidic.results import Result
-    from rgbmidic.settings import read_test
 
-    file, settings = out or result / REPORT, None if test is None else read_test(test)
-    chosen = _whole_numbers(frames, "--frames") if frames else None
+    file, chosen, settings = out or result / REPORT, _frames(frames), _settings(test)
     opened = Result.open(result, partial=partial)
     write_report(opened, file, settings=settings, frames=chosen, overwrite=overwrite)
     print(file)
@@ -294,13 +300,12 @@ def history(
     from rgbmidic.results import Channels, Result, history_rows, probes_of, write_histories
     from rgbmidic.results.files import check_file
     from rgbmidic.results.histories import read_histories
-    from rgbmidic.settings import read_test
 
     picture = out.with_suffix(".png")
     for file in (out, picture):
         check_file(file, overwrite=overwrite)
     result = Result.open(folder, partial=partial)
-    settings = None if test is None else read_test(test)
+    settings = _settings(test)
     kept = probes_of(result) if settings is None else settings.probes
     stated: dict[str, Any] = {
         key: (*getattr(kept, key), *value) if key in _PLACES else value for key, value in probes.items()
@@ -309,15 +314,14 @@ def history(
         result,
         replace(kept, **stated),
         scale=None if settings is None else settings.scale,
-        channels=None if channels is None else Channels.read(channels),
-        offset=offset,
+        channels=None if channels is None else Channels.read(channels, offset),
         area=area,
         force=force,
     )
     write_histories(histories, out, overwrite=overwrite)
     save_figure(history_figure(histories), picture)
     for remark in histories.remarks:
-        _messages.print(f"note: {remark}", soft_wrap=True, markup=False, highlight=False)
+        _note(f"note: {remark}")
     _print_table(f"{len(histories.frames)} frames", *history_rows(histories))
     print(f"table: {out}   picture: {picture}")
 
@@ -344,11 +348,7 @@ def demo(
     ),
 ) -> None:
     """Make a small virtual test, calibrate, measure it, and compare with the known truth."""
-    from rich.table import Table
-
-    _messages.print(
-        f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}", soft_wrap=True
-    )
+    _note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
     _explain_first_run()
     from rgbmidic._kernels.threads import threads
     from rgbmidic.lab.demo import run_demo
@@ -357,27 +357,26 @@ def demo(
 
     started = time.perf_counter()
     with _progress("demo") as progress:
-        rows = run_demo(out, lambda line: _messages.print(line, soft_wrap=True), _calibrate_demo, progress)
-    _messages.print(f"5 of 5: pictures of the result in {out / 'figures'}", soft_wrap=True)
+        rows = run_demo(out, _note, _calibrate_demo, progress)
+    _note(f"5 of 5: pictures of the result in {out / 'figures'}")
     write_figures(Result.open(out / "result"), out / "figures", (len(rows),), processes=threads())
-    table = Table(title="Displacement error against the exact truth, px (a sphere turning under moving reflections)")
-    for heading in ("angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"):
-        table.add_column(heading, justify="right")
-    for row in rows:
-        errors = (row.rms_px, *row.single_px, row.nodal_px, row.predicted_px)
-        table.add_row(f"{row.angle_deg:g} deg", *(f"{error:.4f}" for error in errors))
-    console = Console(soft_wrap=True)
-    console.print(table)
-    console.print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")
+    columns = ["angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"]
+    errors = [(row.rms_px, *row.single_px, row.nodal_px, row.predicted_px) for row in rows]
+    lines = [[f"{row.angle_deg:g} deg", *(f"{e:.4f}" for e in each)] for row, each in zip(rows, errors, strict=True)]
+    title = "Displacement error against the exact truth, px (a sphere turning under moving reflections)"
+    _print_table(title, columns, lines)
+    print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")
 
 
 def _calibrate_demo(test: Path) -> None:
     """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` finds it."""
     from rgbmidic.settings import FrameSettings
+    from rgbmidic_calibration.captures import Captures
     from rgbmidic_calibration.jobs import calibrate_crosstalk
 
     lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
-    calibration, _ = calibrate_crosstalk(lights, str(test / "dark"), FrameSettings(path=("captures",)))
+    captures = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",)))
+    calibration, _ = calibrate_crosstalk(captures)
     calibration.write(test / "calibration.json")
 
 
@@ -415,15 +414,15 @@ def plan(
     uncertainty = "standard uncertainty to expect over the field, px"
     _print_table(uncertainty, *planning.uncertainty_rows(made), planning.UNCERTAINTY_WORDS)
     better = {name: proposal.plan for name, proposal in proposals.items() if proposal.gain > 1}
-    for name, one in {"lamps as they are": made, **better}.items():
-        _print_table(f"{name}: {planning.summary(one)}", *planning.lamp_rows(one))
+    for name, lamps in {"lamps as they are": made, **better}.items():
+        _print_table(f"{name}: {planning.summary(lamps)}", *planning.lamp_rows(lamps))
     if not better:
         print("no better place was found for the lamps")
     print(f"plan: {out / 'plan.json'}   picture: {out / 'plan.png'}")
 
 
 @app.command()
-@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+@command.frame_options
 def frames(
     statement: dict[str, Any],
     path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
@@ -440,8 +439,8 @@ def frames(
     from rgbmidic.settings import FrameSettings
 
     if formats:
-        for known in known_formats():
-            print(f"{known.name}: {' '.join((*known.endings, *known.movies)) or 'by content'}")
+        for format_ in known_formats():
+            print(f"{format_.name}: {' '.join((*format_.endings, *format_.movies)) or 'by content'}")
         return
     if not path:
         raise InputError("PATH must name a movie, a frame, a folder or a pattern; --formats lists what is read")
@@ -450,12 +449,12 @@ def frames(
     if save is not None:
         save_frame(settings, *save, overwrite=overwrite)
     for warning in description.warnings:
-        _messages.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+        _note(f"warning: {warning}")
     print(description.as_json() if json else description.as_text())
 
 
 @app.command()
-@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+@command.frame_options
 def inspect(
     frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; one per light in succession.")],
     statement: dict[str, Any],
@@ -472,11 +471,10 @@ def inspect(
     """Inspect one frame before a test: lights, reflections, speckle, noise, uncertainty to expect."""
     from rgbmidic.lab import check_folder
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
-    from rgbmidic.settings import read_test
 
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
-    settings = None if test is None else read_test(test)
+    settings = _settings(test)
     _explain_first_run()
     with _progress("inspecting") as progress:
         inspection = inspect_files(
@@ -521,11 +519,12 @@ def _print_table(
     print()
 
 
-def _whole_numbers(text: str, option: str) -> list[int]:
+def _frames(text: str) -> list[int] | None:
+    """Indices that ``--frames`` states, None where it states none."""
     try:
-        return [int(part) for part in text.split(",")]
+        return [int(part) for part in text.split(",")] if text else None
     except ValueError:
-        raise InputError(f"{option} are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
+        raise InputError(f"--frames are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
 
 
 def _explain_first_run() -> None:
@@ -533,10 +532,9 @@ def _explain_first_run() -> None:
     from rgbmidic._kernels import are_compiled
 
     if not are_compiled():
-        _messages.print(
+        _note(
             "first run on this machine: kernels are compiled for its processor as they are needed, in all some 40 s; "
-            "later runs take them from a cache",
-            soft_wrap=True,
+            "later runs take them from a cache"
         )
 
 
@@ -549,6 +547,8 @@ def _progress(what: str) -> AbstractContextManager[Callable[[int, int, str], Non
 
 def _print_summary(result: Result, seconds: float) -> None:
     """Print how the deformed frames ended; the reference, matched with itself, is left out."""
+    from rgbmidic.timing import STAGES
+
     deformed = list(result.deformed)
     ends = [int((result.status[deformed] == code).sum()) for code in (_CONVERGED, _UNCONVERGED, _FAILED)]
     words = [f"{ends[0]} converged", *([f"{ends[1]} not converged"] if ends[1] else []), f"{ends[2]} failed"]
@@ -562,22 +562,13 @@ def _print_summary(result: Result, seconds: float) -> None:
     for light, fraction in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
         known = fraction[fraction == fraction]
         rows[light] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
-    if measured and (stages := _stages(result, deformed)):
-        rows["frame"] = stages
+    timed = [seconds for seconds in result.each("seconds", deformed) if seconds[0] == seconds[0]] if measured else []
+    if timed:  # the mean time of a frame and what each stage takes of it
+        mean = sum(timed) / len(timed)
+        parts = ", ".join(f"{name} {part:.0%}" for name, part in zip(STAGES, mean / mean.sum(), strict=True))
+        rows["frame"] = f"{mean.sum():.2f} s: {parts}"
     for name, text in {**rows, "time": f"{seconds:.1f} s", "result": result.path}.items():
         print(f"{name:<8}{text}")
-
-
-def _stages(result: Result, frames: Sequence[int]) -> str:
-    """The mean time of a frame and what each stage takes of it; empty where nobody asked for it."""
-    from rgbmidic.timing import STAGES
-
-    known = [seconds for seconds in result.each("seconds", frames) if seconds[0] == seconds[0]]
-    if not known:
-        return ""
-    mean = sum(known) / len(known)
-    parts = ", ".join(f"{name} {part:.0%}" for name, part in zip(STAGES, mean / mean.sum(), strict=True))
-    return f"{mean.sum():.2f} s: {parts}"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What both commands have in common: errors as one line and an exit status, and options that several commands take."""
+"""Parts of both commands: errors become one line and an exit status, and several commands take the same options."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ from rgbmidic.errors import InputError, RgbmidicError, disk_reason
 __all__ = [
     "FAILURE",
     "FRAME_OPTIONS",
+    "REQUIRED",
     "execute",
     "fail",
+    "frame_options",
     "gather",
     "help_where_alone",
     "main",
@@ -33,6 +35,7 @@ __all__ = [
 ]
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
+REQUIRED = inspect.Parameter.empty
 
 FRAME_OPTIONS: dict[str, Any] = {
     "kind": Annotated[
@@ -100,7 +103,7 @@ def help_where_alone(context: typer.Context) -> None:
 
 
 def gather(
-    name: str, options: Mapping[str, Any], read: Callable[[dict[str, Any]], Any]
+    name: str, options: Mapping[str, Any], read: Callable[[dict[str, Any]], Any], **defaults: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorator of a command whose parameter `name` is asked for as several options.
 
@@ -109,9 +112,11 @@ def gather(
     name
         Parameter of the command; it gets what `read` makes of the options.
     options
-        Annotated type of every option by its key; each may be left out.
+        Annotated type of every option by its key.
     read
-        Function of the options' values by key, None for one that is left out.
+        Function of the options' values by key.
+    **defaults
+        Values of options that are left out, None where none is given here; ``REQUIRED`` for one that may not be.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -124,9 +129,10 @@ def gather(
         asked: list[inspect.Parameter] = []
         for parameter in signature.parameters.values():
             parts = options if parameter.name == name else {parameter.name: parameter.annotation}
-            default = None if parameter.name == name else parameter.default
             kind = inspect.Parameter.KEYWORD_ONLY
-            asked += [inspect.Parameter(key, kind, default=default, annotation=hint) for key, hint in parts.items()]
+            for key, hint in parts.items():
+                default = defaults.get(key) if parameter.name == name else parameter.default
+                asked.append(inspect.Parameter(key, kind, default=default, annotation=hint))
         gathering.__annotations__ = {parameter.name: parameter.annotation for parameter in asked}
         vars(gathering)["__signature__"] = signature.replace(parameters=asked)
         return gathering
@@ -187,6 +193,10 @@ def read_statement(options: Mapping[str, Any]) -> dict[str, Any]:
     """
     values = {**options, "shape": read_shape(options["shape"])}
     return {key: value for key, value in values.items() if value is not None}
+
+
+frame_options = gather("statement", FRAME_OPTIONS, read_statement)
+"""Decorator of a command whose parameter `statement` holds what the `FRAME_OPTIONS` state."""
 
 
 def read_shape(text: str | None) -> tuple[int, int] | None:

@@ -6,6 +6,8 @@ Every message says what is wrong, what is allowed and what was given, and names 
 import errno
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 __all__ = [
     "CalibrationError",
@@ -15,6 +17,7 @@ __all__ = [
     "RegionError",
     "ResultError",
     "RgbmidicError",
+    "disk_faults",
     "disk_reason",
     "first_line",
     "legible",
@@ -73,3 +76,12 @@ class RegionError(RgbmidicError, ValueError):
 
 class ResultError(RgbmidicError, ValueError):
     """A result folder is missing, damaged, or would be overwritten."""
+
+
+@contextmanager
+def disk_faults(kind: type[RgbmidicError], what: str) -> Iterator[None]:
+    """Turn what the disk refuses inside the block into an error of a `kind`: `what` could not be done, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what}: {disk_reason(error)}") from None

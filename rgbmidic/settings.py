@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import operator
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -33,10 +34,13 @@ __all__ = [
     "SolverSettings",
     "TestSettings",
     "WeightSettings",
+    "bounded",
     "check_names",
     "convert_value",
+    "plain",
     "read_range",
     "read_section",
+    "read_table",
     "read_test",
     "read_toml",
     "regular",
@@ -61,7 +65,7 @@ BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """The four phases of the Bayer colour filter array, named by the top-left 2x2 cell read row by row."""
 
 
-def _bounded(default: Any, **bounds: float) -> Any:
+def bounded(default: Any = MISSING, **bounds: float) -> Any:
     """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`."""
     return field(default=default, metadata={"bounds": bounds})
 
@@ -73,7 +77,11 @@ class _Checked:
     section = ""
 
     def __post_init__(self) -> None:
-        _normalise(self, self.section)
+        hints = _hints(cast(Any, self.__class__))
+        for entry in fields(cast(Any, self)):
+            where = entry.metadata.get("key") or f"{self.section}.{entry.name}".lstrip(".")
+            value = _converted(entry, getattr(self, entry.name), hints[entry.name], where)
+            object.__setattr__(self, entry.name, value)
         self._check()
 
     def _check(self) -> None:
@@ -126,17 +134,17 @@ class FrameSettings(_Checked):
     path: tuple[str, ...]
     kind: FrameKind | None = None
     cfa: str | None = None
-    black_level: float | None = _bounded(None, at_least=0)
-    white_level: float | None = _bounded(None, above=0)
-    reference: tuple[int, ...] = _bounded((0,), at_least=0)
-    first: int = _bounded(0, at_least=0)
-    last: int | None = _bounded(None, at_least=0)
-    step: int = _bounded(1, at_least=1)
-    lights: int = _bounded(1, at_least=1)
+    black_level: float | None = bounded(None, at_least=0)
+    white_level: float | None = bounded(None, above=0)
+    reference: tuple[int, ...] = bounded((0,), at_least=0)
+    first: int = bounded(0, at_least=0)
+    last: int | None = bounded(None, at_least=0)
+    step: int = bounded(1, at_least=1)
+    lights: int = bounded(1, at_least=1)
     update_reference: bool = False
-    shape: tuple[int, int] | None = _bounded(None, at_least=1)
+    shape: tuple[int, int] | None = bounded(None, at_least=1)
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
-    crop_origin: tuple[int, int] | None = _bounded(None, at_least=0)
+    crop_origin: tuple[int, int] | None = bounded(None, at_least=0)
 
     def _check(self) -> None:
         _require(all(self.path), "frames.path must name the frame files")
@@ -185,7 +193,7 @@ class IlluminationSettings(_Checked):
     section = "illumination"
 
     demosaic: Literal["auto", "reflection-aware", "malvar", "normalised"] = "auto"
-    normalise: float = _bounded(10.0, at_least=0)
+    normalise: float = bounded(10.0, at_least=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -257,12 +265,12 @@ class WeightSettings(_Checked):
     section = "weights"
 
     method: Literal["statistics", "threshold", "geometry", "images", "none"] = "statistics"
-    threshold: float | Literal["auto"] = _bounded(2 / 3, above=0, at_most=1)
-    blur: float = _bounded(10.0, above=0)
+    threshold: float | Literal["auto"] = bounded(2 / 3, above=0, at_most=1)
+    blur: float = bounded(10.0, above=0)
     geometry: Path | None = None
     height_map: Path | None = None
     images: tuple[Path, ...] = ()
-    limit_deg: float | None = _bounded(None, above=0, below=180)
+    limit_deg: float | None = bounded(None, above=0, below=180)
 
     def _check(self) -> None:
         geometric = self.method == "geometry"
@@ -306,9 +314,9 @@ class SolverSettings(_Checked):
     prefilter: Literal["none", "binomial", "gaussian"] = "binomial"
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
     brightness: Literal["none", "global", "local"] = "none"
-    fill: float = _bounded(0.0, at_least=0)
-    tolerance: float = _bounded(1e-3, above=0)
-    max_iterations: int = _bounded(50, at_least=1)
+    fill: float = bounded(0.0, at_least=0)
+    tolerance: float = bounded(1e-3, above=0)
+    max_iterations: int = bounded(50, at_least=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -327,9 +335,9 @@ class ScaleSettings(_Checked):
 
     section = "scale"
 
-    mm_per_pixel: float | None = _bounded(None, above=0)
-    mm_per_pixel_std: float = _bounded(0.0, at_least=0)
-    frame_rate: float | None = _bounded(None, above=0)
+    mm_per_pixel: float | None = bounded(None, above=0)
+    mm_per_pixel_std: float = bounded(0.0, at_least=0)
+    frame_rate: float | None = bounded(None, above=0)
 
     def _check(self) -> None:
         _require(
@@ -382,7 +390,7 @@ class ProbeSettings(_Checked):
     straight_gauges: _Place4 = ()
     strain_gauges: _Place3 = ()
     measure: Literal["green-lagrange", "hencky", "biot", "engineering"] = "green-lagrange"
-    window: int = _bounded(0, at_least=0)
+    window: int = bounded(0, at_least=0)
     rigid_motion: Literal["none", "tell", "remove"] = "none"
 
     def _check(self) -> None:
@@ -507,14 +515,14 @@ class TestSettings(_Checked):
         places = {_place(entry): entry.name for entry in fields(cls)}
         check_names(document, sections, "section", "the file")
         values: dict[str, Any] = {"base": base}
-        for name, content in document.items():
-            if not isinstance(content, Mapping):
-                raise ConfigurationError(f"[{name}] must be a section with keys, not {content!r}")
+        for name in document:
+            content = read_table(document, name)
             if name in hints:
                 values[name] = read_section(hints[name], name, content, base)
-            else:
-                check_names(content, sections[name], "key", f"[{name}]")
-                values |= {places[name, key]: _from(base, content[key], sections[name][key]) for key in content}
+                continue
+            check_names(content, sections[name], "key", f"[{name}]")
+            for key, value in content.items():
+                values[places[name, key]] = convert_value(value, sections[name][key], f"{name}.{key}", base)
         for entry in fields(cls):
             if _is_required(entry) and entry.name not in values:
                 raise ConfigurationError(f"the section [{entry.name}] is missing")
@@ -528,17 +536,32 @@ class TestSettings(_Checked):
         document: dict[str, dict[str, Any]] = {}
         for entry in fields(self):
             section, key = _place(entry)
-            value = getattr(self, entry.name)
-            if is_dataclass(value):
-                plain = {part.name: _plain(getattr(value, part.name)) for part in fields(value)}
-                document[section] = {name: content for name, content in plain.items() if content is not None}
+            value = plain(getattr(self, entry.name))
+            if not key and section:
+                document[section] = {name: content for name, content in value.items() if content is not None}
             elif section and value is not None:
-                document.setdefault(section, {})[key] = _plain(value)
+                document.setdefault(section, {})[key] = value
         return document
 
 
-def read_section(kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".") -> _Section:
-    """One section of the settings from its keys and plain values.
+def read_table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Keys and values of a section of a file; empty where the section is not there.
+
+    Raises
+    ------
+    ConfigurationError
+        It is no section.
+    """
+    table = document.get(name, {})
+    if not isinstance(table, Mapping):
+        raise ConfigurationError(f"[{name}] must be a section with keys, not {table!r}")
+    return dict(table)
+
+
+def read_section(
+    kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".", /, **ready: Any
+) -> _Section:
+    """Object of a dataclass from the keys and plain values of a section: of TEST.toml, SCENE.toml or a calibration.
 
     Parameters
     ----------
@@ -550,27 +573,26 @@ def read_section(kind: type[_Section], name: str, content: Mapping[str, Any], ba
         Its keys and values.
     base
         Folder that relative paths start from.
+    **ready
+        Fields that are no keys of the section.
 
     Raises
     ------
     ConfigurationError
         A key is unknown, missing, of the wrong type, out of range, or contradicts another.
     """
-    hints = _hints(cast(Any, kind))
+    hints = {key: hint for key, hint in _hints(cast(Any, kind)).items() if key not in ready}
     check_names(content, hints, "key", f"[{name}]")
     for entry in fields(cast(Any, kind)):
-        if _is_required(entry) and entry.name not in content:
+        if entry.name in content:
+            value, hint, where = content[entry.name], hints[entry.name], f"{name}.{entry.name}"
+            inner = next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
+            if inner is not None and isinstance(value, Mapping):
+                value = read_section(cast(Any, inner), where, value, base)
+            ready[entry.name] = _converted(entry, value, hint, where, base)
+        elif _is_required(entry) and entry.name not in ready:
             raise ConfigurationError(f"{name}.{entry.name} is missing")
-    return kind(**{key: _from(Path(base), content[key], hints[key]) for key in content})
-
-
-def _from(base: Path, value: Any, hint: Any) -> Any:
-    """A value of the file; where it names a file, from the folder that relative paths start from."""
-    if Path not in (hint, *get_args(hint)):
-        return value
-    if isinstance(value, list | tuple):
-        return [_from(base, entry, Path) for entry in value]
-    return base / value if isinstance(value, str | PurePath) else value
+    return kind(**ready)
 
 
 def regular(path: Path) -> Path:
@@ -653,7 +675,7 @@ def check_names(given: Iterable[str], allowed: Iterable[str], what: str, where: 
     given, allowed
         Names.
     what, where
-        What the names are of and where they stand, for the message.
+        Noun for the names, and the place where they stand, for the message.
 
     Raises
     ------
@@ -709,6 +731,8 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         return convert_value(value, kinds[0], where, base)
     if origin is tuple:
         return _convert_list(value, kinds, where, base)
+    if getattr(origin, "__module__", "") == "numpy":  # the class checks the shape of its arrays
+        return value
     if origin is Literal:
         if value in kinds:
             return value
@@ -773,34 +797,34 @@ def _hint_depth(hint: Any) -> int:
 
 
 def _quoted(value: Any) -> str:
-    return f'"{value}"' if isinstance(value, str) else repr(_plain(value))
+    return f'"{value}"' if isinstance(value, str) else repr(plain(value))
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Value as TOML and JSON hold it: a dataclass as a dict, an array or a tuple as a list, NaN as None."""
+    if is_dataclass(value):
+        return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
+    value = _python(value)
     if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
+    if isinstance(value, float) and math.isnan(value):
+        return None
     return str(value) if isinstance(value, Path) else value
 
 
-def _normalise(settings: Any, section: str) -> None:
-    """Every field of settings in the type that it states and within its bounds; all settings begin with this."""
-    hints = _hints(settings.__class__)
-    for entry in fields(settings):
-        where = entry.metadata.get("key") or f"{section}.{entry.name}".lstrip(".")
-        value = convert_value(getattr(settings, entry.name), hints[entry.name], where)
-        object.__setattr__(settings, entry.name, value)
-        for number in _numbers(value):
-            if not math.isfinite(number):
-                raise ConfigurationError(f"{where} must be finite, not {number}")
-            for bound, limit in entry.metadata.get("bounds", {}).items():
-                kept = {
-                    "above": number > limit,
-                    "at_least": number >= limit,
-                    "at_most": number <= limit,
-                    "below": number < limit,
-                }[bound]
-                if not kept:
-                    raise ConfigurationError(f"{where} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
+_BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
+
+
+def _converted(entry: Field[Any], value: Any, hint: Any, where: str, base: Path | str = "") -> Any:
+    """A value in the type of a field, every number of it finite and within the field's bounds."""
+    value = convert_value(value, hint, where, base)
+    for number in _numbers(value):
+        if not math.isfinite(number):
+            raise ConfigurationError(f"{where} must be finite, not {number}")
+        for bound, limit in entry.metadata.get("bounds", {}).items():
+            if not _BOUNDS[bound](number, limit):
+                raise ConfigurationError(f"{where} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
+    return value
 
 
 def _numbers(value: Any) -> list[float]:

@@ -1,4 +1,4 @@
-"""Quick synthetic colour frames for the demosaicing tests: exact texture, reflections as private sparkle."""
+"""Quick synthetic colour frames for the demosaicing tests: exact texture, reflections as channel-specific sparkle."""
 
 import numpy as np
 from naive_demosaic import colour_by_colour

@@ -7,29 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-import rgbmidic
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
 from rgbmidic.frames.data import planes_of
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-from rgbmidic_calibration.ratio import plane_origins, saturation_pile
+from rgbmidic_calibration.ratio import Sampling, saturation_pile
 
 __all__ = [
     "TILE",
     "CaptureFiles",
+    "Captures",
     "TemporalStack",
     "check_output",
     "named_patterns",
-    "provenance",
     "same_camera",
     "stack_frames",
     "tile_means",
@@ -58,7 +55,7 @@ class CaptureFiles:
     def find(
         cls, role: str, pattern: str, stated: FrameSettings, calibration: Calibration | None = None
     ) -> CaptureFiles:
-        """Files that a pattern or folder names; `stated` is what the user says of them (its path is not used).
+        """Files that a pattern or folder names; `stated` is what the user states of them (its path is not used).
 
         What neither the files nor the user state comes from the `calibration`, which must agree with both.
 
@@ -102,6 +99,71 @@ class CaptureFiles:
         return {str(source.path): source.fingerprint for source in self.series.lights[0]}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Captures:
+    """All captures of a calibration, or of a check.
+
+    Attributes
+    ----------
+    lights
+        With one light on, by its name.
+    dark
+        With every lamp off; None: there are none.
+    together
+        With several lights on, by their names joined by ``+``.
+    """
+
+    lights: Mapping[str, CaptureFiles]
+    dark: CaptureFiles | None
+    together: Mapping[str, CaptureFiles]
+
+    @classmethod
+    def find(
+        cls,
+        lights: Mapping[str, str],
+        dark: str | None,
+        stated: FrameSettings,
+        *,
+        calibration: Calibration | None = None,
+        together: Mapping[str, str] | None = None,
+    ) -> Captures:
+        """Find the files of patterns, given by the names of the lights.
+
+        Raises
+        ------
+        ConfigurationError
+            Captures of lights together without the single ones of each.
+        CalibrationError
+            As in `CaptureFiles.find`.
+        """
+        for names in together or ():
+            if missing := [name for name in names.split("+") if name not in lights]:
+                raise ConfigurationError(
+                    f"--together {names} needs the single captures of {', '.join(missing)} too (--light)"
+                )
+            if "+" not in names:
+                raise ConfigurationError(f"--together takes NAME+NAME=FILES, at least two lights, not {names}")
+
+        def found(role: str, pattern: str) -> CaptureFiles:
+            return CaptureFiles.find(role, pattern, stated, calibration)
+
+        return cls(
+            lights={name: found(f"light {name}", pattern) for name, pattern in lights.items()},
+            dark=found("dark", dark) if dark else None,
+            together={names: found(f"lights {names}", pattern) for names, pattern in (together or {}).items()},
+        )
+
+    @property
+    def groups(self) -> tuple[CaptureFiles, ...]:
+        """The captures of each light, of lights together, and the dark frames."""
+        return *self.lights.values(), *self.together.values(), *([self.dark] if self.dark else [])
+
+    def stacks(self) -> tuple[dict[str, TemporalStack], TemporalStack | None]:
+        """Mean and variance of the captures of every light by its name, and of the dark frames."""
+        dark = stack_frames(self.dark.frames(), drifts=False, name="the dark frames") if self.dark else None
+        return {name: stack_frames(files.frames(), name=files.role) for name, files in self.lights.items()}, dark
+
+
 def named_patterns(options: Sequence[str], option: str) -> dict[str, str]:
     """Split options of the form NAME=FILES.
 
@@ -138,36 +200,14 @@ def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
         raise ConfigurationError(f"the folder of {option} {path} does not exist")
 
 
-def provenance(command: str, groups: Sequence[CaptureFiles], details: Mapping[str, Any]) -> dict[str, Any]:
-    """Where a section of the calibration file comes from: date, version, inputs with hashes, and `details`."""
-    inputs = [
-        {"role": group.role, "file": path, "sha256": fingerprint}
-        for group in groups
-        for path, fingerprint in group.fingerprints.items()
-    ]
-    names = ("kind", "cfa", "black_level", "white_level", "shape", "dtype")
-    stated = {name: getattr(groups[0].stated, name) for name in names} if groups else {}
-    return {
-        "command": f"rgbmidic-calibrate {command}",
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "version": rgbmidic.__version__,
-        "stated": {name: value for name, value in stated.items() if value is not None},
-        "inputs": inputs,
-        **details,
-    }
-
-
-Images = tuple[FloatImage, ...]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TemporalStack:
     """Frames of a scene at rest, all at one exposure.
 
     Attributes
     ----------
-    names : tuple of str, length P
-        Colour planes: R, G1, G2, B; R, G, B; or M.
+    camera
+        How they were sampled; P colour planes.
     mean, variance : tuple of ndarray, length P, each (h, w), float32
         Mean above the stated black level (DN) and sample variance (DN squared) over the frames. Every frame is first
         scaled to the mean strength of all, so that a drifting lamp does not count as noise.
@@ -175,36 +215,21 @@ class TemporalStack:
         True where any frame is saturated.
     strength : ndarray, shape (M, P)
         Mean of every frame and plane above the stated black level (DN).
-    black : ndarray, shape (P,)
-        Stated black levels (DN).
-    white : float
-        White level (DN).
     zeros : float
         Largest fraction of a plane's samples that are 0 (cut off at the bottom).
     piled_at : float or None
         Level below white where samples pile up as at saturation.
-    shape : tuple of int
-        Rows and columns of the frames.
-    origins : tuple of (int, int), length P
-        Row and column of each plane's first sample.
-    step : int
-        Distance of a plane's samples in the frame, px: 2 for a mosaic.
     exposure : float or None
         Exposure time, any unit.
     """
 
-    names: tuple[str, ...]
-    mean: Images
-    variance: Images
+    camera: Sampling
+    mean: tuple[FloatImage, ...]
+    variance: tuple[FloatImage, ...]
     clipped: tuple[BoolArray, ...]
     strength: FloatArray
-    black: FloatArray
-    white: float
     zeros: float
     piled_at: float | None
-    shape: tuple[int, int]
-    origins: tuple[tuple[int, int], ...]
-    step: int
     exposure: float | None = None
 
     @property
@@ -239,70 +264,48 @@ def stack_frames(
     CalibrationError
         No frame, or frames that do not belong together.
     """
-    state: _Running | None = None
+    camera: Sampling | None = None
+    strength: list[FloatArray] = []
+    zeros, piled_at = 0.0, None
     for frame in frames:
-        state = state or _Running(frame, drifts=drifts)
-        state.add(frame, name)
-    if state is None:
-        raise CalibrationError(f"{name}: no frames")
-    return state.finish(exposure)
-
-
-class _Running:
-    """Running mean and sum of squares of every plane."""
-
-    def __init__(self, frame: Mosaic | ChannelFrame, *, drifts: bool) -> None:
-        self.names, planes, self.black = planes_of(frame)
-        self.white, self.shape, self.drifts = frame.white_level, frame.values.shape[-2:], drifts
-        self.step = 2 if isinstance(frame, Mosaic) else 1
-        self.origins = plane_origins(frame)
-        self.mean = [np.zeros(plane.shape, dtype=np.float32) for plane in planes]
-        self.squares = [np.zeros(plane.shape, dtype=np.float32) for plane in planes]
-        self.clipped = [np.zeros(plane.shape, dtype=bool) for plane in planes]
-        self.strength: list[FloatArray] = []
-        self.zeros = 0.0
-        self.piled_at: float | None = None
-
-    def add(self, frame: Mosaic | ChannelFrame, name: str) -> None:
-        names, planes, black = planes_of(frame)
-        shape = frame.values.shape[-2:]
-        if names != self.names or shape != self.shape or frame.white_level != self.white:
+        (_, planes, black), sampling = planes_of(frame), Sampling.of(frame)
+        if camera is None:
+            camera = sampling
+            means, squares = (
+                [np.zeros(plane.shape, dtype=np.float32) for plane in planes] for _ in ("means", "squares")
+            )
+            clipped = [np.zeros(plane.shape, dtype=bool) for plane in planes]
+        if replace(sampling, black=camera.black, origins=camera.origins) != camera:
             raise CalibrationError(
-                f"{name}: a frame is {_words(shape, names, frame.white_level)}, the first "
-                f"{_words(self.shape, self.names, self.white)}: all must come from the same camera and settings"
+                f"{name}: a frame is {sampling}, the first {camera}: all must come from the same camera and settings"
             )
         levels = np.array([plane.mean(dtype=np.float64) for plane in planes]) - black
-        self.strength.append(levels)
-        self.zeros = max(self.zeros, *(float((plane == 0).mean()) for plane in planes))
-        self.piled_at = self.piled_at or next(filter(None, (saturation_pile(p, self.white) for p in planes)), None)
-        scale = _ratio(self.strength[0], levels) if self.drifts else np.ones(len(levels))
+        strength.append(levels)
+        zeros = max(zeros, *(float((plane == 0).mean()) for plane in planes))
+        piled_at = piled_at or next(filter(None, (saturation_pile(plane, camera.white) for plane in planes)), None)
+        scale = _ratio(strength[0], levels) if drifts else np.ones(len(levels))
         for index, plane in enumerate(planes):
             values = (plane.astype(np.float32) - np.float32(black[index])) * np.float32(scale[index])
-            step = values - self.mean[index]
-            self.mean[index] += step / len(self.strength)
-            self.squares[index] += step * (values - self.mean[index])
-            self.clipped[index] |= plane >= self.white
-
-    def finish(self, exposure: float | None) -> TemporalStack:
-        strength = np.array(self.strength)
-        # The frames were scaled to the first one's strength: bring them to the mean strength.
-        factor = _ratio(strength.mean(axis=0), strength[0]) if self.drifts else np.ones(len(self.names))
-        freedom = max(len(strength) - 1, 1)
-        return TemporalStack(
-            names=self.names,
-            mean=tuple(mean * np.float32(f) for mean, f in zip(self.mean, factor, strict=True)),
-            variance=tuple(s * np.float32(f**2 / freedom) for s, f in zip(self.squares, factor, strict=True)),
-            clipped=tuple(self.clipped),
-            strength=strength,
-            black=np.asarray(self.black, dtype=np.float64),
-            white=self.white,
-            zeros=self.zeros,
-            piled_at=self.piled_at,
-            shape=(int(self.shape[0]), int(self.shape[1])),
-            origins=self.origins,
-            step=self.step,
-            exposure=exposure,
-        )
+            step = values - means[index]
+            means[index] += step / len(strength)
+            squares[index] += step * (values - means[index])
+            clipped[index] |= plane >= camera.white
+    if camera is None:
+        raise CalibrationError(f"{name}: no frames")
+    levels = np.array(strength)
+    # The frames were scaled to the first one's strength: bring them to the mean strength.
+    factor = _ratio(levels.mean(axis=0), levels[0]) if drifts else np.ones(len(camera.names))
+    freedom = max(len(levels) - 1, 1)
+    return TemporalStack(
+        camera=camera,
+        mean=tuple(mean * np.float32(f) for mean, f in zip(means, factor, strict=True)),
+        variance=tuple(square * np.float32(f**2 / freedom) for square, f in zip(squares, factor, strict=True)),
+        clipped=tuple(clipped),
+        strength=levels,
+        zeros=zeros,
+        piled_at=piled_at,
+        exposure=exposure,
+    )
 
 
 TILE = 16
@@ -341,15 +344,7 @@ def same_camera(stacks: Sequence[TemporalStack]) -> None:
     CalibrationError
         Size, planes, pattern or levels differ.
     """
-    first = stacks[0]
+    first = stacks[0].camera
     for stack in stacks[1:]:
-        camera = (stack.names, stack.shape, stack.white, stack.origins, tuple(stack.black))
-        if camera != (first.names, first.shape, first.white, first.origins, tuple(first.black)):
-            raise CalibrationError(
-                f"the exposures are of different cameras or settings: {_words(stack.shape, stack.names, stack.white)} "
-                f"and {_words(first.shape, first.names, first.white)}"
-            )
-
-
-def _words(shape: Sequence[int], names: Sequence[str], white: float) -> str:
-    return f"{shape[1]} x {shape[0]} px with planes {' '.join(names)} and white level {white:g}"
+        if stack.camera != first:
+            raise CalibrationError(f"the exposures are of different cameras or settings: {stack.camera} and {first}")

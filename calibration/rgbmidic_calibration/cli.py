@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rgbmidic import command
+from rgbmidic.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from rgbmidic.settings import FrameSettings
+    from rgbmidic_calibration.captures import Captures
 
 __all__ = ["app", "main"]
 
@@ -20,10 +28,19 @@ app = typer.Typer(
 )
 
 Out = Annotated[Path, typer.Option(help="Calibration file to write (JSON).")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing --out.")]
-Light = Annotated[list[str], typer.Option(help="NAME=FILES: captures with this light alone on. Once per light.")]
-Dark = Annotated[str | None, typer.Option(help="Captures with every lamp off (and the same ambient light).")]
-Allow = Annotated[list[str] | None, typer.Option(help="Waive a plausibility check by its name. May be repeated.")]
+Region = Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+CAPTURE_OPTIONS: dict[str, Any] = {
+    "light": Annotated[
+        list[str], typer.Option("--light", help="NAME=FILES: captures with this light alone on. Once per light.")
+    ],
+    "dark": Annotated[
+        str | None, typer.Option("--dark", help="Captures with every lamp off (and the same ambient light).")
+    ],
+    **command.FRAME_OPTIONS,
+}
+
+Command = Callable[..., None]
 
 
 def main() -> None:
@@ -40,39 +57,75 @@ def _root(
     command.help_where_alone(context)
 
 
+def _frames(options: Mapping[str, Any]) -> FrameSettings:
+    """Settings of captures as options state them; an option with a value that is not allowed is named."""
+    from rgbmidic.settings import FrameSettings
+
+    try:
+        return FrameSettings(path=("captures",), **command.read_statement(options))
+    except ConfigurationError as error:
+        as_options = re.sub(r"frames\.(\w+)", lambda key: "--" + key[1].replace("_", "-"), str(error))
+        raise ConfigurationError(as_options) from None
+
+
+def _captures(options: dict[str, Any]) -> partial[Captures]:
+    """How the captures that options name are found, by a call."""
+    from rgbmidic_calibration.captures import Captures, named_patterns
+
+    lights, dark = named_patterns(options.pop("light"), "--light"), options.pop("dark")
+    return partial(Captures.find, lights, dark, _frames(options))
+
+
+def _region(text: str | None) -> tuple[float, ...] | None:
+    return command.read_place(text, "--region", "X0,Y0,X1,Y1") if text else None
+
+
+_takes_captures = command.gather("captures", CAPTURE_OPTIONS, _captures, light=command.REQUIRED)
+
+
+def _writes(name: str, hint: Any, default: str | None = None) -> Callable[[Command], Command]:
+    """Decorator of a command with a file to write, which may replace another only where that is stated."""
+
+    def read(options: Mapping[str, Any]) -> Path | None:
+        from rgbmidic_calibration.captures import check_output
+
+        path: Path | None = options[name]
+        if path is not None:
+            check_output(path, overwrite=options["overwrite"], option=f"--{name}")
+        return path
+
+    defaults = {name: default and Path(default), "overwrite": False}
+    return command.gather(name, {name: hint, "overwrite": Overwrite}, read, **defaults)
+
+
 @app.command()
-@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+@_writes("out", Out, "calibration.json")
+@_takes_captures
 def crosstalk(
-    light: Light,
-    statement: dict[str, Any],
-    out: Out = Path("calibration.json"),
-    dark: Dark = None,
+    captures: Any,
+    out: Path,
     block: Annotated[int, typer.Option(help="Side of the blocks that are averaged, px.")] = 16,
     field: Annotated[
         str, typer.Option(help="Degree by which A varies over the field: 0 to 4, or auto: what the data ask for.")
     ] = "auto",
-    allow: Allow = None,
-    overwrite: Overwrite = False,
+    allow: Annotated[
+        list[str] | None, typer.Option(help="Waive a plausibility check by its name. May be repeated.")
+    ] = None,
 ) -> None:
     """Measure how strongly each camera channel sees each light: the matrix A in channels = A . lights."""
     from rgbmidic_calibration import display, jobs
-    from rgbmidic_calibration.captures import check_output, named_patterns
 
-    check_output(out, overwrite=overwrite)
-    calibration, estimate = jobs.calibrate_crosstalk(
-        named_patterns(light, "--light"),
-        dark,
-        jobs.captures_as_stated(statement),
-        block=block,
-        order=jobs.field_order(field),
-        allow=tuple(allow or ()),
-    )
+    if field != "auto" and not field.isdecimal():
+        raise ConfigurationError(f"--field is auto or a degree from 0, not {field!r}")
+    order = None if field == "auto" else int(field)
+    calibration, estimate = jobs.calibrate_crosstalk(captures(), block=block, order=order, allow=tuple(allow or ()))
     calibration.write(out)
     display.crosstalk(estimate, out)
 
 
 @app.command()
-@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+@_writes("out", Out, "noise.json")
+@command.gather("stated", command.FRAME_OPTIONS, _frames)
 def noise(
     dark: Annotated[str, typer.Option(help="Dark frames, two at least: lens capped, exposure time of the test.")],
     flat: Annotated[
@@ -82,54 +135,39 @@ def noise(
             "one exposure with its time. May be repeated."
         ),
     ],
-    statement: dict[str, Any],
-    out: Out = Path("noise.json"),
-    overwrite: Overwrite = False,
+    stated: Any,
+    out: Path,
 ) -> None:
     """Measure gain, read noise, black level, saturation, linearity, fixed pattern and defects of the camera."""
     from rgbmidic_calibration import display, jobs
-    from rgbmidic_calibration.captures import check_output
 
-    check_output(out, overwrite=overwrite)
-    calibration, estimate = jobs.calibrate_noise(dark, flat, jobs.captures_as_stated(statement))
+    calibration, estimate = jobs.calibrate_noise(dark, flat, stated)
     calibration.write(out)
     display.noise(estimate, out)
 
 
 @app.command()
-@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+@_writes("out", Out, "registration.json")
+@_takes_captures
 def registration(
-    light: Light,
-    statement: dict[str, Any],
-    out: Out = Path("registration.json"),
-    dark: Dark = None,
-    region: Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")] = None,
+    captures: Any,
+    out: Path,
+    region: Region = None,
     element_size: Annotated[float, typer.Option(help="Side of the elements, px; several speckles.")] = 25.0,
-    overwrite: Overwrite = False,
 ) -> None:
     """Measure lateral colour: where each light shows a point other than where the first light shows it."""
     from rgbmidic_calibration import display, jobs
-    from rgbmidic_calibration.captures import check_output, named_patterns
 
-    check_output(out, overwrite=overwrite)
-    calibration, estimate = jobs.calibrate_registration(
-        named_patterns(light, "--light"),
-        dark,
-        jobs.captures_as_stated(statement),
-        region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
-        element_size=element_size,
-    )
+    calibration, estimate = jobs.calibrate_registration(captures(), region=_region(region), element_size=element_size)
     calibration.write(out)
     display.registration(estimate, out)
 
 
 @app.command()
-@command.gather("statement", command.FRAME_OPTIONS, command.read_statement)
+@_takes_captures
 def check(
     file: Annotated[Path, typer.Argument(help="Calibration file.")],
-    light: Light,
-    statement: dict[str, Any],
-    dark: Dark = None,
+    captures: Any,
     together: Annotated[
         list[str] | None, typer.Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
     ] = None,
@@ -137,28 +175,24 @@ def check(
         list[str] | None,
         typer.Option(help="NAME=VALUE: leakage, additivity, strength, noise (in %), registration (in px)."),
     ] = None,
-    region: Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")] = None,
+    region: Region = None,
 ) -> None:
     """Check a calibration on captures that were not used to make it; exit status 1 where it does not hold."""
-    from rgbmidic_calibration import display, jobs
+    from rgbmidic.illumination.calibration import Calibration
+    from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import named_patterns
     from rgbmidic_calibration.verdict import check_calibration, read_limits
 
-    verdict = check_calibration(
-        file,
-        named_patterns(light, "--light"),
-        dark,
-        named_patterns(together or (), "--together"),
-        jobs.captures_as_stated(statement),
-        limits=read_limits(limit or ()),
-        region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
-    )
+    limits, calibration = read_limits(limit or ()), Calibration.read(file)
+    found = captures(calibration=calibration, together=named_patterns(together or (), "--together"))
+    verdict = check_calibration(calibration, found, limits=limits, region=_region(region))
     display.verdict(verdict)
     if not verdict.passed:
         raise typer.Exit(1)
 
 
 @app.command()
+@_writes("picture", Annotated[Path | None, typer.Option(help="Picture of spectra and matrix of the best set.")])
 def design(
     camera: Annotated[
         str,
@@ -173,16 +207,13 @@ def design(
     ],
     choose: Annotated[int, typer.Option(help="Lamps in a set; of more candidates the best sets are found.")] = 3,
     show_sets: Annotated[int, typer.Option("--sets", help="How many of the best sets to list.")] = 5,
-    picture: Annotated[Path | None, typer.Option(help="Picture of spectra and matrix of the best set.")] = None,
-    overwrite: Overwrite = False,
+    picture: Path | None = None,
 ) -> None:
     """Predict crosstalk, condition number and noise from spectra, and find the best set of lamps to buy."""
     from rgbmidic_calibration import design as designs
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.captures import check_output, named_patterns
+    from rgbmidic_calibration.captures import named_patterns
 
-    if picture is not None:
-        check_output(picture, overwrite=overwrite, option="--picture")
     lamps = {name: designs.read_lamp(text) for name, text in named_patterns(light, "--light").items()}
     sensitivities = designs.read_camera(camera)
     found = designs.best_sets(sensitivities, lamps, min(choose, len(lamps)))
@@ -192,36 +223,31 @@ def design(
 
 
 @app.command()
+@_writes("out", Out, "calibration.json")
 def merge(
     files: Annotated[list[Path], typer.Argument(help="Calibration files; every section from one of them.")],
-    out: Out = Path("calibration.json"),
-    overwrite: Overwrite = False,
+    out: Path,
 ) -> None:
     """Merge noise, crosstalk and registration from several files into one."""
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.captures import check_output
     from rgbmidic_calibration.jobs import merge_files
 
-    check_output(out, overwrite=overwrite)
     calibration = merge_files(files)
     calibration.write(out)
     display.merged(calibration, out)
 
 
 @app.command()
+@_writes("picture", Annotated[Path | None, typer.Option(help="Write a picture too (PNG, PDF or SVG).")])
 def show(
     file: Annotated[Path, typer.Argument(help="Calibration file.")],
-    picture: Annotated[Path | None, typer.Option(help="Write a picture too (PNG, PDF or SVG).")] = None,
-    overwrite: Overwrite = False,
+    picture: Path | None = None,
 ) -> None:
     """Show a calibration file as tables, and in one picture."""
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.captures import check_output
 
     calibration = Calibration.read(file)
-    if picture is not None:
-        check_output(picture, overwrite=overwrite, option="--picture")
     display.calibration(calibration, file)
     if picture is not None:
         from rgbmidic_calibration.design import draw_calibration

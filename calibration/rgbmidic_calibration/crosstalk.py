@@ -74,8 +74,8 @@ class LightFit:
         Column of A; 1 in the reference channel.
     signal : float
         Mean grey level (DN above dark) of the reference channel in the blocks used.
-    used, saturated, rejected : float
-        Fractions of the blocks that were used, left out as saturated, and left out as outliers.
+    used, rejected : float
+        Fractions of the blocks that were used, and left out as outliers.
     intensity_drift : float
         Range of the light's strength over the captures, relative to its mean.
     colour_drift : float
@@ -92,7 +92,6 @@ class LightFit:
     column: FloatArray
     signal: float
     used: float
-    saturated: float
     rejected: float
     intensity_drift: float
     colour_drift: float
@@ -104,22 +103,11 @@ class LightFit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrosstalkEstimate:
-    """Result of `estimate_crosstalk`.
-
-    Attributes
-    ----------
-    crosstalk : Crosstalk
-    lights : tuple of LightFit
-    dark, dark_std : ndarray, shape (C,)
-        Mean dark signal above the stated black level and its uncertainty, in DN.
-    warnings : tuple of str
-    """
+    """Result of `estimate_crosstalk`: the matrix, the fit of every light, and what the user should know."""
 
     crosstalk: Crosstalk
     lights: tuple[LightFit, ...]
-    dark: FloatArray
-    dark_std: FloatArray
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,10 +121,9 @@ class _Dark:
 
 @dataclass(frozen=True, slots=True)
 class _Light:
-    """Captures of one light above dark, the blocks that are not saturated, and the channel that sees it best."""
+    """Captures of one light above dark (N, C, R, S), the unsaturated blocks, and the channel that sees it best."""
 
     name: str
-    captures: Sequence[BlockMeans]
     signal: FloatArray
     valid: BoolArray
     reference: int
@@ -179,32 +166,34 @@ def estimate_crosstalk(
         raise CalibrationError(f"the degree of the field is 0 to {LARGEST_ORDER}, not {order}")
     warnings = check_captures(lights, dark, allow=allow, labels=labels or {})
     like = next(iter(lights.values()))[0]
+    centres = block_centres(like.shape, like.block)
     offset = _dark_level(dark, like)
     prepared = [_prepare(name, captures, offset) for name, captures in lights.items()]
-    tests = [_variation(light, like) for light in prepared]
+    tests = [_variation(light, legendre_products(centres, like.shape, AUTOMATIC_ORDER)) for light in prepared]
     order = max(needed for needed, _ in tests) if order is None else order
-    design = legendre_products(block_centres(like.shape, like.block), like.shape, order)
+    design = legendre_products(centres, like.shape, order)
     columns = [fit_column(light.signal, light.valid, light.reference, design) for light in prepared]
     fits = tuple(
         _summary(light, column, test, design) for light, column, (_, test) in zip(prepared, columns, tests, strict=True)
     )
     warnings += check_matrix(fits, allow=allow)
-    return CrosstalkEstimate(
-        crosstalk=_assemble(tuple(lights), columns, offset, order, like.shape),
-        lights=fits,
-        dark=offset.level.mean(axis=(1, 2)),
-        dark_std=np.sqrt(np.diag(offset.mean_covariance)),
-        warnings=tuple(warnings),
+    matrices, covariance = np.stack([fit.coefficients for fit in columns], axis=-1), _covariance(columns, offset)
+    field, size = None, matrices[0].size
+    if order:
+        std = np.sqrt(np.einsum("tcktck->tck", covariance))
+        field = CrosstalkField(order=order, coefficients=matrices[1:], shape=like.shape, std=std[1:])
+    crosstalk = Crosstalk(
+        matrix=matrices[0], lights=tuple(lights), covariance=covariance[0, :, :, 0].reshape(size, size), field=field
     )
+    return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, warnings=tuple(warnings))
 
 
 def _dark_level(dark: Sequence[BlockMeans], like: BlockMeans) -> _Dark:
+    unknown = BLACK_LEVEL_STD**2 * np.eye(3)
     if not dark:
-        covariance = BLACK_LEVEL_STD**2 * np.eye(3)
-        return _Dark(np.zeros_like(like.channels), covariance, np.zeros((3, 3)))
+        return _Dark(np.zeros_like(like.channels), unknown, np.zeros((3, 3)))
     frames = np.stack([frame.channels for frame in dark])
-    known = len(frames) > 1
-    drift = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if known else BLACK_LEVEL_STD**2 * np.eye(3)
+    drift = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else unknown
     return _Dark(frames.mean(axis=0), drift / len(frames), drift)
 
 
@@ -217,12 +206,11 @@ def _prepare(name: str, captures: Sequence[BlockMeans], dark: _Dark) -> _Light:
             "shorten the exposure until none does"
         )
     reference = int(np.median(signal.transpose(0, 2, 3, 1)[valid], axis=0).argmax())
-    return _Light(name, captures, signal, valid, reference)
+    return _Light(name, signal, valid, reference)
 
 
-def _variation(light: _Light, like: BlockMeans) -> tuple[int, Variation]:
+def _variation(light: _Light, design: FloatArray) -> tuple[int, Variation]:
     """Degree that the light's captures ask for, and the test of all terms that are not constant."""
-    design = legendre_products(block_centres(like.shape, like.block), like.shape, AUTOMATIC_ORDER)
     needed, overall = 0, Variation(p_value=1.0, rms=0.0)
     for order in range(AUTOMATIC_ORDER):
         found = variation(light.signal, light.valid, light.reference, design, (order + 1) * (order + 2) // 2)
@@ -243,29 +231,13 @@ def _summary(light: _Light, fit: ColumnFit, found: Variation, design: FloatArray
         column=fit.coefficients[0],
         signal=float(fit.mass.sum() / count.sum()),
         used=float((fit.weights > 0).mean()),
-        saturated=float(1 - light.valid.mean()),
         rejected=float((light.valid & (fit.weights == 0)).mean()),
         intensity_drift=float(np.ptp(strength) / strength.mean()),
         colour_drift=float(np.sqrt(capture_scatter(fit).max())),
         offset=offset,
         offset_std=offset_std,
         variation=found,
-        captures=len(light.captures),
-    )
-
-
-def _assemble(
-    lights: tuple[str, ...], columns: Sequence[ColumnFit], dark: _Dark, order: int, shape: tuple[int, int]
-) -> Crosstalk:
-    matrices = np.stack([fit.coefficients for fit in columns], axis=-1)
-    covariance = _covariance(columns, dark)
-    field = None
-    if order:
-        std = np.sqrt(np.einsum("tcktck->tck", covariance))
-        field = CrosstalkField(order=order, coefficients=matrices[1:], shape=shape, std=std[1:])
-    size = matrices[0].size
-    return Crosstalk(
-        matrix=matrices[0], lights=lights, covariance=covariance[0, :, :, 0].reshape(size, size), field=field
+        captures=len(light.signal),
     )
 
 
@@ -294,10 +266,13 @@ def check_matrix(fits: Sequence[LightFit], *, allow: Sequence[str]) -> list[str]
     Raises
     ------
     CalibrationError
-        A light is seen best by another channel than its name says, or two by the same, and that is not waived.
+        A light is seen best by another channel than its name states, or two by the same, and that is not waived.
     """
-    for fit, expected in zip(fits, _expected_channels([fit.name for fit in fits]), strict=True):
-        if "name" not in allow and expected not in (None, fit.reference):
+    lower = [fit.name.lower() for fit in fits]
+    if all(name in (*COLOURS, "r", "g", "b") for name in lower):  # single letters count where all names are colours
+        lower = [COLOURS["rgb".index(name[0])] for name in lower]
+    for fit, name in zip(fits, lower, strict=True):
+        if "name" not in allow and name in COLOURS and name != COLOURS[fit.reference]:
             raise CalibrationError(
                 f"light {fit.name} is seen best by the {COLOURS[fit.reference]} channel: are the captures of two "
                 "lights swapped, or is the colour filter array (--cfa) another one? (--allow name goes on all the same)"
@@ -323,14 +298,6 @@ def check_matrix(fits: Sequence[LightFit], *, allow: Sequence[str]) -> list[str]
             "must be calibrated too"
         )
     return warnings
-
-
-def _expected_channels(names: Sequence[str]) -> list[int | None]:
-    """Channel that each name promises; single letters count only where all names are colours."""
-    lower = [name.lower() for name in names]
-    if all(name in (*COLOURS, "r", "g", "b") for name in lower):
-        return ["rgb".index(name[0]) for name in lower]
-    return [COLOURS.index(name) if name in COLOURS else None for name in lower]
 
 
 def _fit_warnings(fit: LightFit) -> list[str]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "COLOURS",
     "Design",
     "Lamp",
     "MeasuredLamp",
@@ -39,10 +38,8 @@ __all__ = [
     "design",
     "draw_calibration",
     "draw_design",
-    "draw_matrix",
     "read_camera",
     "read_lamp",
-    "save",
 ]
 
 COLOURS = ("#c0392b", "#27823b", "#2457a6", "#7d3c98")
@@ -127,7 +124,7 @@ def design(camera: Sensitivities, lamps: Mapping[str, Lamp]) -> Design:
     Raises
     ------
     CalibrationError
-        The camera cannot tell the lamps apart, or does not see one of them.
+        The camera cannot separate the lamps, or does not see one of them.
     """
     spectra = np.stack([lamp.power(camera.wavelengths) for lamp in lamps.values()], axis=1)
     response = camera.values @ spectra
@@ -144,7 +141,7 @@ def design(camera: Sensitivities, lamps: Mapping[str, Lamp]) -> Design:
 
 
 def best_sets(camera: Sensitivities, lamps: Mapping[str, Lamp], count: int = 3) -> list[Design]:
-    """All sets of `count` lamps that the camera can tell apart, those with the least noise first.
+    """All sets of `count` lamps that the camera can separate, those with the least noise first.
 
     Raises
     ------
@@ -157,10 +154,10 @@ def best_sets(camera: Sensitivities, lamps: Mapping[str, Lamp], count: int = 3) 
     for names in combinations(lamps, count):
         try:
             found.append(design(camera, {name: lamps[name] for name in names}))
-        except CalibrationError:  # a set that cannot be told apart is no candidate
+        except CalibrationError:  # a set that cannot be separated is no candidate
             continue
     if not found:
-        raise CalibrationError("the camera can tell no set of these lamps apart")
+        raise CalibrationError("the camera can separate no set of these lamps")
     return sorted(found, key=lambda candidate: candidate.noise)
 
 
@@ -184,7 +181,15 @@ def read_lamp(text: str) -> Lamp:
     if ".csv" in text.lower():
         wavelengths, columns = _read_table(text)
         return MeasuredLamp(wavelengths=wavelengths, values=columns[0])
-    return _lamp_of_colour(text)
+    import colour
+
+    known = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
+    if text not in known:
+        leds = ", ".join(sorted(key for key in known if "LED" in key))
+        raise ConfigurationError(
+            f"a lamp is CENTRE:WIDTH in nm, a CSV file, or a light source of colour-science ({leds} ...), not {text!r}"
+        )
+    return MeasuredLamp(wavelengths=known[text].wavelengths, values=known[text].values)
 
 
 def read_camera(text: str) -> Sensitivities:
@@ -200,25 +205,17 @@ def read_camera(text: str) -> Sensitivities:
     return Sensitivities.from_colour(text)
 
 
-def _lamp_of_colour(name: str) -> MeasuredLamp:
-    import colour
-
-    known = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
-    if name not in known:
-        leds = ", ".join(sorted(key for key in known if "LED" in key))
-        raise ConfigurationError(
-            f"a lamp is CENTRE:WIDTH in nm, a CSV file, or a light source of colour-science ({leds} ...), not {name!r}"
-        )
-    return MeasuredLamp(wavelengths=known[name].wavelengths, values=known[name].values)
-
-
 def _read_table(text: str, endings: Sequence[str] = ("",)) -> tuple[FloatArray, FloatArray]:
     """Wavelengths and the columns that a text FILE.csv#NAME means, shape (columns, n)."""
     file, _, column = text.partition("#")
     try:
         with regular(Path(file)).open(newline="", encoding="utf-8") as stream:
             rows = [row for row in csv.reader(stream) if row]
-        head = [] if _is_number(rows[0][0]) else [cell.strip() for cell in rows.pop(0)]
+        try:
+            float(rows[0][0])
+            head = []
+        except ValueError:
+            head = [cell.strip() for cell in rows.pop(0)]
         table = np.array(rows, dtype=np.float64).T
     except FileNotFoundError:
         raise ConfigurationError(f"file of spectra not found: {file}") from None
@@ -234,14 +231,6 @@ def _read_table(text: str, endings: Sequence[str] = ("",)) -> tuple[FloatArray, 
     return table[0], table[[head.index(name) for name in names] if column else [1]]
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def draw_calibration(calibration: Calibration, path: Path) -> None:
     """Draw every section of a calibration into one picture file.
 
@@ -252,7 +241,7 @@ def draw_calibration(calibration: Calibration, path: Path) -> None:
     """
     panels: list[Callable[[Axes], None]] = []
     if (crosstalk := calibration.crosstalk) is not None:
-        panels.append(lambda axes: draw_matrix(axes, crosstalk))
+        panels.append(lambda axes: _draw_matrix(axes, crosstalk))
         if crosstalk.field is not None:
             panels.append(lambda axes: _draw_field(axes, crosstalk))
     if (noise := calibration.camera_noise) is not None:
@@ -261,10 +250,10 @@ def draw_calibration(calibration: Calibration, path: Path) -> None:
         panels.append(lambda axes: _draw_registration(axes, registration))
     if not panels:
         raise CalibrationError("the calibration has nothing to draw")
-    save(panels, path)
+    _save(panels, path)
 
 
-def save(panels: list[Callable[[Axes], None]], path: Path) -> None:
+def _save(panels: list[Callable[[Axes], None]], path: Path) -> None:
     """Draw panels side by side into a file.
 
     Raises
@@ -272,18 +261,20 @@ def save(panels: list[Callable[[Axes], None]], path: Path) -> None:
     CalibrationError
         The file cannot be written in the format of its ending.
     """
+    import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    figure: Figure = Figure(figsize=(5 * len(panels), 4.4), layout="constrained")
-    for draw, axes in zip(panels, np.atleast_1d(figure.subplots(1, len(panels))), strict=True):
-        draw(axes)
     try:
-        figure.savefig(path, dpi=130)
+        with mpl.rc_context({"axes.titlesize": "medium"}):
+            figure: Figure = Figure(figsize=(5 * len(panels), 4.4), layout="constrained")
+            for draw, axes in zip(panels, np.atleast_1d(figure.subplots(1, len(panels))), strict=True):
+                draw(axes)
+            figure.savefig(path, dpi=130)
     except (OSError, ValueError) as error:
         raise CalibrationError(f"the picture {path} cannot be written: {error}") from None
 
 
-def draw_matrix(axes: Axes, crosstalk: Crosstalk) -> None:
+def _draw_matrix(axes: Axes, crosstalk: Crosstalk) -> None:
     """The crosstalk matrix as a coloured table."""
     matrix = crosstalk.matrix
     axes.imshow(matrix, cmap="Greys", vmin=0, vmax=1.4)
@@ -291,8 +282,8 @@ def draw_matrix(axes: Axes, crosstalk: Crosstalk) -> None:
         axes.text(column, row, f"{value:.3f}", ha="center", va="center", color="w" if value > 0.8 else "k")
     axes.set_xticks(range(len(crosstalk.lights)), list(map(literal, crosstalk.lights)))
     axes.set_yticks(range(len(matrix)), CHANNELS[: len(matrix)])
-    axes.set(xlabel="light", ylabel="camera channel")
-    axes.set_title(f"crosstalk A, condition number {crosstalk.condition_number:.2f}", fontsize="medium")
+    title = f"crosstalk A, condition number {crosstalk.condition_number:.2f}"
+    axes.set(xlabel="light", ylabel="camera channel", title=title)
 
 
 def _draw_field(axes: Axes, crosstalk: Crosstalk) -> None:
@@ -304,8 +295,8 @@ def _draw_field(axes: Axes, crosstalk: Crosstalk) -> None:
     row, column = np.unravel_index(np.ptp(values, axis=(0, 1)).argmax(), crosstalk.matrix.shape)
     image = axes.imshow(values[..., row, column], extent=(0, width, height, 0), cmap="viridis")
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
-    axes.set(xlabel="x, px", ylabel="y, px")
-    axes.set_title(f"{CHANNELS[row]} seen of {literal(crosstalk.lights[column])}", fontsize="medium")
+    title = f"{CHANNELS[row]} seen of {literal(crosstalk.lights[column])}"
+    axes.set(xlabel="x, px", ylabel="y, px", title=title)
 
 
 def _draw_noise(axes: Axes, noise: CameraNoise) -> None:
@@ -315,8 +306,7 @@ def _draw_noise(axes: Axes, noise: CameraNoise) -> None:
         std = np.sqrt(noise.read_noise.value[index] ** 2 + level / noise.gain.value[index])
         colour = COLOURS["RGB".find(plane[0])] if plane[0] in "RGB" else "k"
         axes.loglog(level, std, color=colour, ls="--" if plane == "G2" else "-", label=plane)
-    axes.set(xlabel="grey level above black, DN", ylabel="noise of one sample, DN")
-    axes.set_title("camera noise", fontsize="medium")
+    axes.set(xlabel="grey level above black, DN", ylabel="noise of one sample, DN", title="camera noise")
     axes.legend()
     axes.grid(alpha=0.3)
 
@@ -328,15 +318,15 @@ def _draw_registration(axes: Axes, registration: Registration) -> None:
     moved = registration.displacement(points)
     largest = max(float(np.abs(moved).max()), 1e-6)
     for index, name in enumerate(registration.lights[1:], start=1):
-        u, v = moved[index].T * 0.1 * radius / largest
-        colour = COLOURS[index % len(COLOURS)]
-        axes.quiver(
-            points[:, 0], points[:, 1], u, v, color=colour, angles="xy", scale_units="xy", scale=1, label=literal(name)
-        )
-    axes.set(xlabel="x, px", ylabel="y, px", xlim=(-0.1 * x, 2.1 * x), ylim=(2.1 * y, -0.1 * y), aspect="equal")
-    axes.set_title(
-        f"seen elsewhere than by {literal(registration.lights[0])}, up to {largest:.2f} px", fontsize="medium"
-    )
+        look: dict[str, Any] = {
+            "color": COLOURS[index % len(COLOURS)],
+            "label": literal(name),
+            "scale": 10 * largest / radius,
+        }
+        axes.quiver(*points.T, *moved[index].T, angles="xy", scale_units="xy", **look)
+    title = f"seen elsewhere than by {literal(registration.lights[0])}, up to {largest:.2f} px"
+    axes.set(xlabel="x, px", ylabel="y, px", title=title)
+    axes.set(xlim=(-0.1 * x, 2.1 * x), ylim=(2.1 * y, -0.1 * y), aspect="equal")
     axes.legend(fontsize="small")
 
 
@@ -353,4 +343,4 @@ def draw_design(result: Design, camera: Sensitivities, lamps: Mapping[str, Lamp]
         axes.set(xlabel="wavelength, nm", ylabel="relative")
         axes.legend(fontsize="small")
 
-    save([spectra, lambda axes: draw_matrix(axes, result.crosstalk)], path)
+    _save([spectra, lambda axes: _draw_matrix(axes, result.crosstalk)], path)

@@ -5,88 +5,48 @@ Noise, crosstalk and registration are often measured on different days, hence th
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import rgbmidic
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import unevenness
 from rgbmidic.settings import FrameSettings
-from rgbmidic_calibration.captures import CaptureFiles, provenance, stack_frames
+from rgbmidic_calibration.captures import CaptureFiles, Captures, stack_frames
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
 from rgbmidic_calibration.ratio import BlockMeans, block_means
 from rgbmidic_calibration.registration import ELEMENT, RegistrationEstimate, estimate_registration
 
-__all__ = [
-    "calibrate_crosstalk",
-    "calibrate_noise",
-    "calibrate_registration",
-    "captures_as_stated",
-    "field_order",
-    "find_groups",
-    "merge_files",
-]
+__all__ = ["calibrate_crosstalk", "calibrate_noise", "calibrate_registration", "merge_files"]
 
 LIT = 0.1
 """Mean above black, relative to the full scale, of a plane whose histogram is looked at: in the dark, noise is too
 little to smooth it. Some cameras apply gains of their own to red and blue, so all planes are."""
 
 
-def captures_as_stated(statement: Mapping[str, Any]) -> FrameSettings:
-    """Settings of the captures as options state them (`rgbmidic.command.read_statement`).
-
-    Raises
-    ------
-    ConfigurationError
-        An option has a value that is not allowed; the option is named.
-    """
-    try:
-        return FrameSettings(path=("captures",), **statement)
-    except ConfigurationError as error:
-        as_options = re.sub(r"frames\.(\w+)", lambda key: "--" + key[1].replace("_", "-"), str(error))
-        raise ConfigurationError(as_options) from None
-
-
-def field_order(text: str) -> int | None:
-    """Degree that ``--field`` states; None for ``auto``."""
-    if text == "auto":
-        return None
-    if not text.isdecimal():
-        raise ConfigurationError(f"--field is auto or a degree from 0, not {text!r}")
-    return int(text)
-
-
-def find_groups(
-    lights: Mapping[str, str], dark: str | None, stated: FrameSettings
-) -> tuple[dict[str, CaptureFiles], CaptureFiles | None]:
-    """Files of every light and of the dark frames."""
-    found = {name: CaptureFiles.find(f"light {name}", pattern, stated) for name, pattern in lights.items()}
-    return found, None if dark is None else CaptureFiles.find("dark", dark, stated)
-
-
 def calibrate_crosstalk(
-    lights: Mapping[str, str],
-    dark: str | None,
-    stated: FrameSettings,
-    *,
-    block: int = 16,
-    order: int | None = None,
-    allow: Sequence[str] = (),
+    captures: Captures, *, block: int = 16, order: int | None = None, allow: Sequence[str] = ()
 ) -> tuple[Calibration, CrosstalkEstimate]:
-    """Crosstalk section from capture files: patterns by light, pattern of the dark frames, what is stated of them."""
-    found, dark_files = find_groups(lights, dark, stated)
+    """Crosstalk section from capture files; `order` and `allow` as in `estimate_crosstalk`, blocks of `block` px."""
     uneven: list[float] = []
-    means = {name: _reduce(files, block, uneven) for name, files in found.items()}
-    dark_means = _reduce(dark_files, block, uneven) if dark_files else []
-    groups = [*found.values(), *([dark_files] if dark_files else [])]
-    labels = {group.role.removeprefix("light "): group.labels for group in groups}
-    estimate = estimate_crosstalk(means, dark_means, order=order, allow=allow, labels=labels)
+
+    def reduced(files: CaptureFiles | None) -> list[BlockMeans]:
+        means = []
+        for frame in files.frames() if files else ():
+            uneven.extend(_unevenness(frame))
+            means.append(block_means(frame, block=block))
+        return means
+
+    means = {name: reduced(files) for name, files in captures.lights.items()}
+    labels = {group.role.removeprefix("light "): group.labels for group in captures.groups}
+    estimate = estimate_crosstalk(means, reduced(captures.dark), order=order, allow=allow, labels=labels)
     details = {
         "block": block,
         "waived_checks": list(allow),
@@ -95,12 +55,7 @@ def calibrate_crosstalk(
             fit.name: {"p_value": fit.variation.p_value, "rms": fit.variation.rms} for fit in estimate.lights
         },
     }
-    calibration = Calibration(
-        crosstalk=estimate.crosstalk,
-        provenance={"crosstalk": provenance("crosstalk", groups, details)},
-        **_camera(groups[0], uneven),
-    )
-    return calibration, estimate
+    return _calibration("crosstalk", captures.groups, uneven, details, crosstalk=estimate.crosstalk), estimate
 
 
 def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
@@ -117,55 +72,39 @@ def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> t
         What is stated of the files.
     """
     dark_files = CaptureFiles.find("dark", dark, stated)
-    groups = [group for text in flats for group in _exposures(text, stated)]
+    exposures: list[tuple[CaptureFiles, float | None]] = []
+    for text in flats:
+        time, separator, pattern = text.partition("=")
+        if not separator:
+            exposures += [(files, None) for files in CaptureFiles.find(f"flat {text}", text, stated).by_folder()]
+            continue
+        try:
+            seconds = float(time)
+        except ValueError:
+            raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
+        exposures.append((CaptureFiles.find(f"flat exposure {time}", pattern, stated), seconds))
     dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames")
-    stacks = [stack_frames(files.frames(), exposure=time, name=files.role) for files, time in groups]
+    stacks = [stack_frames(files.frames(), exposure=time, name=files.role) for files, time in exposures]
     estimate = photon_transfer(dark_stack, stacks)
-    all_files = [dark_files, *(files for files, _ in groups)]
-    details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in groups]}
-    uneven = [value for files, _ in groups for value in _unevenness(next(files.frames()))]
-    return Calibration(
-        camera_noise=estimate.camera_noise,
-        provenance={"noise": provenance("noise", all_files, details)},
-        **_camera(dark_files, uneven),
-    ), estimate
+    groups = [dark_files, *(files for files, _ in exposures)]
+    uneven = [value for files in groups[1:] for value in _unevenness(next(files.frames()))]
+    details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in exposures]}
+    return _calibration("noise", groups, uneven, details, camera_noise=estimate.camera_noise), estimate
 
 
 def calibrate_registration(
-    lights: Mapping[str, str],
-    dark: str | None,
-    stated: FrameSettings,
-    *,
-    region: Sequence[float] | None = None,
-    element_size: float = ELEMENT,
+    captures: Captures, *, region: Sequence[float] | None = None, element_size: float = ELEMENT
 ) -> tuple[Calibration, RegistrationEstimate]:
-    """Registration section from capture files of a speckled target: patterns by light, the first is the reference."""
-    found, dark_files = find_groups(lights, dark, stated)
-    dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames") if dark_files else None
-    stacks = {name: stack_frames(files.frames(), name=files.role) for name, files in found.items()}
-    estimate = estimate_registration(stacks, dark_stack, region=region, element_size=element_size)
-    groups = [*found.values(), *([dark_files] if dark_files else [])]
+    """Registration section from captures of a speckled target; the first light is the reference."""
+    estimate = estimate_registration(*captures.stacks(), region=region, element_size=element_size)
+    uneven = [value for files in captures.lights.values() for value in _unevenness(next(files.frames()))]
     details = {
         "warnings": list(estimate.warnings),
         "region": None if region is None else list(region),
         "element_size": element_size,
         "residual_rms_px": {match.name: match.rms for match in estimate.matches},
     }
-    return Calibration(
-        registration=estimate.registration,
-        provenance={"registration": provenance("registration", groups, details)},
-        **_camera(groups[0], [value for files in found.values() for value in _unevenness(next(files.frames()))]),
-    ), estimate
-
-
-def _exposures(text: str, stated: FrameSettings) -> list[tuple[CaptureFiles, float | None]]:
-    time, separator, pattern = text.partition("=")
-    if separator:
-        try:
-            return [(CaptureFiles.find(f"flat exposure {time}", pattern, stated), float(time))]
-        except ValueError:
-            raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
-    return [(files, None) for files in CaptureFiles.find(f"flat {text}", text, stated).by_folder()]
+    return _calibration("registration", captures.groups, uneven, details, registration=estimate.registration), estimate
 
 
 def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
@@ -177,31 +116,40 @@ def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
     return [value for value in found if np.isfinite(value)]
 
 
-def _camera(files: CaptureFiles, uneven: Sequence[float]) -> dict[str, Any]:
-    """Camera settings of a calibration, from the first of its frames, and how even the grey levels of lit ones are.
+def _calibration(
+    section: str, groups: Sequence[CaptureFiles], uneven: Sequence[float], details: Mapping[str, Any], **found: Any
+) -> Calibration:
+    """A calibration of one section, with the camera's settings and where it comes from: date, version, input files.
 
-    Levels that neither the file nor the user states stay open.
+    The settings are those of the first frame; levels that neither the file nor the user states stay open.
     """
+    files = groups[0]
     header, frame = files.series.lights[0][0].stored(0), next(files.frames())
-    levels = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
-    stated = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
-    kind = "bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome"
-    return {
-        "kind": kind,
-        "unevenness": max(uneven, default=None),
-        "cfa": frame.cfa if isinstance(frame, Mosaic) else None,
-        **{name: level for name, level in levels.items() if name in stated},
-        "shape": (frame.values.shape[-2], frame.values.shape[-1]),
+    levels: dict[str, Any] = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
+    known = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
+    names = ("kind", "cfa", "black_level", "white_level", "shape", "dtype")
+    stated = {name: getattr(files.stated, name) for name in names}
+    provenance = {
+        "command": f"rgbmidic-calibrate {section}",
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "version": rgbmidic.__version__,
+        "stated": {name: value for name, value in stated.items() if value is not None},
+        "inputs": [
+            {"role": group.role, "file": path, "sha256": fingerprint}
+            for group in groups
+            for path, fingerprint in group.fingerprints.items()
+        ],
+        **details,
     }
-
-
-def _reduce(files: CaptureFiles, block: int, uneven: list[float]) -> list[BlockMeans]:
-    """Block averages of every file; how uneven the grey levels of each are is added to `uneven`."""
-    means = []
-    for frame in files.frames():
-        uneven += _unevenness(frame)
-        means.append(block_means(frame, block=block))
-    return means
+    return Calibration(
+        **found,
+        provenance={section: provenance},
+        kind="bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome",
+        cfa=frame.cfa if isinstance(frame, Mosaic) else None,
+        shape=(frame.values.shape[-2], frame.values.shape[-1]),
+        unevenness=max(uneven, default=None),
+        **{name: level for name, level in levels.items() if name in known},
+    )
 
 
 SECTIONS = ("crosstalk", "camera_noise", "noise", "registration")

@@ -31,13 +31,13 @@ from rgbmidic.typing import BoolArray, FloatArray
 __all__ = [
     "BlockMeans",
     "ColumnFit",
+    "Sampling",
     "Variation",
     "block_centres",
     "block_means",
     "capture_scatter",
     "fit_column",
     "offsets_left",
-    "plane_origins",
     "saturation_pile",
     "variation",
 ]
@@ -84,12 +84,49 @@ class BlockMeans:
         return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
 
 
-def plane_origins(frame: Mosaic | ChannelFrame) -> tuple[tuple[int, int], ...]:
-    """Row and column of the first sample of every plane of `rgbmidic.frames.data.planes_of`."""
-    if isinstance(frame, ChannelFrame):
-        return ((0, 0),) * len(frame.values)
-    order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
-    return tuple((int(position) // 2, int(position) % 2) for position in order)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sampling:
+    """How a camera samples its frames.
+
+    Attributes
+    ----------
+    names : tuple of str, length P
+        Colour planes: R, G1, G2, B; R, G, B; or M.
+    shape : tuple of int
+        Rows and columns of the frames.
+    black : tuple of float, length P
+        Stated black levels (DN).
+    white : float
+        White level (DN).
+    origins : tuple of (int, int), length P
+        Row and column of each plane's first sample.
+    step : int
+        Distance of a plane's samples in the frame, px: 2 for a mosaic.
+    """
+
+    names: tuple[str, ...]
+    shape: tuple[int, int]
+    black: tuple[float, ...]
+    white: float
+    origins: tuple[tuple[int, int], ...]
+    step: int
+
+    @classmethod
+    def of(cls, frame: Mosaic | ChannelFrame) -> Sampling:
+        """How the camera of a frame samples."""
+        names, _, black = planes_of(frame)
+        origins, step = ((0, 0),) * len(names), 1
+        if isinstance(frame, Mosaic):
+            order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
+            origins, step = tuple((int(position) // 2, int(position) % 2) for position in order), 2
+        shape = frame.values.shape[-2], frame.values.shape[-1]
+        return cls(
+            names=names, shape=shape, black=tuple(black.tolist()), white=frame.white_level, origins=origins, step=step
+        )
+
+    def __str__(self) -> str:
+        planes = " ".join(self.names)
+        return f"{self.shape[1]} x {self.shape[0]} px with planes {planes} and white level {self.white:g}"
 
 
 def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
@@ -108,7 +145,8 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
         The frame is monochrome, or too small for 3 x 3 blocks.
     """
     names, planes, black = planes_of(frame)
-    shape = frame.values.shape[-2], frame.values.shape[-1]
+    camera = Sampling.of(frame)
+    shape, step = camera.shape, camera.step
     if names == ("M",):
         raise CalibrationError("a monochrome frame has no colour channels: there is no crosstalk to calibrate")
     if block < 2 or block % 2:
@@ -118,12 +156,10 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
             f"frames of {shape[1]} x {shape[0]} px are too small for calibration in blocks of {block} px "
             f"(at least {3 * block + 4} px on each side)"
         )
-    offsets = plane_origins(frame)
-    step = 2 if isinstance(frame, Mosaic) else 1
     means = [
         _window(shape[0], len(plane), block, step, row) @ plane @ _window(shape[1], plane.shape[1], block, step, col).T
         - dark
-        for plane, dark, (row, col) in zip(planes, black, offsets, strict=True)
+        for plane, dark, (row, col) in zip(planes, black, camera.origins, strict=True)
     ]
     stack = np.stack(means)
     brightest = int(stack.mean(axis=(1, 2)).argmax())

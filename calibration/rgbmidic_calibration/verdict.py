@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.settings import FrameSettings
-from rgbmidic_calibration.captures import CaptureFiles, TemporalStack, stack_frames
+from rgbmidic_calibration.captures import Captures, stack_frames
 from rgbmidic_calibration.ratio import block_means
 from rgbmidic_calibration.verify import (
     Additivity,
@@ -39,75 +37,73 @@ class Verdict:
         return all(item.passed for item in self.items)
 
 
-@dataclass(frozen=True, slots=True)
-class _Captures:
-    lights: dict[str, CaptureFiles]
-    together: dict[str, CaptureFiles]
-    dark: CaptureFiles | None
-
-    def groups(self) -> Iterator[CaptureFiles]:
-        yield from self.lights.values()
-        yield from self.together.values()
-        if self.dark is not None:
-            yield self.dark
-
-
 def check_calibration(
-    path: Path,
-    lights: Mapping[str, str],
-    dark: str | None,
-    together: Mapping[str, str],
-    stated: FrameSettings,
+    calibration: Calibration,
+    captures: Captures,
     *,
     limits: Limits | None = None,
     region: Sequence[float] | None = None,
 ) -> Verdict:
-    """Check a calibration file on captures that were not used to make it.
+    """Check a calibration on captures that were not used to make it.
 
     Parameters
     ----------
-    path
-        Calibration file.
-    lights
-        Patterns of the captures with one light on, by light.
-    dark
-        Pattern of the dark frames.
-    together
-        Patterns of captures with several lights on, by the lights' names joined by ``+``.
-    stated
-        What is stated of the files; it, the files and the calibration must agree, and the calibration fills in what
-        neither states.
+    calibration
+        The calibration under test.
+    captures
+        Found with the calibration, which fills in what neither the files nor the user states (`Captures.find`).
     limits
         What may be left.
     region
         Rectangle of the speckled target for the registration, px.
+
+    Raises
+    ------
+    CalibrationError
+        The calibration has no crosstalk, or captures cannot be compared with it.
     """
     limits = limits or Limits()
-    calibration = Calibration.read(path)
-    files = _find(lights, dark, together, stated, calibration)
-    calibration = calibration.cropped(None, next(iter(files.lights.values())).series.shape)
-    warnings, skipped = _reused(calibration, files), []
-    dark_stack = stack_frames(files.dark.frames(), drifts=False, name="the dark frames") if files.dark else None
-    stacks = {name: stack_frames(group.frames(), name=group.role) for name, group in files.lights.items()}
+    if not captures.lights:
+        raise ConfigurationError("check needs captures with one light on: --light NAME=FILES")
+    calibration = calibration.cropped(None, next(iter(captures.lights.values())).series.shape)
     if calibration.crosstalk is None:
         raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
-    means = {name: [block_means(frame) for frame in group.frames()] for name, group in files.lights.items()}
-    dark_means = [block_means(frame) for frame in files.dark.frames()] if files.dark else []
+    warnings, skipped = _reused(calibration, captures), []
+    stacks, dark = captures.stacks()
+    means = {name: [block_means(frame) for frame in files.frames()] for name, files in captures.lights.items()}
+    dark_means = [block_means(frame) for frame in captures.dark.frames()] if captures.dark else []
     items = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage)
     sums = []
-    for names, group in files.together.items():
+    for names, files in captures.together.items():
+        together = stack_frames(files.frames(), name=files.role)
         singles = {name: stacks[name] for name in names.split("+")}
-        together_stack = stack_frames(group.frames(), name=group.role)
-        sums.append(additivity(together_stack, singles, dark_stack, noise=calibration.noise))
+        sums.append(additivity(together, singles, dark, noise=calibration.noise))
     items += [item for total in sums for item in total.items(limits)]
-    for name, check in (("noise", _noise_items), ("registration", _registration_items)):
+
+    def noise() -> list[CheckItem]:
+        if calibration.noise is None:
+            raise CalibrationError("the calibration has no noise section")
+        ratios = {name: noise_ratio(stack, calibration.noise) for name, stack in stacks.items()}
+        return [
+            CheckItem(f"noise of {name} against prediction", 100 * (ratio - 1), 100 * std, limits.noise, "%")
+            for name, (ratio, std) in ratios.items()
+        ]
+
+    def registration() -> list[CheckItem]:
+        if calibration.registration is None:
+            raise CalibrationError("the calibration has no registration section")
+        left = registration_left(calibration.registration, stacks, dark, region=region)
+        limit = limits.registration
+        return [CheckItem(f"registration of {name}", value, std, limit, "px") for name, value, std in left]
+
+    for check in (noise, registration):
         try:
-            items += check(calibration, stacks, dark_stack, limits, region)
+            items += check()
         except CalibrationError as error:
-            skipped.append(f"{name} was not checked: {error}")
-    if dark_stack is None:
+            skipped.append(f"{check.__name__} was not checked: {error}")
+    if dark is None:
         warnings.append("no dark frames: the stated black level is taken for the dark level")
-    if not together:
+    if not captures.together:
         skipped.append("additivity was not checked: no captures with lights together (--together)")
     return Verdict(items=tuple(items), sums=tuple(sums), skipped=tuple(skipped), warnings=tuple(warnings))
 
@@ -135,78 +131,16 @@ def read_limits(options: Sequence[str]) -> Limits:
     return limits
 
 
-def _find(
-    lights: Mapping[str, str],
-    dark: str | None,
-    together: Mapping[str, str],
-    stated: FrameSettings,
-    calibration: Calibration,
-) -> _Captures:
-    def find(role: str, pattern: str) -> CaptureFiles:
-        return CaptureFiles.find(role, pattern, stated, calibration)
-
-    if not lights:
-        raise ConfigurationError("check needs captures with one light on: --light NAME=FILES")
-    found = {name: find(f"light {name}", pattern) for name, pattern in lights.items()}
-    for names in together:
-        if missing := [name for name in names.split("+") if name not in found]:
-            raise ConfigurationError(
-                f"--together {names} needs the single captures of {', '.join(missing)} too (--light)"
-            )
-        if "+" not in names:
-            raise ConfigurationError(f"--together takes NAME+NAME=FILES, at least two lights, not {names}")
-    return _Captures(
-        found,
-        {names: find(f"lights {names}", pattern) for names, pattern in together.items()},
-        find("dark", dark) if dark else None,
-    )
-
-
-def _reused(calibration: Calibration, files: _Captures) -> list[str]:
+def _reused(calibration: Calibration, captures: Captures) -> list[str]:
     known = {
         entry.get("sha256")
         for origin in calibration.provenance.values()
         if isinstance(origin, Mapping)
         for entry in origin.get("inputs", ())
     }
-    groups = (*files.lights.values(), *files.together.values())
+    groups = (*captures.lights.values(), *captures.together.values())
     reused = [path for group in groups for path, fingerprint in group.fingerprints.items() if fingerprint in known]
     if not reused:
         return []
     made = f"{len(reused)} of these captures made the calibration ({reused[0]} ...)"
     return [f"{made}: they always agree; a check needs others"]
-
-
-def _noise_items(
-    calibration: Calibration,
-    stacks: Mapping[str, TemporalStack],
-    dark: TemporalStack | None,
-    limits: Limits,
-    region: Sequence[float] | None,
-) -> list[CheckItem]:
-    if calibration.noise is None:
-        raise CalibrationError("the calibration has no noise section")
-    items = []
-    for name, stack in stacks.items():
-        ratio, std = noise_ratio(stack, calibration.noise)
-        value, error = 100 * (ratio - 1), 100 * std
-        items.append(
-            CheckItem(name=f"noise of {name} against prediction", value=value, std=error, limit=limits.noise, unit="%")
-        )
-    return items
-
-
-def _registration_items(
-    calibration: Calibration,
-    stacks: Mapping[str, TemporalStack],
-    dark: TemporalStack | None,
-    limits: Limits,
-    region: Sequence[float] | None,
-) -> list[CheckItem]:
-    if calibration.registration is None:
-        raise CalibrationError("the calibration has no registration section")
-    left = registration_left(calibration.registration, stacks, dark, region=region)
-    return [
-        CheckItem(name=f"registration of {name}", value=value, std=std, limit=limits.registration, unit="px")
-        for name, value, std in left
-    ]

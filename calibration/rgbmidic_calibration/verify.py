@@ -17,16 +17,7 @@ from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile
 from rgbmidic_calibration.ratio import BlockMeans, block_centres
 from rgbmidic_calibration.registration import estimate_registration
 
-__all__ = [
-    "Additivity",
-    "CheckItem",
-    "Leakage",
-    "Limits",
-    "additivity",
-    "leakage",
-    "noise_ratio",
-    "registration_left",
-]
+__all__ = ["Additivity", "CheckItem", "Leakage", "Limits", "additivity", "leakage", "noise_ratio", "registration_left"]
 
 
 SAME_EXPOSURE = 0.05
@@ -60,7 +51,7 @@ class Limits:
     noise: float = 10.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class CheckItem:
     """One line of the verdict: a figure, its uncertainty and its limit, all in `unit`."""
 
@@ -88,26 +79,18 @@ class Leakage:
         Lights that were captured alone.
     mean, std : ndarray, shape (k, m)
         Ratio of the sums over the field, and its standard uncertainty; the light itself gives 1.
-    local : ndarray, shape (k, m)
-        Root mean square over the blocks of the ratio to the light's mean.
     """
 
     lights: tuple[str, ...]
     alone: tuple[str, ...]
     mean: FloatArray
     std: FloatArray
-    local: FloatArray
 
     def items(self, limit: float) -> list[CheckItem]:
         """One line per pair of lights."""
+        mean, std = 100 * self.mean, 100 * self.std
         return [
-            CheckItem(
-                name=f"{alone} left in {light}",
-                value=100 * float(self.mean[row, column]),
-                std=100 * float(self.std[row, column]),
-                limit=limit,
-                unit="%",
-            )
+            CheckItem(f"{alone} left in {light}", float(mean[row, column]), float(std[row, column]), limit, "%")
             for column, alone in enumerate(self.alone)
             for row, light in enumerate(self.lights)
             if light != alone
@@ -139,14 +122,14 @@ def leakage(
         )
     level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
     columns = [_unmixed(crosstalk, name, captures, level) for name, captures in lights.items()]
-    mean, std, local = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
-    return Leakage(lights=crosstalk.lights, alone=tuple(lights), mean=mean, std=std, local=local)
+    mean, std = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
+    return Leakage(lights=crosstalk.lights, alone=tuple(lights), mean=mean, std=std)
 
 
 def _unmixed(
     crosstalk: Crosstalk, name: str, captures: Sequence[BlockMeans], level: npt.NDArray[np.floating] | np.float64
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Ratios (k,) of every light's sum to that of light `name`, their uncertainty and their local spread."""
+) -> tuple[FloatArray, FloatArray]:
+    """Ratios (k,) of every light's sum to that of light `name`, and their uncertainty."""
     first = captures[0]
     clear = ~np.any([frame.saturated for frame in captures], axis=0)
     if clear.sum() < 4:
@@ -164,9 +147,7 @@ def _unmixed(
         )
     ratio = values.sum(axis=1) / total
     scatter = values - ratio[:, None] * values[lit]
-    std = np.sqrt((scatter**2).sum(axis=1)) / total
-    local = np.sqrt(((values / values[lit].mean()) ** 2).mean(axis=1))
-    return ratio, std, local
+    return ratio, np.sqrt((scatter**2).sum(axis=1)) / total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,8 +168,6 @@ class Additivity:
         Relative change of every light's strength between its own and the common capture.
     left : float
         Rms over tiles of what remains, as a fraction of the mean signal, noise taken out.
-    signal : float
-        Mean of the sum, DN.
     """
 
     lights: tuple[str, ...]
@@ -199,24 +178,14 @@ class Additivity:
     change: FloatArray
     change_std: FloatArray
     left: float
-    signal: float
 
     def items(self, limits: Limits) -> list[CheckItem]:
         """Lines of the verdict."""
         together = "+".join(self.lights)
-        items = [
-            CheckItem(name=f"{together} not the sum", value=100 * self.left, std=0.0, limit=limits.additivity, unit="%")
-        ]
-        for name, change, std in zip(self.lights, self.change, self.change_std, strict=True):
-            items.append(
-                CheckItem(
-                    name=f"strength of {name} in {together}",
-                    value=100 * float(change),
-                    std=100 * float(std),
-                    limit=limits.strength,
-                    unit="%",
-                )
-            )
+        items = [CheckItem(f"{together} not the sum", 100 * self.left, 0.0, limits.additivity, "%")]
+        for name, *figure in zip(self.lights, self.change.tolist(), self.change_std.tolist(), strict=True):
+            change, std = (100 * value for value in figure)
+            items.append(CheckItem(f"strength of {name} in {together}", change, std, limits.strength, "%"))
         return items
 
 
@@ -244,7 +213,7 @@ def additivity(
         Camera noise; None: from the captures where each group has two or more, else rounding to grey levels alone.
     """
     same_camera([together, *singles.values(), *([dark] if dark else [])])
-    images = [_difference(together, singles, dark, plane, noise) for plane in range(len(together.names))]
+    images = [_difference(together, singles, dark, plane, noise) for plane in range(len(together.camera.names))]
     samples = np.concatenate([image[:, np.isfinite(image[0])] for image in images], axis=1)
     if samples.shape[1] < TILE**2:
         raise CalibrationError("nearly every sample is saturated in one of the captures; shorten the exposure")
@@ -268,7 +237,6 @@ def additivity(
         change=solution[1:],
         change_std=std[1:],
         left=float(np.sqrt(left)) / max(signal, 1e-9),
-        signal=signal,
     )
 
 
@@ -327,21 +295,16 @@ def registration_left(
     """
     ordered = {name: lights[name] for name in registration.lights if name in lights}
     found = estimate_registration(ordered, dark, region=region).registration
-    height, width = next(iter(ordered.values())).shape
+    height, width = next(iter(ordered.values())).camera.shape
     x0, y0, x1, y1 = region if region is not None else (0, 0, width - 1, height - 1)
     grid = np.stack(np.meshgrid(np.linspace(x0, x1, 9), np.linspace(y0, y1, 9)), axis=-1).reshape(-1, 2)
     known = registration.displacement(grid)[[registration.lights.index(name) for name in ordered]]
     # The first of the captured lights need not be the calibration's first.
     left = np.linalg.norm(found.displacement(grid) - (known - known[0]), axis=2)
     std = found.displacement_std(grid)
-    places = left.argmax(axis=1)
-    errors = (
-        np.zeros(len(left)) if std is None else [float(np.linalg.norm(s[p])) for s, p in zip(std, places, strict=True)]
-    )
-    return [
-        (name, float(value.max()), float(error))
-        for name, value, error in list(zip(ordered, left, errors, strict=True))[1:]
-    ]
+    errors = np.zeros_like(left) if std is None else np.linalg.norm(std, axis=2)
+    worst = [(float(row.max()), float(error[row.argmax()])) for row, error in zip(left, errors, strict=True)]
+    return [(name, *figures) for name, figures in list(zip(ordered, worst, strict=True))[1:]]
 
 
 def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:

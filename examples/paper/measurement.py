@@ -23,7 +23,7 @@ from rgbmidic.illumination import IlluminationImages
 from rgbmidic.lab.measures import Goniometry, area_means, area_stds, residual_percent
 from rgbmidic.pipeline import correlated
 from rgbmidic.settings import ELEMENT_SIZE, IlluminationSettings, SolverSettings
-from rgbmidic.weights import SetUpThreshold, threshold_weights
+from rgbmidic.weights import SetUpThreshold, Statistics, threshold_weights
 
 if TYPE_CHECKING:
     from causes import Cause, NoiseOfLights
@@ -108,7 +108,7 @@ class Competitor:
             start = find_start(self.reference, deformed).displacement
         method = METHODS[self.method]
         options = SolverSettings(brightness=method.brightness)
-        return solve(self.reference, deformed, start, options, statistics=method.default)
+        return solve(self.reference, deformed, start, options, Statistics() if method.default else None)
 
 
 def _seen(

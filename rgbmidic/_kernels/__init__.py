@@ -9,4 +9,4 @@ def are_compiled() -> bool:
     """Whether kernels were compiled on this machine before: one that every solve needs is in the cache."""
     from rgbmidic._kernels.mesh import claim_pixels
 
-    return any(Path(claim_pixels.stats.cache_path or "").glob("mesh.claim_pixels*.nbi"))
+    return any(Path(claim_pixels.dispatcher.stats.cache_path or "").glob("mesh.claim_pixels*.nbi"))

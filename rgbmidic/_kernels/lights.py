@@ -31,23 +31,25 @@ def unmix(start, stop, channels, valid, grid, step, needed, out, out_valid):
         down = np.float32(y - gy * step) / np.float32(step)
         for light in range(lights):
             values, ok = out[light, y], out_valid[light, y]
-            for x in range(width):
-                values[x], ok[x] = 0.0, True
+            for x in range(np.uint64(width)):
+                values[x] = 0.0
+            for x in range(np.uint64(width)):
+                ok[x] = True
             for colour in range(colours):
                 given, known = channels[colour, y], valid[colour, y]
                 for gx in range((width + step - 1) // step):
-                    first, last = gx * step, min((gx + 1) * step, width)
+                    first, number = np.uint64(gx * step), np.uint64(min(step, width - gx * step))
                     above, below = grid[gy, gx, light, colour], grid[gy + 1, gx, light, colour]
                     left = above + (below - above) * down
                     above, below = grid[gy, gx + 1, light, colour], grid[gy + 1, gx + 1, light, colour]
                     slope = (above + (below - above) * down - left) / np.float32(step)
-                    for x in range(first, last):
-                        factor = left + slope * np.float32(np.int32(x - first))
-                        values[x] += factor * given[x] if np.isfinite(given[x]) else np.float32(0.0)
+                    for i in range(number):
+                        factor, value = left + slope * np.float32(np.int32(i)), given[first + i]
+                        values[first + i] += factor * value if np.isfinite(value) else np.float32(0.0)
                 if needed[light, colour]:
-                    for x in range(width):
+                    for x in range(np.uint64(width)):
                         ok[x] &= known[x]
-            for x in range(width):
+            for x in range(np.uint64(width)):
                 values[x] = values[x] if ok[x] else np.float32(np.nan)
 
 
@@ -115,10 +117,11 @@ _ONE = np.float32(1.0)
 
 @over_ranges("fraction", axis=1, grain=BLOCK)
 @compiled(fastmath=_FAST)
-def best_mean(start, stop, fraction, weights, difference, mean, used):
+def best_mean(start, stop, fraction, weights, difference, mean, used, square):
     """Turn `fraction` (k, P) into the fractions of the lights in a mean: none below 0 or without weight, their sum 1.
 
-    `mean` (P,) receives that of `difference` (k, P), `used` (P,) 1 where a light has a fraction and else 0.
+    `mean` (P,) receives that of `difference` (k, P), `square` (P,) its square, and `used` (P,) 1 where a light has a
+    fraction, else 0.
     """
     for first in range(start, stop, BLOCK):
         chunk = slice(first, min(first + BLOCK, stop))
@@ -137,23 +140,26 @@ def best_mean(start, stop, fraction, weights, difference, mean, used):
                 result[i] += own[i] * value[i]
         for i in range(np.uint64(total.size)):
             total[i] = _ONE if total[i] > _ZERO else _ZERO
+        squares = square[chunk]
+        for i in range(np.uint64(total.size)):
+            squares[i] = result[i] * result[i]
 
 
 @over_ranges("fraction", axis=1, grain=BLOCK)
 @compiled(fastmath=_FAST)
-def robust_weights(start, stop, mean, variance, trusted, unit, freedom, fraction, bend):
+def robust_weights(start, stop, mean, variance, displacing, unit, freedom, fraction, bend):
     """Multiply `fraction` (k, P) by the robust weight of the lights' `mean` residual (P,); the loss's `bend` (P,).
 
-    Its `variance` (P,) is that around the pixel, `trusted` (P,) the part of it that counts, in units of `unit`; the
-    weight is its inverse to the power .75 times that of a Student distribution of so many degrees of `freedom`.
+    Its `variance` (P,) is that around the pixel, `displacing` (P,) the fraction of it that counts, in units of `unit`;
+    the weight is its inverse to the power .75 times that of a Student distribution of so many degrees of `freedom`.
     """
     factor = np.empty(BLOCK, dtype=np.float32)
     for first in range(start, stop, BLOCK):
         chunk = slice(first, min(first + BLOCK, stop))
-        value, around, reliable, curved = mean[chunk], variance[chunk], trusted[chunk], bend[chunk]
+        value, around, part, curved = mean[chunk], variance[chunk], displacing[chunk], bend[chunk]
         for i in range(np.uint64(value.size)):
             ratio = value[i] * value[i] / around[i]
-            precision = unit / reliable[i]
+            precision = unit / (part[i] * around[i])
             curved[i] = (freedom - ratio) / (freedom + ratio)
             factor[i] = np.sqrt(precision * np.sqrt(precision)) * (freedom + _ONE) / (freedom + ratio)
         for light in range(len(fraction)):

@@ -1,7 +1,8 @@
 """How kernels are compiled, and the threads that share their items: ranges of elements, rows or pixels.
 
 A kernel is compiled once for the processor and kept in a cache. It holds no lock of the interpreter (``nogil=True``)
-and writes only what belongs to its items, so that the result is the same bits on any number of threads.
+and writes only what belongs to its items, so that the result is the same bits on any number of threads. Numba itself
+is imported with the first call: whoever reads a result waits for no compiler.
 """
 
 from __future__ import annotations
@@ -11,17 +12,16 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache, partial, wraps
+from functools import cache, cached_property, partial, update_wrapper, wraps
 from itertools import pairwise
 from threading import Barrier
 from typing import Any
 
-from numba import njit
 from threadpoolctl import ThreadpoolController
 
 from rgbmidic.errors import InputError
 
-__all__ = ["compiled", "helper", "one_blas_thread", "over_ranges", "set_threads", "start_threads", "threads"]
+__all__ = ["Kernel", "compiled", "helper", "one_blas_thread", "over_ranges", "set_threads", "start_threads", "threads"]
 
 _VARIABLE = "RGBMIDIC_THREADS"
 _chosen: list[int] = []
@@ -71,7 +71,14 @@ def start_threads() -> None:
             one.result()
 
 
-def over_ranges(array: str, *, axis: int = 0, grain: int = 1) -> Callable[[Callable[..., None]], Callable[..., None]]:
+_LEAST = 1 << 16
+"""Entries of a kernel's largest array under which one thread does it all: at some 3 ns each it takes .2 ms, and another
+thread .05 to .1 ms to begin and to report (measured)."""
+
+
+def over_ranges(
+    array: str, *, axis: int = 0, grain: int = 1, least: int = _LEAST
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Share the items of a compiled ``kernel(start, stop, *arguments)``, which is called without the first two.
 
     Parameters
@@ -81,25 +88,31 @@ def over_ranges(array: str, *, axis: int = 0, grain: int = 1) -> Callable[[Calla
     grain : int
         Ranges start at multiples of it: what is vectorised or gathered in blocks of so many items stays the same on
         any number of threads.
+    least : int
+        Entries of its largest array from which threads share a kernel.
     """
 
     def shared(kernel: Any) -> Callable[..., None]:
-        code = kernel.py_func.__code__
+        code = kernel.__wrapped__.__code__
         position = code.co_varnames[: code.co_argcount].index(array) - 2
 
         @wraps(kernel)
         def call(*arguments: Any) -> None:
-            _share(kernel, arguments, arguments[position].shape[axis], grain)
+            most = threads()
+            if most > 1 and max(getattr(argument, "size", 0) for argument in arguments) < least:
+                most = 1
+            _share(kernel, arguments, arguments[position].shape[axis], grain, most)
 
         return call
 
     return shared
 
 
-def _share(kernel: Callable[..., None], arguments: tuple[Any, ...], items: int, grain: int) -> None:
-    """Run `kernel` on ranges of about equal length: the first in this thread, the others in the pool."""
+def _share(kernel: Callable[..., None], arguments: tuple[Any, ...], items: int, grain: int, most: int) -> None:
+    """Run `kernel` on `most` ranges of about equal length: the first in this thread, the others in the pool."""
+    kernel = getattr(kernel, "dispatcher", kernel)  # the first call imports numba, before threads begin
     grains = -(-items // grain)
-    parts = min(threads(), grains)
+    parts = min(most, grains)
     if parts <= 1:
         kernel(0, items, *arguments)
         return
@@ -151,7 +164,36 @@ def _default() -> int:
     return int(given)
 
 
-# a division by zero gives what the processor gives, and C callers are not catered for: less code, sooner compiled
-compiled = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+class Kernel:
+    """A function that numba compiles when it is first called, or when a kernel that calls it is."""
+
+    __wrapped__: Callable[..., Any]
+
+    def __init__(self, options: dict[str, Any], function: Callable[..., Any]) -> None:
+        update_wrapper(self, function)
+        self._options = options
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        """Numba's, which knows the kernel's signatures and its place in the cache."""
+        from numba import njit
+
+        return njit(**self._options)(self.__wrapped__)
+
+    @property
+    def _numba_type_(self) -> Any:  # what numba asks of a global of a function that it compiles
+        return self.dispatcher._numba_type_
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.dispatcher(*arguments)
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorate a kernel; `options` are those of ``numba.njit``."""
+    # a division by zero gives what the processor gives, and C callers are not catered for: less code, sooner compiled
+    always = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    return partial(Kernel, always | options)
+
+
 helper = partial(compiled, no_cpython_wrapper=True)
 """For a function that only kernels call."""

@@ -1,8 +1,8 @@
 """The MIDIC solve: one displacement field from k weighted image pairs (paper, section 3.2)."""
 
-from rgbmidic.correlation.correlate import correlate
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
+from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status, fill
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import Start, find_start, track
@@ -10,12 +10,14 @@ from rgbmidic.correlation.start import Start, find_start, track
 __all__ = [
     "Deformed",
     "NodeStatus",
+    "Precision",
+    "PrecisionMethod",
     "Reference",
     "ReferenceUpdate",
+    "Residual",
     "Solution",
     "Start",
     "Status",
-    "correlate",
     "fill",
     "find_start",
     "solve",

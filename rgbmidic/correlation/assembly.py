@@ -362,11 +362,7 @@ def block_side(pixels: PixelMap, element: float) -> int:
 
 
 def unfitted_fraction(
-    pixels: PixelMap,
-    assembly: Assembly,
-    gradient: FloatImage,
-    weights: FloatImage,
-    side: int,
+    pixels: PixelMap, assembly: Assembly, gradient: FloatImage, weights: FloatImage, side: int
 ) -> float:
     """Return the fraction of the variance of a block's score that a fit of the displacement to white noise leaves.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rgbmidic.correlation.assembly import RigidMotions
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
@@ -124,13 +124,13 @@ class Equations:
         cos, sin = np.cos(angle), np.sin(angle)
         rotation = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
         functions = _turned_back(rotation, functions)
-        per_light = [reference.hessian_blocks(light, weight) for light, weight in enumerate(weights)]
+        per_light = reference.hessians(weights)
         blocks = np.sum(per_light, axis=0)
         own = assembly.node_blocks(blocks)
         textured, scale = _observability(own, assembly.nodal_area, SEEN if given is None else _INFORMED)
         if given is not None:
-            texture = sum(reference.hessian_blocks(light, weight) for light, weight in enumerate(given))
-            textured &= _observability(assembly.node_blocks(np.asarray(texture)), assembly.nodal_area, SEEN)[0]
+            texture = assembly.node_blocks(np.sum(reference.hessians(given), axis=0))
+            textured &= _observability(texture, assembly.nodal_area, SEEN)[0]
         held = scale * (_SMOOTHNESS * assembly.smoothness.data + _CONSTANT * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
         light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
@@ -209,12 +209,12 @@ def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[Boo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """What is solved: two states, the options, and the rigid functions (2 N, m)."""
+    """What is solved: two states, the options, the method of weighting, and the rigid functions (2 N, m)."""
 
     reference: Reference
     deformed: Deformed
     options: SolverSettings
-    statistics: bool
+    method: PrecisionMethod | None
     functions: FloatArray
 
 
@@ -330,15 +330,17 @@ def _right_sides(
     problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
-    bend = problem.reference.assembly.smoothness @ estimate.displacement.ravel()
+    reference, assembly = problem.reference, problem.reference.assembly
+    bend = assembly.smoothness @ estimate.displacement.ravel()
     held = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
     total, rigid = held.copy(), []
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         weight = equations.weights[light]
         if known is None:
-            vector = problem.reference.right_side(problem.deformed, light, values[light], weight, displacement)
+            parts = reference.right_side(problem.deformed, light, values[light], weight, displacement)
         else:
-            vector = problem.reference.projected(light, weight, known[light])
+            parts = reference.projected(weight, known[light], reference.gradient[:, light])
+        vector = assembly.vector(parts)
         total += vector
         if light:
             rigid.append(equations.functions.T @ vector)

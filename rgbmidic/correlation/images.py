@@ -113,7 +113,7 @@ _COARSE = 4
 
 
 def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-    """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
+    """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P) or (1, P)."""
     return _means(pixels.block_sums(fields * weights, _COARSE), pixels.block_sums(weights, _COARSE))
 
 
@@ -132,9 +132,10 @@ def window_covariance(pixels: PixelMap, fields: FloatImage, weights: FloatImage)
 
 
 def _means(totals: FloatImage, weights: FloatImage) -> FloatImage:
-    """Divide sums (n, h, w) by those of their weights, both blurred."""
-    both = zip(totals, weights, strict=True)
-    return np.stack([_blur(total) / np.maximum(_blur(weight), np.float32(1e-6)) for total, weight in both])
+    """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
+    means, around = (np.stack([_blur(grid) for grid in grids]) for grids in (totals, weights))
+    means /= np.maximum(around, np.float32(1e-6), out=around)
+    return means
 
 
 def spread(pixels: PixelMap, grids: FloatImage) -> FloatImage:

@@ -1,28 +1,37 @@
-"""What is known of each node after a solve: whether it counts as measured, and its standard uncertainty.
+"""Which elements match, and which nodes count as measured.
 
-A node counts as measured unless one of an ordered table of rules applies to it. The uncertainty of displacement and
-strain follows from the residual of the solve.
+The matching criterion of an element is the zero-mean correlation coefficient of all lights at the displacement found.
+A node counts as measured unless one of an ordered table of rules applies to it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import element_hessian
-from rgbmidic.correlation.assembly import RigidMotions
 from rgbmidic.correlation.equations import Equations
-from rgbmidic.correlation.precision import light_covariances, score_covariance
-from rgbmidic.correlation.recovery import Functional, Recovery, displacement_functionals, functional_std
-from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.residual import Precision, Residual
 from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["LOST", "RULES", "Evidence", "Rule", "judge", "lost_elements", "nodal_std", "one_sided_texture"]
+__all__ = [
+    "LOST",
+    "RULES",
+    "Evidence",
+    "correlation",
+    "correlation_around",
+    "judge",
+    "lost_elements",
+    "matching_elements",
+    "misfit",
+    "one_sided_texture",
+]
 
 LOST = 0.5
 """Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match."""
@@ -65,49 +74,26 @@ class Evidence:
     misfit: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rule:
-    """A rule: a node to which it applies gets the status, unless an earlier rule applied."""
-
-    status: NodeStatus
-    because: str
-    applies: Callable[[Evidence], BoolArray]
-
-
-RULES = (
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="the elements around it do not match, and the others have too little texture",
-        applies=lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured),
-    ),
-    Rule(
-        status=NodeStatus.NOT_SEEN,
-        because="no light sees enough texture around it",
-        applies=lambda nodes: ~nodes.textured,
-    ),
-    Rule(
-        status=NodeStatus.NOT_SEEN,
-        because="the texture runs in one direction only: what lies along it cannot be measured",
-        applies=lambda nodes: nodes.one_sided,
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="its displacement is uncertain by half a pixel or more",
-        applies=lambda nodes: nodes.std.max(axis=1) > LOST,
-    ),
-    Rule(
-        status=NodeStatus.DECORRELATED,
-        because="elements near it do not match, and the residual around it is several times the usual one",
-        applies=lambda nodes: nodes.near_mismatch & (nodes.misfit > _MISFIT),
-    ),
+RULES: tuple[tuple[NodeStatus, Callable[[Evidence], BoolArray]], ...] = (
+    # the elements around it do not match, and the others have too little texture
+    (NodeStatus.DECORRELATED, lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured)),
+    # no light sees enough texture around it
+    (NodeStatus.NOT_SEEN, lambda nodes: ~nodes.textured),
+    # the texture runs in one direction only: what lies along it cannot be measured
+    (NodeStatus.NOT_SEEN, lambda nodes: nodes.one_sided),
+    # its displacement is uncertain by half a pixel or more
+    (NodeStatus.DECORRELATED, lambda nodes: nodes.std.max(axis=1) > LOST),
+    # elements near it do not match, and the residual around it is several times the usual one
+    (NodeStatus.DECORRELATED, lambda nodes: nodes.near_mismatch & (nodes.misfit > _MISFIT)),
 )
-"""In this order; a node to which none applies is measured."""
+"""Status of a node to which a rule applies, in this order; one to which none does is measured."""
 
 
 def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
     """`NodeStatus` of every node (N,) by the `RULES`."""
-    applied = [rule.applies(evidence) for rule in RULES]
-    return np.select(applied, [np.uint8(rule.status) for rule in RULES], np.uint8(NodeStatus.MEASURED))
+    status, applies = zip(*RULES, strict=True)
+    applied = [rule(evidence) for rule in applies]
+    return np.select(applied, [np.uint8(one) for one in status], np.uint8(NodeStatus.MEASURED))
 
 
 def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray, one_sided: BoolArray) -> BoolArray:
@@ -173,63 +159,110 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
     return reference.assembly.node_blocks(total)
 
 
-def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | None = None) -> FloatArray:
-    """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
+_MATCHED = (0.4, 0.6)
+"""Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
+_MATCHED_PRECISE = (0.4, 0.9)
+"""The same where the lights count by their precision, so that a reflection in one of them is no mismatch."""
+_WORSE = 8.0
+"""In between: how many times farther from 1 than the median of the elements around. Chosen; with half or twice of it
+lights do not change (benchmarks/constants.py)."""
+_AROUND = 61
+"""Elements around: a square of some 5.5 elements a side, of which a crack takes a third."""
 
-    The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs/uncertainty.md), and what the
-    rigid motions of the lights add. Displacement is stated at the textured nodes, strain where all nodes around are
-    textured, too.
+
+def matching_elements(
+    residual: Residual, precision: Precision | None = None, *, least: float | None = None
+) -> BoolArray:
+    """Find the elements whose images match: zero-mean correlation coefficient of all lights together.
+
+    Elements without weight or texture in the reference count as matched.
 
     Parameters
     ----------
-    residual, equations
-        Of the last pass.
-    recovery
-        Of the field from the linear fit; None for the fit itself.
+    residual
+        At the displacement found.
+    precision
+        Of the lights, by which they count in an element; None: all alike.
+    least
+        Coefficient from which an element matches; None judges it by what the elements around reach.
 
     Returns
     -------
-    ndarray, shape (N, 2) or (N, 5)
-        Of u and v (px); with a `recovery` of u, v, exx, eyy, exy.
+    ndarray, shape (E,), bool
     """
-    reference, textured = residual.reference, equations.textured
-    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
-    if recovery is None:
-        asked = [(one, textured) for one in displacement_functionals(len(textured))]
-    else:
-        inner = textured & ~reference.mesh.beside(~textured)
-        asked = [(one, textured) for one in recovery.displacement_functionals]
-        asked += [(one, inner) for one in recovery.strain_functionals]
-    std = functional_std(equations.solve, covariance, reference.geometry.colouring, asked)
-    if equations.rigid is None:
-        return std
-    rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
-    return np.asarray(np.sqrt(np.maximum(std**2 + rigid, 0)))
+    mesh = residual.reference.mesh
+    fg, ff, gg = _centred_products(residual, _light_precision(residual, precision))
+    own = correlation(fg, ff, gg)
+    # a few speckles can match by chance; those of all elements around a node hardly
+    around = correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
+    coefficient = np.minimum(own, np.sort(around[mesh.elements], axis=1)[:, 1])
+    if least is not None:
+        return np.asarray(coefficient >= least)
+    poor, good = _MATCHED if precision is None else _MATCHED_PRECISE
+    matched = np.asarray(coefficient >= good)
+    between = ~matched & (coefficient >= poor)
+    typical, textured = 1.0, ff > 0
+    if textured.any() and between.any():
+        centre = mesh.nodes[mesh.elements].mean(axis=1)
+        ranks = [*range(1, min(_AROUND, int(textured.sum())) + 1)]
+        nearest = cKDTree(centre[textured]).query(centre[between], k=ranks)[1]
+        typical = np.median(coefficient[textured][nearest], axis=1)
+    matched[between] = coefficient[between] >= 1 - _WORSE * (1 - typical)
+    return matched
 
 
-def _rigid_variance(
-    residual: Residual, equations: Equations, rigid: RigidMotions, asked: Sequence[Functional]
-) -> FloatArray:
-    """Variance (N, F) that the error of the rigid coefficients adds to quantities linear in the displacement.
+def correlation_around(residual: Residual) -> FloatArray:
+    """Zero-mean correlation coefficient (N,) of all lights together in the elements around each node.
 
-    The displacement's error is ``M^-1 q - X e``, where q is the sum over the lights of their scores q_j and
-    ``e = sum G_j^T q_j``, ``G_j = D_j T``, is that of the coefficients, with T the inverse Schur complement. With S_jl
-    the covariance of q_j and q_l a quantity ``a^T u`` gets ``(a^T X) Cov(e) (X^T a) - 2 (a^T M^-1 Cov(q, e)) (X^T a)``,
-    where ``Cov(e) = sum G_j^T S_jl G_l`` and ``Cov(q, e) = sum S_jl G_l``.
+    It is NaN where the states show no texture together.
     """
-    gains, assembly = rigid.moves @ rigid.inverse, residual.reference.assembly
-    products = np.zeros_like(gains)
-    for a, b, blocks in light_covariances(residual, equations.weights):
-        covariance = assembly.matrix(blocks)
-        products[a] += covariance @ gains[b]
-        if a != b:
-            products[b] += covariance @ gains[a]
-    coefficients = np.einsum("jnc,jnd->cd", gains, products)
-    shared, variance = equations.solve(products.sum(axis=0)), []
-    for along_x, along_y in asked:
-        follows, common = (
-            sum(matrix @ column[axis::2] for axis, matrix in enumerate((along_x, along_y)) if matrix is not None)
-            for column in (rigid.follows, shared)
-        )
-        variance.append(((follows @ coefficients - 2 * common) * follows).sum(axis=1))
-    return np.stack(variance, axis=1)
+    mesh = residual.reference.mesh
+    fg, ff, gg = (mesh.to_nodes(part) for part in _centred_products(residual, _light_precision(residual, None)))
+    return np.where(ff > 1e-9 * ff.max(initial=0.0), correlation(fg, ff, gg), np.nan)
+
+
+def _light_precision(residual: Residual, precision: Precision | None) -> FloatArray:
+    """Mean precision (k, E) of each light in each element, over that of the most precise; 1 where it is not known."""
+    reference = residual.reference
+    if precision is None or len(residual.values) == 1:
+        return np.ones((len(residual.values), len(reference.mesh.elements)))
+    mean = reference.sums(precision.factor, precision.bend)[..., 0]
+    return np.asarray(mean / np.maximum(mean.max(axis=0), 1e-300))
+
+
+def misfit(mesh: Tri3Mesh, squares: FloatArray, measured: BoolArray) -> FloatArray:
+    """Weighted rms residual around each node, over its median: 1 is ordinary, 3 is suspicious.
+
+    Parameters
+    ----------
+    mesh
+        N nodes, E elements.
+    squares : ndarray, shape (k, E, 3)
+        Those of `Residual` with the weights of the solve, in units of the inverse variance of the residual.
+    measured : ndarray, shape (N,), bool
+        Nodes over which the median is taken.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+    """
+    square, _, count = (mesh.to_nodes(part) for part in squares.sum(axis=0).T)
+    around = square / np.maximum(count, 1.0)
+    typical = float(np.median(around[measured])) if measured.any() else 0.0
+    return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)
+
+
+def _centred_products(residual: Residual, precision: FloatArray) -> FloatArray:
+    """Sum the centred products f g, f f and g g over the lights, each with its `precision` (k, E); (3, E)."""
+    return np.asarray([(precision * part).sum(axis=0) for part in residual.centred_products()])
+
+
+def correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:
+    """Correlation coefficient from the centred products f g, f f and g g.
+
+    It is 1 where the reference has nothing to compare, and 0 where only the deformed image has nothing.
+    """
+    empty = ff <= 1e-9 * ff.max(initial=0.0)
+    blank = gg <= 1e-9 * ff
+    scale = np.sqrt(np.maximum(ff, 0) * np.maximum(gg, 0))
+    return np.where(empty, 1.0, np.where(blank, 0.0, fg / np.where(empty | blank, 1.0, scale)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import cv2
@@ -185,8 +186,10 @@ class Reference:
         pixel of the frame: there it is read; None: at the same pixel.
     unfitted : float
         Fraction of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
-    values, gradient_x, gradient_y, pixel_weights : ndarray, shape (k, P), float32
-        The same at the owned pixels, with the gradient in grey levels per px: that of the texture common to the lights.
+    values, pixel_weights : ndarray, shape (k, P), float32
+        The same at the owned pixels.
+    gradient : ndarray, shape (2, k, P), float32
+        Gradient of the texture common to the lights, in grey levels per px of each.
     texture : ndarray, shape (2, P), float32
         Gradient of the lights' common texture: the sum of theirs.
     channel_specific : ndarray, shape (2, k, P), float32
@@ -200,8 +203,7 @@ class Reference:
     images: FloatImage
     weights: FloatImage
     values: FloatImage
-    gradient_x: FloatImage
-    gradient_y: FloatImage
+    gradient: FloatImage
     pixel_weights: FloatImage
     texture: FloatImage
     channel_specific: FloatImage
@@ -274,8 +276,7 @@ class Reference:
             images=ready,
             weights=usable,
             values=values,
-            gradient_x=gradient[0],
-            gradient_y=gradient[1],
+            gradient=gradient,
             pixel_weights=weighted,
             texture=gradient.sum(axis=1),
             channel_specific=own[:, :0] if gradient is own else np.subtract(own, gradient, out=own),
@@ -318,16 +319,15 @@ class Reference:
             return motion
         return np.asarray(motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin)[light])
 
-    def blocks(self, weight: FloatImage, gradient_x: FloatImage, gradient_y: FloatImage) -> FloatArray:
-        """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), all of shape (P,)."""
-        pixels = self.pixels
+    def blocks(self, weight: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
+        """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,)."""
         out = np.zeros((len(self.mesh.elements), 3, 3, 3))
-        element_hessian(gradient_x, gradient_y, weight, *pixels.positions, out)
+        element_hessian(*gradient, weight, *self.pixels.positions, out)
         return out
 
-    def hessian_blocks(self, light: int, weight: FloatImage) -> FloatArray:
-        """Element blocks of a light's Hessian with the pixel weights (P,)."""
-        return self.blocks(weight, self.gradient_x[light], self.gradient_y[light])
+    def hessians(self, weights: FloatImage) -> list[FloatArray]:
+        """Element blocks of each light's Hessian for pixel weights (k, P)."""
+        return [self.blocks(*light) for light in zip(weights, self.gradient.swapaxes(0, 1), strict=True)]
 
     def warp(
         self,
@@ -363,32 +363,17 @@ class Reference:
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
     ) -> FloatArray:
-        """Sum a light's right-hand side (2 N,) for reference grey levels `values` (P,)."""
+        """Sum a light's right-hand side over each element, (E, 3, 2), for reference grey levels `values` (P,)."""
+        parts, motion = np.empty((len(self.mesh.elements), 3, 2)), self.motion(deformed, light, displacement)
+        images = deformed.coefficients[light], values, *self.gradient[:, light], weight
+        element_right_side(*images, *self.geometry.parts, motion, parts)
+        return parts
+
+    def projected(self, weight: FloatImage, difference: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
+        """Sum the same for a difference that is known: ``sum w (f - g) grad f phi``, for fields (P,)."""
         parts = np.empty((len(self.mesh.elements), 3, 2))
-        gradient, motion = (self.gradient_x[light], self.gradient_y[light]), self.motion(deformed, light, displacement)
-        geometry = self.geometry.parts
-        element_right_side(deformed.coefficients[light], values, *gradient, weight, *geometry, motion, parts)
-        return self.assembly.vector(parts)
-
-    def projected(self, light: int, weight: FloatImage, difference: FloatImage) -> FloatArray:
-        """Sum the same for a `difference` (P,) that is known: ``sum w (f - g) grad f phi``, (2 N,)."""
-        parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
-        geometry = pixels.positions
-        element_vector(weight, difference, self.gradient_x[light], self.gradient_y[light], *geometry, parts)
-        return self.assembly.vector(parts)
-
-    def channel_specific_pulls(self, weights: FloatImage, difference: FloatImage) -> FloatArray:
-        """Sum the same of every light, (k, 2 N), with its channel-specific gradient.
-
-        `weights` and `difference` are (k, P); the result is empty where there is but one light.
-        """
-        parts, pixels = np.empty((len(self.mesh.elements), 3, 2)), self.pixels
-        geometry = pixels.positions
-        pulls = np.empty((self.channel_specific.shape[1], self.assembly.size))
-        for light, pull in enumerate(pulls):
-            element_vector(weights[light], difference[light], *self.channel_specific[:, light], *geometry, parts)
-            pull[:] = self.assembly.vector(parts)
-        return pulls
+        element_vector(weight, difference, *gradient, *self.pixels.positions, parts)
+        return parts
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:
         """Sum fields (n, P) over each element, and their products with a `factor` (P,); shape (n, E, 2)."""
@@ -402,11 +387,11 @@ def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: s
     given = np.ones_like(images) if weights is None else weights
     usable, reach = np.zeros_like(images), usable_reach(prefilter)
     for image, weight, out in zip(images, given, usable, strict=True):
-        known = np.isfinite(image)
-        known &= weight > 0
-        if known.all():
+        if weight.min() > 0 and np.isfinite([image.min(), image.max()]).all():  # NaN spreads to both
             out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
         else:
+            known = np.isfinite(image)
+            known &= weight > 0
             cv2.copyTo(weight, usable_pixels(known, prefilter).view(np.uint8), out)
     return usable
 
@@ -493,7 +478,7 @@ def _regression(own: FloatImage, mean: FloatImage, used: FloatImage, pixels: Pix
         The coefficient (P,), at least 0, and the median of the correlation coefficient.
     """
     products = np.stack([(mean * own).sum(axis=0), (mean**2).sum(axis=0), (own**2).sum(axis=0)])
-    along, square, power = window_means(pixels, products, np.broadcast_to(used, products.shape))
+    along, square, power = window_means(pixels, products, used[None])
     known = (square > 0) & (power > 0)
     correlation = along[known] / np.sqrt(square[known] * power[known])
     contrast = np.divide(along, square, out=np.zeros_like(along), where=known)

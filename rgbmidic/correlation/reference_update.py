@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.correlation import element_vector
 from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.images import usable_reach
-from rgbmidic.correlation.precision import correlation
+from rgbmidic.correlation.nodes import correlation
 from rgbmidic.correlation.reference import Deformed, Reference, drawn
-from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.correlation.start import Start, track
 from rgbmidic.errors import InputError
@@ -46,13 +45,11 @@ class ReferenceUpdate:
         Of the first frame; results are at its nodes.
     reference : Reference
         Of frame r, with the mesh where the nodes are there; `first` itself before any update.
-    displacement, strain : ndarray, shape (N, 2), (N, 3)
-        Of frame r on the first one, px; gaps in the displacement carried over from the nearest node. What frame r did
-        not measure is not seen on it either, and comes back with an older reference only.
-    variance, strain_variance : ndarray, shape (N, 2), (N, 3)
-        Squares of their standard uncertainty.
-    rigid : ndarray, shape (k, m), or 0
-        Of frame r on the first one.
+    displacement : ndarray, shape (N, 2)
+        Of frame r on the first one, px; gaps are carried over from the nearest node. What frame r did not measure is
+        not seen on it either, and comes back with an older reference only.
+    solution : Solution, or None
+        Of frame r on the first one; None before any update.
     scores : ndarray, shape (E, 2), or None
         Sums over the elements of the residual times the gradient in the step to frame r, turned as the elements are;
         None before any update.
@@ -61,32 +58,21 @@ class ReferenceUpdate:
     first: Reference
     reference: Reference
     displacement: FloatArray
-    variance: FloatArray
-    strain: FloatArray
-    strain_variance: FloatArray
-    rigid: FloatArray | float
-    scores: FloatArray | None
+    solution: Solution | None = None
+    scores: FloatArray | None = None
 
     @classmethod
     def none(cls, first: Reference) -> ReferenceUpdate:
         """Return the first frame as its own reference."""
-        count = len(first.mesh.nodes)
-        return cls(
-            first=first,
-            reference=first,
-            displacement=np.zeros((count, 2)),
-            variance=np.zeros((count, 2)),
-            strain=np.zeros((count, 3)),
-            strain_variance=np.zeros((count, 3)),
-            rigid=0.0,
-            scores=None,
-        )
+        return cls(first=first, reference=first, displacement=np.zeros_like(first.mesh.nodes))
 
-    def track(self, deformed: Deformed, start: Start, options: SolverSettings, *, statistics: bool = True) -> Solution:
+    def track(
+        self, deformed: Deformed, start: Start, options: SolverSettings, method: PrecisionMethod | None
+    ) -> Solution:
         """Solve for the displacement of a later frame on the first one, from a start on the first one; see `track`."""
         last = start.displacement
         own = replace(start, displacement=None if last is None else last - self.displacement)
-        return self.accumulated(track(self.reference, deformed, own, options, statistics=statistics), deformed)
+        return self.accumulated(track(self.reference, deformed, own, options, method), deformed)
 
     def accumulated(self, step: Solution, deformed: Deformed) -> Solution:
         """Return the solution on the first frame from that on this reference.
@@ -99,31 +85,36 @@ class ReferenceUpdate:
         over stated uncertainty .92 to 1.07, g .43 to .50 and, for paint, .02 to .03. Strains, linear in the
         displacement, add up likewise.
         """
-        if self.scores is None:
+        if self.solution is None or self.scores is None:
             return step
+        last = self.solution
         before, after = self.scores, _scores(self.reference, deformed, step.displacement, step.rigid)
         both = np.isfinite(before + after)
         square = float((after[both] ** 2).sum())
         regression = float(np.clip(-(before[both] * after[both]).sum() / square, -1, 0.5)) if square > 0 else 0.0
-        own = 1 - 2 * regression
+        own, mesh = 1 - 2 * regression, self.first.mesh
         return replace(
             step,
-            nodes=self.first.mesh.nodes,
-            elements=self.first.mesh.elements,
+            nodes=mesh.nodes,
+            elements=mesh.elements,
             displacement=self.displacement + step.displacement,
-            displacement_std=np.sqrt(self.variance + own * step.displacement_std**2),
-            strain=self.strain + step.strain,
-            strain_std=np.sqrt(self.strain_variance + own * step.strain_std**2),
-            rigid=self.rigid + step.rigid if step.rigid.size else step.rigid,
+            displacement_std=np.sqrt(_single(last.displacement_std) ** 2 + own * step.displacement_std**2),
+            strain=_single(last.strain) + step.strain,
+            strain_std=np.sqrt(_single(last.strain_std) ** 2 + own * step.strain_std**2),
+            rigid=last.rigid + step.rigid if step.rigid.size else step.rigid,
         )
+
+    def _step(self, displacement: FloatArray, solution: Solution) -> tuple[FloatArray, FloatArray]:
+        """Return what a `displacement` (N, 2) and the rigid motions of a solution add to those of frame r."""
+        rigid = solution.rigid if self.solution is None else solution.rigid - self.solution.rigid
+        return displacement - self.displacement, rigid
 
     def match(self, deformed: Deformed, solution: Solution) -> FloatArray:
         """Correlation coefficient (E,) of the elements with this reference, of the light that matches best.
 
         NaN where a node has no displacement, and where no light sees the element in both images.
         """
-        step = solution.displacement - self.displacement, solution.rigid - self.rigid
-        residual, known = _residual(self.reference, deformed, *step)
+        residual, known = _residual(self.reference, deformed, *self._step(solution.displacement, solution))
         lights = zip(*residual.centred_products(), strict=True)
         own = np.array([correlation(fg, ff, gg) for fg, ff, gg in lights])
         best = np.where(residual.moments[..., 0] > 0, own, -np.inf).max(axis=0)
@@ -194,19 +185,16 @@ class ReferenceUpdate:
             origin=origin,
             registration=self.first.registration,
         )
-        step = displacement - self.displacement
+        step, rigid = self._step(displacement, solution)
         gaps = np.where(measured[:, None], step, np.nan)
         deformed = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
-        scores = _scores(self.reference, deformed, gaps, solution.rigid - self.rigid)
+        scores = _scores(self.reference, deformed, gaps, rigid)
         turn = np.eye(2) + self.reference.mesh.element_gradient(step)
         return ReferenceUpdate(
             first=self.first,
             reference=reference,
             displacement=displacement,
-            variance=_single(solution.displacement_std) ** 2,
-            strain=_single(solution.strain),
-            strain_variance=_single(solution.strain_std) ** 2,
-            rigid=solution.rigid,
+            solution=solution,
             scores=np.einsum("ecd,ed->ec", turn, scores),
         )
 
@@ -243,15 +231,9 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, 
     The sums are NaN where a node has no displacement.
     """
     residual, known = _residual(reference, deformed, displacement, rigid)
-    pixels = reference.pixels
-    total, parts = np.zeros((len(pixels.origin), 2)), np.zeros((len(pixels.origin), 3, 2))
-    geometry = pixels.positions
-    fields = residual.weights, residual.difference, reference.gradient_x, reference.gradient_y
-    for light in zip(*fields, strict=True):
-        element_vector(*light, *geometry, parts)
-        total += parts.sum(axis=1)
-    total[~known] = np.nan
-    return total
+    lights = zip(residual.weights, residual.difference, reference.gradient.swapaxes(0, 1), strict=True)
+    total = np.sum([reference.projected(*light).sum(axis=1) for light in lights], axis=0)
+    return np.where(known[:, None], total, np.nan)
 
 
 def _residual(

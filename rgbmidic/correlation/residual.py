@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
-from rgbmidic._kernels.correlation import element_squares, element_vector, interpolate_nodal, subtract_quadratic
+from rgbmidic._kernels.correlation import element_squares, interpolate_nodal, subtract_quadratic
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Residual", "brightness_change", "corrected_values", "curved_deviation"]
+__all__ = ["Precision", "PrecisionMethod", "Residual", "brightness_change", "corrected_values", "curved_deviation"]
 
+_LEAST_BEND = 0.1
+"""Least bend of the loss around a node, over that of its weights. Chosen; with half or twice of it nothing changes
+(benchmarks/constants.py)."""
 _ROUNDING = 2e-7
 """Fraction of the sum of squares below which that beyond the mean is rounding: three units of single precision."""
 
@@ -65,6 +68,12 @@ class Residual:
         """Grey levels g(x + u), (k, P); those of f where it is not known."""
         return self.values - self.difference
 
+    @property
+    def contrast(self) -> float:
+        """Weighted variance of the reference's grey levels under all lights together."""
+        total, f, _, ff, _, _ = self.moments.sum(axis=(0, 1)) / max(self.moments[..., 0].sum(), 1e-30)
+        return max(float(ff - f * f), 0.0) if total else 0.0
+
     def difference_from(self, values: FloatImage) -> FloatImage:
         """Return the difference for other reference grey levels (k, P)."""
         return self.difference if values is self.values else self.difference + (values - self.values)
@@ -74,8 +83,9 @@ class Residual:
 
         The result has the shape (k, E, 3).
         """
-        out = np.empty((len(weights), len(self.reference.mesh.elements), 3))
-        element_squares(self.difference, weights, self.reference.pixels.offsets, out)
+        pixels = self.reference.pixels
+        out = np.empty((len(weights), len(pixels.origin), 3))
+        element_squares(self.difference, weights, pixels.offsets, out)
         return out
 
     def centred_products(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -99,10 +109,39 @@ class Residual:
             Second derivatives xx, xy, yy of the field at the nodes, 1/px.
         """
         known, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
-        images = self.difference, known.gradient_x, known.gradient_y
         deviation = curved_deviation(known.geometry.material, pixels.barycentric, carried, curvature)
-        subtract_quadratic(*images, deviation, pixels.local_x, pixels.local_y, pixels.offsets, out)
+        place = pixels.local_x, pixels.local_y, pixels.offsets
+        subtract_quadratic(self.difference, *known.gradient, deviation, *place, out)
         return replace(self, difference=out)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Precision:
+    """Precision of the lights, from their residuals.
+
+    Attributes
+    ----------
+    factor : ndarray, shape (k, P), float32
+        Factor on the weights that are given, in any unit.
+    bend : ndarray, shape (P,), float32
+        Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
+    """
+
+    factor: FloatImage
+    bend: FloatImage
+
+    def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
+        """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less."""
+        total, bent = (reference.mesh.to_nodes(part) for part in reference.sums(weights, self.bend).sum(axis=0).T)
+        return np.divide(total, np.maximum(bent, _LEAST_BEND * total), out=np.ones_like(total), where=total > 0)
+
+
+class PrecisionMethod(Protocol):
+    """A method of weighting that learns from the residual; `rgbmidic.weights.Statistics` is the package's own."""
+
+    def precision(self, residual: Residual) -> Precision | None:
+        """Precision of the lights for the next pass; None leaves the weights as they are given."""
+        ...
 
 
 def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArray, curvature: FloatArray) -> FloatImage:
@@ -187,17 +226,16 @@ def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: Floa
     """Correct f (P,) by a gain and an offset that are linear in every element."""
     if not weight.any():
         return f
-    pixels, assembly = reference.pixels, reference.assembly
+    assembly = reference.assembly
     scale = float(np.sqrt((weight * g * g).sum() / weight.sum())) or 1.0
     g = g / np.float32(scale)
-    system = assembly.matrix(reference.blocks(weight, g, np.ones_like(g)))
+    basis = g, np.ones_like(g)
+    system = assembly.matrix(reference.blocks(weight, basis))
     smooth = _SMOOTHNESS * system.diagonal().mean() * assembly.smoothness.data
-    parts = np.zeros((len(reference.mesh.elements), 3, 2))
-    geometry = pixels.positions
-    element_vector(weight, f, g, np.ones_like(g), *geometry, parts)
-    nodal = assembly.factorise(with_data(system, system.data + smooth))(assembly.vector(parts)).reshape(-1, 2)
+    right_side = assembly.vector(reference.projected(weight, f, basis))
+    nodal = assembly.factorise(with_data(system, system.data + smooth))(right_side).reshape(-1, 2)
     fields = np.empty((2, f.size), dtype=np.float32)
-    interpolate_nodal(nodal, reference.mesh.elements, *geometry, fields)
+    interpolate_nodal(nodal, reference.mesh.elements, *reference.pixels.positions, fields)
     gain = np.maximum(fields[0] / np.float32(scale), np.float32(_LEAST_GAIN))
     return np.asarray((f - fields[1]) / gain, dtype=np.float32)
 
@@ -211,10 +249,7 @@ _MANY = 400
 
 
 def brightness_change(
-    first: FloatImage,
-    second: FloatImage,
-    reference: Reference,
-    displacement: FloatArray,
+    first: FloatImage, second: FloatImage, reference: Reference, displacement: FloatArray
 ) -> FloatArray:
     """Gain and offset of every light, ``second = gain first + offset``, as the median over the elements.
 

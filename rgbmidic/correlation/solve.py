@@ -21,12 +21,19 @@ import numpy.typing as npt
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
-from rgbmidic.correlation.nodes import Evidence, judge, lost_elements, nodal_std, one_sided_texture
-from rgbmidic.correlation.precision import Precision, learn_precision, matching_elements, misfit
+from rgbmidic.correlation.nodes import (
+    Evidence,
+    judge,
+    lost_elements,
+    matching_elements,
+    misfit,
+    one_sided_texture,
+)
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import Residual, corrected_values
+from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, corrected_values
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
+from rgbmidic.correlation.uncertainty import standard_uncertainty
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
@@ -40,7 +47,6 @@ __all__ = [
     "refining",
     "settled",
     "solve",
-    "standard_uncertainty",
 ]
 
 FIRST_PASS = 0.01
@@ -57,9 +63,9 @@ frames took 40 to 50 iterations over the most passes, a third of them did not co
 _SETTLED = 1e-3
 """Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
 change (benchmarks/constants.py)."""
-_LOOKED_AT = 16
-"""That change is the sum over one weight in so many. Chosen; with half or twice of it nothing changes
-(benchmarks/constants.py)."""
+_LOOKED_AT = 10_000
+"""That change is the sum over about so many pixels: a change of all weights by that fraction is known to 1 % of it
+(derived)."""
 _PASSES = 8
 """Most passes: each warps the weights with the latest displacement; `_RETURNS`, and the `_REFINED` ones after."""
 
@@ -150,13 +156,13 @@ def next_weighting(
     return replace(
         weighting,
         values=corrected_values(residual, problem.options.brightness),
-        precision=learn_precision(residual) if problem.statistics else None,
+        precision=None if problem.method is None else problem.method.precision(residual),
     )
 
 
 def settled(weighting: Weighting, equations: Equations) -> bool:
     """Whether the next pass would have the weights of the last one."""
-    some = slice(None, None, _LOOKED_AT)
+    some = slice(None, None, equations.weights.shape[1] // _LOOKED_AT + 1)
     weights = weighting.of(some)
     total = float(weights.sum())
     return total > 0 and float(np.abs(weights - equations.weights[:, some]).sum()) <= _SETTLED * total
@@ -164,30 +170,8 @@ def settled(weighting: Weighting, equations: Equations) -> bool:
 
 def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
     """Whether the residual of a pass still changes weights or grey levels."""
-    learns = problem.statistics or problem.options.brightness != "none"
+    learns = problem.method is not None or problem.options.brightness != "none"
     return learns and number <= weighting.returned + _REFINED[problem.options.brightness]
-
-
-def standard_uncertainty(
-    residual: Residual, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
-) -> FloatArray:
-    """Evaluate the standard uncertainty of the linear fit, (N, 2), or of what a `recovery` gives, (N, 5).
-
-    The latter holds the step, too, that the lights' channel-specific gradients would make from the solution: two
-    gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978). Where a reflection
-    does not follow the surface it pulls with them, and what it still pulls without is less than that
-    (docs/uncertainty.md).
-    """
-    std = nodal_std(residual, equations, recovery)
-    if precision is not None:
-        std = std * precision.robust_loss(residual.reference, equations.weights)[:, None]
-    if recovery is None:
-        return std
-    pulls = residual.reference.channel_specific_pulls(equations.weights, residual.difference)
-    pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
-    step, _ = equations.increment(pull, np.zeros_like(pull), rigid_pull)
-    disagreement = np.concatenate([recovery.displacement(step), recovery.strain(step)], axis=1)
-    return np.asarray(np.hypot(std, disagreement))
 
 
 def solve(
@@ -195,8 +179,7 @@ def solve(
     deformed: Deformed,
     initial: FloatArray,
     options: SolverSettings,
-    *,
-    statistics: bool = True,
+    method: PrecisionMethod | None,
 ) -> Solution:
     """Find the displacement of the reference mesh with which the warped deformed images match the reference ones.
 
@@ -208,8 +191,9 @@ def solve(
         Initial guess of the displacement (u, v) in px, within about half a speckle of the solution.
     options
         Rigid functions, grey-level correction, tolerance and iterations.
-    statistics
-        Weight every light by the inverse variance of its own residual around each pixel, robustly.
+    method
+        Learns the lights' precision from the residual, such as `rgbmidic.weights.Statistics`; None leaves the weights
+        as they are given.
 
     Returns
     -------
@@ -232,7 +216,7 @@ def solve(
         reference=reference,
         deformed=deformed,
         options=options,
-        statistics=statistics,
+        method=method,
         functions=rigid_functions(reference.mesh.nodes, options.rigid),
     )
     try:

@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic.correlation.precision import correlation_around
+from rgbmidic.correlation.nodes import correlation_around
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.mesh import Tri3Mesh
@@ -423,8 +423,7 @@ def track(
     deformed: Deformed,
     start: Start,
     options: SolverSettings,
-    *,
-    statistics: bool = True,
+    method: PrecisionMethod | None,
 ) -> Solution:
     """Solve one frame from the last frame's displacement, and from a search where that fails or loses nodes.
 
@@ -434,7 +433,7 @@ def track(
         The two states.
     start
         The last frame's end; without a displacement the initial guess is searched for.
-    options, statistics
+    options, method
         How to solve, see `solve`.
 
     Returns
@@ -449,13 +448,13 @@ def track(
         surest = float(np.fmax(surest, found.confidence))
         if found.confidence < NEEDED:
             continue
-        trial = solve(reference, deformed, found.displacement, options, statistics=statistics)
+        trial = solve(reference, deformed, found.displacement, options, method)
         if best is None or (trial.status, trial.unmeasured_fraction) < (best.status, best.unmeasured_fraction):
             best = trial
         if best.status is Status.CONVERGED and best.unmeasured_fraction <= start.unmeasured + (number + 0.5) * _LOSS:
             break
     if best is None:  # from rest, for the reason why there is no start
-        best = solve(reference, deformed, np.zeros_like(reference.mesh.nodes), options, statistics=statistics)
+        best = solve(reference, deformed, np.zeros_like(reference.mesh.nodes), options, method)
     return replace(best, reason=f"{NO_MATCH}; {_looked_for(surest)}") if best.reason == NO_MATCH else best
 
 

@@ -140,22 +140,30 @@ class Nodal:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class History:
-    """One quantity of a probe over the frames.
+    """One quantity over the frames.
 
     Attributes
     ----------
     name
         Such as ``"point_1_u"``.
     unit
-        ``"px"`` for a length, ``"deg"`` for an angle, empty for a strain.
-    values, std : ndarray, shape (T,)
+        Of a probe ``"px"`` for a length, ``"deg"`` for an angle, empty for a strain; of a result read off in the
+        reader's units, such as ``"mm"``, ``"px/frame"``, ``"1/s"``.
+    values : ndarray, shape (T,)
         NaN where not measured.
+    std : ndarray, shape (T,), or None
+        Standard uncertainty; None for what was not measured by the images.
     """
 
     name: str
     unit: str
     values: FloatArray
-    std: FloatArray
+    std: FloatArray | None
+
+    @property
+    def column(self) -> str:
+        """Name of its column in a table, with the unit."""
+        return column(self.name, self.unit)
 
 
 class Probe(Protocol):

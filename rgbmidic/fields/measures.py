@@ -28,6 +28,8 @@ _OF_STRETCH: dict[str, tuple[_Function, _Function]] = {
 """Each measure as a function of an eigenvalue of C, and its derivative."""
 MEASURES = (*_OF_STRETCH, "engineering")
 """Names of the strain measures; the first is the default."""
+_SMALL = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [0, 0.5, 0.5, 0]])
+"""Derivative of the small exx, eyy, exy by the gradient."""
 _SAME = 1e-6
 """Eigenvalues of C that differ by less count as one where a difference is divided by theirs: 1e-10 of error at most."""
 _LARGEST_ANGLE = np.degrees(np.pi / np.sqrt(12))
@@ -98,20 +100,15 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
         raise InputError(f'unknown strain measure "{measure}"; allowed are {", ".join(MEASURES)}')
     shape = gradient.shape[:-2]
     h, spread = gradient.reshape(-1, 2, 2), covariance.reshape(-1, 4, 4)
-    tensor, slopes = _small(h) if measure == "engineering" else _of_stretch(h, *_OF_STRETCH[measure])
-    hencky = (tensor, slopes) if measure == "hencky" else _of_stretch(h, *_OF_STRETCH["hencky"])
-    covariances = [slope @ spread @ slope.transpose(0, 2, 1) for slope in (slopes, hencky[1])]
+    hencky = _of_stretch(h, *_OF_STRETCH["hencky"])
+    if measure == "engineering":
+        tensor, slopes = (h + h.transpose(0, 2, 1)) / 2, _SMALL
+    else:
+        tensor, slopes = hencky if measure == "hencky" else _of_stretch(h, *_OF_STRETCH[measure])
+    covariances = [slope @ spread @ np.swapaxes(slope, -1, -2) for slope in (slopes, hencky[1])]
     with np.errstate(divide="ignore", invalid="ignore"):
         equivalent = _equivalent(_components(hencky[0]), covariances[1])
     return _with_principal(measure, tensor, covariances[0], equivalent, shape)
-
-
-def _small(gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Compute the small strain (n, 2, 2) and the derivative (n, 3, 4) of its exx, eyy, exy by the gradient."""
-    slope = np.zeros((len(gradient), 3, 4))
-    slope[:, 0, 0] = slope[:, 1, 3] = 1
-    slope[:, 2, 1:3] = 0.5
-    return (gradient + gradient.transpose(0, 2, 1)) / 2, slope
 
 
 def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function) -> tuple[FloatArray, FloatArray]:

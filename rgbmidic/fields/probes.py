@@ -52,54 +52,30 @@ class Mean:
     least: float = 1.0
 
     @classmethod
-    def _of(cls, name: str, covariance: NodalCovariance, places: Places, least: float) -> Mean:
+    def over(
+        cls, covariance: NodalCovariance, name: str, points: npt.ArrayLike, least: float = 1.0, *, inside: bool = True
+    ) -> Mean:
+        """Average over points (P, 2) that stand for a place, px.
+
+        Raises
+        ------
+        InputError
+            A point is outside the region; where not all need be `inside`, half of them are.
+        """
+        places = Places.of(covariance.mesh, points)
+        if inside:
+            places.check(name)
+        elif places.inside.mean() < _LEAST:
+            raise InputError(f"half or more of {name} is outside {places.where}")
         weights = places.mean()
         nodes = np.flatnonzero(weights).astype(np.int64)
-        return cls(
-            name=name, nodes=nodes, weights=weights[nodes], correlation=covariance.part(nodes), least=least - 1e-9
-        )
-
-    @classmethod
-    def at_point(cls, covariance: NodalCovariance, name: str, x: float, y: float) -> Mean:
-        """Take the displacement at a point, px; an `InputError` where it is outside the region."""
-        places = Places.of(covariance.mesh, [[x, y]])
-        places.check(name)
-        return cls._of(name, covariance, places, 1.0)
-
-    @classmethod
-    def along_line(cls, covariance: NodalCovariance, name: str, x0: float, y0: float, x1: float, y1: float) -> Mean:
-        """Average along the line between two points, px; an `InputError` where a part of it is outside the region."""
-        count = int(np.hypot(x1 - x0, y1 - y0) / _STEP) + 2
-        places = Places.of(covariance.mesh, np.linspace((x0, y0), (x1, y1), count))
-        places.check(name)
-        return cls._of(name, covariance, places, _LEAST)
-
-    @classmethod
-    def over_circle(cls, covariance: NodalCovariance, name: str, x: float, y: float, radius: float) -> Mean:
-        """Average over a circle, px, where it lies in the region; an `InputError` where less than half of it does."""
-        grid = _grid((x - radius, y - radius, x + radius, y + radius))
-        grid = grid[np.hypot(grid[:, 0] - x, grid[:, 1] - y) <= radius]
-        return cls._over(covariance, name, grid)
-
-    @classmethod
-    def over_region(cls, covariance: NodalCovariance, name: str, x0: float, y0: float, x1: float, y1: float) -> Mean:
-        """Average over a rectangle between two corners, px; errors as `over_circle`."""
-        return cls._over(covariance, name, _grid((min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))))
-
-    @classmethod
-    def _over(cls, covariance: NodalCovariance, name: str, grid: FloatArray) -> Mean:
-        places = Places.of(covariance.mesh, grid)
-        if places.inside.mean() < _LEAST:
-            raise InputError(f"half or more of {name} is outside {places.where}")
-        return cls._of(name, covariance, places, _LEAST)
+        correlation, least = covariance.part(nodes), least - 1e-9
+        return cls(name=name, nodes=nodes, weights=weights[nodes], correlation=correlation, least=least)
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px."""
-        (u, u_std), (v, v_std) = self.read(nodal)
-        return [
-            History(name=f"{self.name}_u", unit="px", values=u, std=u_std),
-            History(name=f"{self.name}_v", unit="px", values=v, std=v_std),
-        ]
+        uv = zip("uv", self.read(nodal), strict=True)
+        return [History(name=f"{self.name}_{name}", unit="px", values=values, std=std) for name, (values, std) in uv]
 
     def read(self, nodal: Nodal) -> list[tuple[FloatArray, FloatArray]]:
         """Average u and v, each (T,), with their standard uncertainty."""
@@ -116,15 +92,23 @@ class Mean:
         return found
 
 
-def _grid(box: tuple[float, float, float, float]) -> FloatArray:
+def _line(x0: float, y0: float, x1: float, y1: float) -> FloatArray:
+    return np.linspace((x0, y0), (x1, y1), int(np.hypot(x1 - x0, y1 - y0) / _STEP) + 2)
+
+
+def _rectangle(x0: float, y0: float, x1: float, y1: float) -> FloatArray:
     """Make the points (P, 2) that stand for the cells of a rectangle."""
-    x0, y0, x1, y1 = box
     axes = []
-    for low, high in ((x0, x1), (y0, y1)):
+    for low, high in ((min(x0, x1), max(x0, x1)), (min(y0, y1), max(y0, y1))):
         count = max(int(np.ceil((high - low) / _STEP)), 1)
         axes.append(low + (np.arange(count) + 0.5) * (high - low) / count)
     x, y = np.meshgrid(*axes)
     return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def _circle(x: float, y: float, radius: float) -> FloatArray:
+    grid = _rectangle(x - radius, y - radius, x + radius, y + radius)
+    return grid[np.hypot(grid[:, 0] - x, grid[:, 1] - y) <= radius]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -160,12 +144,11 @@ class Gauge:
         ends = np.array(place, dtype=np.float64).reshape(2, 2)
         if not np.hypot(*(ends[1] - ends[0])) > 0:
             raise InputError(f"{name} needs two different points, not ({place[0]:g}, {place[1]:g}) twice")
-        places = Places.of(covariance.mesh, ends)
-        places.check(name)
+        Places.of(covariance.mesh, ends).check(name)
         first, second = (Places.of(covariance.mesh, end).mean() for end in ends)
         nodes = np.flatnonzero(second - first).astype(np.int64)
-        weights = (second - first)[nodes]
-        difference = Mean(name=name, nodes=nodes, weights=weights, correlation=covariance.part(nodes))
+        correlation = covariance.part(nodes)
+        difference = Mean(name=name, nodes=nodes, weights=(second - first)[nodes], correlation=correlation)
         return cls(name=name, ends=ends, difference=difference, moving=moving)
 
     @property
@@ -181,17 +164,14 @@ class Gauge:
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the extension in px and the strain."""
         d = self.difference
-        parts = [nodal.u, nodal.v]
-        apart = np.stack([part @ d.weights for part in parts], axis=1)
+        apart = np.stack([nodal.u @ d.weights, nodal.v @ d.weights], axis=1)
         arm = self.ends[1] - self.ends[0]
         now = arm + apart if self.moving else np.broadcast_to(arm, apart.shape)
         towards = now / np.hypot(*now.T)[:, None]
         extension = np.hypot(*now.T) - self.length if self.moving else (towards * apart).sum(axis=1)
-        spread = [
-            np.einsum("tm,tm->t", (d.weights * std) @ d.correlation, d.weights * std)
-            for std in (nodal.u_std, nodal.v_std)
-        ]
-        std = np.sqrt(np.maximum((towards**2 * np.stack(spread, axis=1)).sum(axis=1), 0))
+        parts = [d.weights * std for std in (nodal.u_std, nodal.v_std)]
+        spread = np.stack([np.einsum("tm,tm->t", part @ d.correlation, part) for part in parts], axis=1)
+        std = np.sqrt(np.maximum((towards**2 * spread).sum(axis=1), 0))
         return [
             History(name=f"{self.name}_extension", unit="px", values=extension, std=std),
             History(name=f"{self.name}_strain", unit="", values=extension / self.length, std=std / self.length),
@@ -248,10 +228,10 @@ class StrainGauge:
 
 _Make = Callable[..., Probe]
 PROBES: dict[str, tuple[int, _Make]] = {
-    "point": (2, Mean.at_point),
-    "line": (4, Mean.along_line),
-    "circle": (3, Mean.over_circle),
-    "region": (4, Mean.over_region),
+    "point": (2, lambda c, name, *place: Mean.over(c, name, [place])),
+    "line": (4, lambda c, name, *place: Mean.over(c, name, _line(*place), _LEAST)),
+    "circle": (3, lambda c, name, *place: Mean.over(c, name, _circle(*place), _LEAST, inside=False)),
+    "region": (4, lambda c, name, *place: Mean.over(c, name, _rectangle(*place), _LEAST, inside=False)),
     "gauge": (4, Gauge.between),
     "straight_gauge": (4, lambda *a, **k: Gauge.between(*a, **k, moving=False)),
     "strain_gauge": (3, StrainGauge.around),

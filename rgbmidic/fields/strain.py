@@ -160,18 +160,13 @@ class StrainGauges:
             whole=np.zeros((2, len(rows))),
             inflation=np.ones((len(centres), 3)),
         )
-        return gauges._correlated(covariance.correlation)
-
-    def _correlated(self, correlation: sp.csr_matrix) -> Self:
-        """Add the weights, and the `inflation` by the correlation (N, N) between nodes of one uncertainty."""
-        weights = self._weights(np.ones(len(self.points), dtype=bool))
-        shape, row = (len(self.centres), len(self.points)), self.rows
-        x, y = (sp.csr_matrix((weight, (row, self.nodes)), shape=shape) for weight in weights)
-        together = [np.asarray((a @ correlation).multiply(b).sum(axis=1)).ravel() for a, b in ((x, x), (y, y))]
+        weights = gauges._weights(np.ones(len(mesh.nodes), dtype=bool))
+        x, y = (sp.csr_matrix((weight, (rows, gauges.nodes)), shape=needed.shape) for weight in weights)
+        together = [np.asarray((a @ covariance.correlation).multiply(a).sum(axis=1)).ravel() for a in (x, y)]
         alone = [np.asarray(a.multiply(a).sum(axis=1)).ravel() for a in (x, y)]
         along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
         inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
-        return replace(self, whole=weights, inflation=inflation)
+        return replace(gauges, whole=weights, inflation=inflation)
 
     def gradient(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray

@@ -69,10 +69,9 @@ class CameraRaw(FrameSource):
             monochrome = raw.num_colors == 1
         if values.shape != (sizes.height, sizes.width):
             raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
-        stated = structure.black_level(sizes.top_margin, sizes.left_margin) if structure else None
-        black = black if stated is None else stated
-        as_is = structure is not None and structure.stored_as_is
-        _check_filled(values, black, white, stored_as_is=as_is, path=self.path)
+        if structure and (stated := structure.black_level(sizes.top_margin, sizes.left_margin)) is not None:
+            black = stated
+        _check_filled(values, black, white, stored_as_is=bool(structure and structure.stored_as_is), path=self.path)
         return StoredFrame(
             values=values,
             kind="monochrome" if monochrome else "bayer",

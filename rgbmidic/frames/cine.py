@@ -14,7 +14,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -90,62 +90,6 @@ class CineFile(Movie):
     def _header(self) -> _Header:
         return _header(self.path)
 
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        header = _header(self.path)
-        height = header.shape[0]
-        stored = range(height - rows.stop, height - rows.start) if header.bottom_up else rows
-        values = _samples(header, *self._lines(header, index, stored))
-        if header.bits == _CODED_BITS:
-            values = _LINEAR[values]
-        return StoredFrame(
-            values=values[::-1] if header.bottom_up else values,
-            kind=header.kind,
-            cfa=header.cfa,
-            black_level=header.black_level,
-            white_level=header.white_level,
-        )
-
-    def _lines(self, header: _Header, index: int, rows: range) -> tuple[npt.NDArray[np.uint8], range]:
-        """Read the lines (n, bytes) that hold some rows of a frame; return them and the rows in them."""
-        start = int(header.pointers[index])
-        with self.path.open("rb") as file:
-            if start < header.first_byte or start + 8 > header.size:
-                raise self._ends(header, index)
-            file.seek(start)
-            annotation = int.from_bytes(file.read(4), "little")
-            if annotation < 8 or start + annotation > header.size:
-                raise damaged(self.path, f"the annotation of frame {index} has {annotation} bytes")
-            file.seek(start + annotation - 4)
-            lines = header.lines(int.from_bytes(file.read(4), "little"))
-            if lines is None:
-                raise damaged(self.path, f"frame {index} has not the size that its header announces")
-            if start + annotation + lines[0] * lines[1] > header.size:
-                raise self._ends(header, index)
-            if lines[0] == 1:  # all samples in a row
-                return np.fromfile(file, dtype=np.uint8, count=lines[1]).reshape(lines), rows
-            file.seek(rows.start * lines[1], 1)
-            part = np.fromfile(file, dtype=np.uint8, count=len(rows) * lines[1])
-            return part.reshape(len(rows), lines[1]), range(len(rows))
-
-    def _ends(self, header: _Header, index: int) -> FrameError:
-        last = min(header.last_whole, index - 1)
-        place = f"after frame {last}" if last >= 0 else "before the first frame"
-        return FrameError(
-            f"{self.path} ends {place} of {len(self)} (0 to {len(self) - 1}): truncated or still being written"
-        )
-
-
-def _samples(header: _Header, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
-    """Return samples (n, W), uint8 or uint16, of some of the rows in the lines that they are stored in."""
-    columns = header.shape[1]
-    if header.bits in (8, 16):
-        samples: AnyArray = lines.view("u1" if header.bits == 8 else "<u2")
-    else:
-        samples = unpack_bits(lines, header.bits)
-    if len(lines) == 1 and header.shape[0] > 1:
-        return samples[0, rows.start * columns : rows.stop * columns].reshape(len(rows), columns)
-    return samples[:, :columns]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Header:
@@ -167,8 +111,6 @@ class _Header:
         How the frames were recorded.
     pointers : ndarray, shape (count,), int64
         Where each frame begins in the file.
-    first_byte
-        Where the first frame can begin.
     size
         Bytes of the file.
     """
@@ -182,13 +124,12 @@ class _Header:
     white_level: float
     recording: Recording
     pointers: npt.NDArray[np.int64]
-    first_byte: int
     size: int
 
     @property
     def last_whole(self) -> int:
         """Index of the last frame before the first that the file does not hold whole; -1 where it holds none."""
-        begun = (self.pointers >= self.first_byte) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
+        begun = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
         return int(np.argmin(np.append(begun, False))) - 1
 
     def lines(self, size: int) -> tuple[int, int] | None:
@@ -198,6 +139,60 @@ class _Header:
             return (rows, size // rows) if self.bits in (8, 16) else (1, size)
         line = math.ceil(columns * self.bits / 32) * 4  # as in Windows bitmaps
         return (rows, line) if size == rows * line else None
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame."""
+        height = self.shape[0]
+        stored = range(height - rows.stop, height - rows.start) if self.bottom_up else rows
+        values = _samples(self, *self._lines(path, index, stored))
+        if self.bits == _CODED_BITS:
+            values = _LINEAR[values]
+        return StoredFrame(
+            values=values[::-1] if self.bottom_up else values,
+            kind=self.kind,
+            cfa=self.cfa,
+            black_level=self.black_level,
+            white_level=self.white_level,
+        )
+
+    def _lines(self, path: Path, index: int, rows: range) -> tuple[npt.NDArray[np.uint8], range]:
+        """Read the lines (n, bytes) that hold some rows of a frame; return them and the rows in them."""
+        start = int(self.pointers[index])
+        with path.open("rb") as file:
+            if start < _FILE.size or start + 8 > self.size:
+                raise self._ends(path, index)
+            file.seek(start)
+            annotation = int.from_bytes(file.read(4), "little")
+            if annotation < 8 or start + annotation > self.size:
+                raise damaged(path, f"the annotation of frame {index} has {annotation} bytes")
+            file.seek(start + annotation - 4)
+            lines = self.lines(int.from_bytes(file.read(4), "little"))
+            if lines is None:
+                raise damaged(path, f"frame {index} has not the size that its header announces")
+            if start + annotation + lines[0] * lines[1] > self.size:
+                raise self._ends(path, index)
+            if lines[0] == 1:  # all samples in a row
+                return np.fromfile(file, dtype=np.uint8, count=lines[1]).reshape(lines), rows
+            file.seek(rows.start * lines[1], 1)
+            part = np.fromfile(file, dtype=np.uint8, count=len(rows) * lines[1])
+            return part.reshape(len(rows), lines[1]), range(len(rows))
+
+    def _ends(self, path: Path, index: int) -> FrameError:
+        last, count = min(self.last_whole, index - 1), self.recording.count
+        place = f"after frame {last}" if last >= 0 else "before the first frame"
+        return FrameError(f"{path} ends {place} of {count} (0 to {count - 1}): truncated or still being written")
+
+
+def _samples(header: _Header, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
+    """Return samples (n, W), uint8 or uint16, of some of the rows in the lines that they are stored in."""
+    columns = header.shape[1]
+    if header.bits in (8, 16):
+        samples: AnyArray = lines.view("u1" if header.bits == 8 else "<u2")
+    else:
+        samples = unpack_bits(lines, header.bits)
+    if len(lines) == 1 and header.shape[0] > 1:
+        return samples[0, rows.start * columns : rows.stop * columns].reshape(len(rows), columns)
+    return samples[:, :columns]
 
 
 @remembered
@@ -211,18 +206,22 @@ def _header(path: Path) -> _Header:
     """
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
-        mark, _, compression, version, _, _, first, count, *places, trigger = _unpacked(path, file, _FILE, 0)
+        mark, _, compression, version, _, _, first, count, *places, trigger = _FILE.unpack(
+            _piece(path, file, 0, _FILE.size)
+        )
         if mark != b"CI":
             raise FrameError(f"{path} is no Phantom movie: it does not begin as one")
         if not 0 < count <= _MOST_FRAMES:
             raise damaged(path, f"its header announces {count} frames")
-        _, columns, height, _, bit_count, packing, _, _, _, _, levels = _unpacked(path, file, _BITMAP, places[0])
+        _, columns, height, _, bit_count, packing, _, _, _, _, levels = _BITMAP.unpack(
+            _piece(path, file, places[0], _BITMAP.size)
+        )
         setup, end = _setup(path, file, places[1])
         kind, cfa = _colours(path, compression, bit_count, setup.get("cfa", 0))
         bits, shape = _PACKED_BITS.get(packing, bit_count), (abs(height), columns)
         if packing not in _PACKED_BITS and (packing != 0 or bit_count not in (8, 16)):
-            what = f"samples of {bit_count} bit, packed in the way {packing}, which is unknown"
-            raise damaged(path, f"its header announces {what}")
+            what = f"its header announces samples of {bit_count} bit, packed in the way {packing}, which is unknown"
+            raise damaged(path, what)
         if min(shape) < 1:
             raise damaged(path, f"its header announces {shape[0]} rows of {shape[1]} pixels")
         check_size(path, needed=2 * math.prod(shape), stored=_needed(shape, bits))
@@ -250,7 +249,6 @@ def _header(path: Path) -> _Header:
             **_settings(setup, exposures, remarks),
         ),
         pointers=pointers,
-        first_byte=_FILE.size,
         size=size,
     )
 
@@ -268,10 +266,6 @@ def _piece(path: Path, file: BinaryIO, start: int, length: int) -> bytes:
     return piece
 
 
-def _unpacked(path: Path, file: BinaryIO, layout: struct.Struct, start: int) -> tuple[Any, ...]:
-    return layout.unpack(_piece(path, file, start, layout.size))
-
-
 def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]:
     """Read the fields that the camera's settings store, and where these end."""
     head = _piece(path, file, start, _LENGTH + 2)
@@ -279,11 +273,10 @@ def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]
     if head[_MARK:_LENGTH] != b"ST" or length < len(head):
         raise damaged(path, "the camera's settings in its header are not where they should be")
     stored = _piece(path, file, start, length)
-    layouts = {name: (place, struct.Struct("<" + kind)) for name, (place, kind) in _SETUP.items()}
     fields = {
-        name: layout.unpack_from(stored, place)[0]
-        for name, (place, layout) in layouts.items()
-        if place + layout.size <= length
+        name: struct.unpack_from("<" + kind, stored, place)[0]
+        for name, (place, kind) in _SETUP.items()
+        if place + struct.calcsize(kind) <= length
     }
     return fields, start + length
 
@@ -296,10 +289,11 @@ def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[F
     FrameError
         The samples are not the sensor's, or the pattern is no Bayer pattern.
     """
-    if compression == _LEAD:
-        _refuse(path, "compressed (JPEG)")
-    if bit_count > 16:
-        _refuse(path, "processed (interpolated) colour")
+    if compression == _LEAD or bit_count > 16:
+        what = "compressed (JPEG)" if compression == _LEAD else "processed (interpolated) colour"
+        raise FrameError(
+            f"{path} is {what}: its samples are no longer the sensor's; save it as raw .cine from the camera's software"
+        )
     if compression not in (0, _UNINTERPOLATED):
         raise damaged(path, f"its header announces the kind of compression {compression}, which is unknown")
     if code & _GREY_HEADS:
@@ -309,12 +303,6 @@ def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[F
     if compression == _UNINTERPOLATED and code in _PATTERNS:
         return "bayer", _PATTERNS[code]
     return ("monochrome" if code == compression == 0 else None), None
-
-
-def _refuse(path: Path, what: str) -> NoReturn:
-    raise FrameError(
-        f"{path} is {what}: its samples are no longer the sensor's; save it as raw .cine from the camera's software"
-    )
 
 
 def _depth(bits: int, real: int, levels: int) -> int:

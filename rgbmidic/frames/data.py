@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -20,6 +21,7 @@ __all__ = [
     "Window",
     "cfa_channels",
     "even_times",
+    "fraction",
     "frame_numbers",
     "planes_of",
     "sampled_channels",
@@ -161,12 +163,8 @@ class Mosaic:
         if values.ndim != 2:
             raise InputError(f"a mosaic is one (H, W) image, not an array of shape {values.shape}")
         cfa_channels(self.cfa)
-        black = np.broadcast_to(np.asarray(self.black_level, dtype=np.float64), (2, 2)).copy()
-        _check_levels(black, self.white_level)
-        object.__setattr__(self, "values", np.ascontiguousarray(values, dtype=np.uint16))
         object.__setattr__(self, "cfa", self.cfa.upper())
-        object.__setattr__(self, "black_level", black)
-        object.__setattr__(self, "white_level", float(self.white_level))
+        _convert(self, (2, 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,19 +190,21 @@ class ChannelFrame:
         values = np.asarray(self.values)
         if values.ndim != 3 or values.shape[0] not in (1, 3):
             raise InputError(f"a channel frame has shape (1 or 3, H, W), not {values.shape}")
-        black = np.broadcast_to(np.asarray(self.black_level, dtype=np.float64), values.shape[:1]).copy()
-        _check_levels(black, self.white_level)
-        object.__setattr__(self, "values", np.ascontiguousarray(values, dtype=np.uint16))
-        object.__setattr__(self, "black_level", black)
-        object.__setattr__(self, "white_level", float(self.white_level))
+        _convert(self, values.shape[:1])
 
 
-def _check_levels(black: FloatArray, white: float) -> None:
+def _convert(frame: Mosaic | ChannelFrame, levels: tuple[int, ...]) -> None:
+    """Convert a frame to its types, black levels to the shape `levels`; refuse levels that cannot be."""
+    black = np.broadcast_to(np.asarray(frame.black_level, dtype=np.float64), levels).copy()
+    white = frame.white_level
     if not (np.isfinite(black).all() and np.isfinite(white) and black.min() >= 0 and white > black.max()):
         raise InputError(
             f"black and white level must be finite with 0 <= black < white; given are black {black.tolist()}, "
             f"white {white}"
         )
+    object.__setattr__(frame, "values", np.ascontiguousarray(frame.values, dtype=np.uint16))
+    object.__setattr__(frame, "black_level", black)
+    object.__setattr__(frame, "white_level", float(white))
 
 
 def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.NDArray[np.uint16]], FloatArray]:
@@ -315,3 +315,11 @@ def even_times(numbers: range, interval: Fraction) -> Integers:
     """
     above, below = 10**9 * interval.numerator, interval.denominator
     return np.fromiter(((2 * number * above + below) // (2 * below) for number in numbers), np.int64, len(numbers))
+
+
+_NUMBER = re.compile(r"[0-9]{1,9}(/0{0,8}[1-9][0-9]{0,8}|(\.[0-9]{1,15})?([eE]-?[0-9])?)")
+
+
+def fraction(text: str) -> Fraction | None:
+    """Return the number that a header states as text, such as "0.25", "1/500" or "2.5e-3"; None where it is none."""
+    return Fraction(text) if _NUMBER.fullmatch(text) else None

@@ -6,14 +6,11 @@ import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.formats import reader_name
 from rgbmidic.frames.images import TIFF_ENDINGS, write_tiff
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.settings import FrameSettings
-from rgbmidic.typing import FloatArray
 
 __all__ = ["Description", "describe", "save_frame"]
 
@@ -100,7 +97,7 @@ def describe(settings: FrameSettings) -> Description:
     source, recording = series.lights[0][0], series.recording
     stored = source.stored(0)
     frame, *_ = series.read(0)
-    cfa = getattr(frame, "cfa", None)
+    cfa, levels = getattr(frame, "cfa", None), tuple(frame.black_level.ravel().tolist())
     warnings = list(recording.remarks)
     try:
         series.read(len(series) - 1)
@@ -114,7 +111,7 @@ def describe(settings: FrameSettings) -> Description:
         kind="bayer" if cfa else settings.kind or stored.kind,
         cfa=cfa,
         bit_depth=recording.bit_depth or stored.bits or 8 * stored.values.itemsize,
-        black_level=_level(frame.black_level),
+        black_level=levels[0] if len(set(levels)) == 1 else levels,
         white_level=frame.white_level,
         frame_rate=recording.frame_rate,
         exposure=None if recording.exposure_ns is None else recording.exposure_ns / _SECOND,
@@ -162,8 +159,3 @@ def _text(value: object) -> str:
     if isinstance(value, tuple):
         return ", ".join(map(_text, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _level(black: FloatArray) -> float | tuple[float, ...]:
-    levels = tuple(np.unique(black).tolist())
-    return levels[0] if len(levels) == 1 else tuple(black.ravel().tolist())

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Literal, NoReturn, TypedDict, Unpack
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
@@ -37,8 +37,6 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-SampleType = Literal["uint8", "uint16", ">u2"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameFormat:
@@ -53,20 +51,27 @@ class FrameFormat:
     movies
         Endings of its files that are named by themselves: a folder does not stand for movies.
     recognises
-        Whether a file, with what the user states of it, is read as this format; it raises nothing for any file.
+        Whether a file, with what the user states of it, is read as this format; it raises nothing for any file. None:
+        by its ending.
     source
         Its reader; built with `path` and `stated`, it reads nothing yet.
     """
 
     name: str
     endings: tuple[str, ...] = ()
-    recognises: Callable[[Path, FrameSettings], bool]
+    recognises: Callable[[Path, FrameSettings], bool] | None = None
     source: type[FrameSource]
     movies: tuple[str, ...] = ()
 
+    def reads(self, path: Path, stated: FrameSettings) -> bool:
+        """Report whether it reads a file of which the user states this."""
+        if self.recognises is None:
+            return path.suffix.lower() in self.endings + self.movies
+        return self.recognises(path, stated)
 
-def _ends(*endings: str) -> Callable[[Path, FrameSettings], bool]:
-    return lambda path, _: path.suffix.lower() in endings
+
+def _is_tiff(path: Path) -> bool:
+    return path.suffix.lower() in TIFF_ENDINGS and not is_dng(path)
 
 
 FORMATS = (
@@ -76,33 +81,21 @@ FORMATS = (
         recognises=is_headerless,
         source=HeaderlessFile,
     ),
-    FrameFormat(name="PNG", endings=(".png",), recognises=_ends(".png"), source=PngFile),
+    FrameFormat(name="PNG", endings=(".png",), source=PngFile),
     FrameFormat(
-        name="TIFF stacks",
-        recognises=lambda path, _: path.suffix.lower() in TIFF_ENDINGS and not is_dng(path) and is_tiff_stack(path),
-        source=TiffStack,
+        name="TIFF stacks", recognises=lambda path, _: _is_tiff(path) and is_tiff_stack(path), source=TiffStack
     ),
-    FrameFormat(
-        name="TIFF",
-        endings=TIFF_ENDINGS,
-        recognises=lambda path, _: path.suffix.lower() in TIFF_ENDINGS and not is_dng(path),
-        source=TiffFile,
-    ),
-    FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, recognises=_ends(*CINE_ENDINGS), source=CineFile),
+    FrameFormat(name="TIFF", endings=TIFF_ENDINGS, recognises=lambda path, _: _is_tiff(path), source=TiffFile),
+    FrameFormat(name="Phantom .cine", movies=CINE_ENDINGS, source=CineFile),
     FrameFormat(
         name="camera raws (DNG, NEF, CR2, ARW, ...)",
         endings=CAMERA_RAW_ENDINGS,
         recognises=lambda path, _: has_camera_header(path),
         source=CameraRaw,
     ),
-    FrameFormat(
-        name="Photron .mraw with .cihx or .cih",
-        movies=MRAW_ENDINGS,
-        recognises=_ends(*MRAW_ENDINGS),
-        source=MrawFile,
-    ),
-    FrameFormat(name="NorPix .seq", movies=(".seq",), recognises=_ends(".seq"), source=SeqFile),
-    FrameFormat(name="stacks in .npy files", movies=(".npy",), recognises=_ends(".npy"), source=NpyFile),
+    FrameFormat(name="Photron .mraw with .cihx or .cih", movies=MRAW_ENDINGS, source=MrawFile),
+    FrameFormat(name="NorPix .seq", movies=(".seq",), source=SeqFile),
+    FrameFormat(name="stacks in .npy files", movies=(".npy",), source=NpyFile),
     FrameFormat(
         name="stacks in HDF5 files",
         movies=HDF5_ENDINGS,
@@ -201,7 +194,7 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
         Of the first of `FORMATS` that recognises the file.
     """
     path = Path(path)
-    source = next((known.source for known in known_formats() if known.recognises(path, stated)), _UnknownFile)
+    source = next((known.source for known in known_formats() if known.reads(path, stated)), _UnknownFile)
     return source(path=path, stated=stated, camera=camera)
 
 
@@ -210,16 +203,18 @@ def reader_name(source: FrameSource) -> str:
     return next((known.name for known in known_formats() if known.source is type(source)), "unknown")
 
 
-def read_frame(
-    path: Path | str,
-    *,
-    kind: FrameKind | None = None,
-    cfa: str | None = None,
-    black_level: float | None = None,
-    white_level: float | None = None,
-    shape: tuple[int, int] | None = None,
-    dtype: SampleType | None = None,
-) -> Mosaic | ChannelFrame:
+class Statements(TypedDict, total=False):
+    """What the caller of `read_frame` states of a file; None: what the file states."""
+
+    kind: FrameKind | None
+    cfa: str | None
+    black_level: float | None
+    white_level: float | None
+    shape: tuple[int, int] | None
+    dtype: Literal["uint8", "uint16", ">u2"] | None
+
+
+def read_frame(path: Path | str, **stated: Unpack[Statements]) -> Mosaic | ChannelFrame:
     """Read one raw frame.
 
     Camera raws (LibRaw) state everything themselves. TIFF and PNG state size and number of channels; headerless
@@ -229,15 +224,12 @@ def read_frame(
     ----------
     path
         Frame file.
-    kind
-        None: what the file states (three channels: ``"rgb"``), else ``"bayer"``.
-    cfa
-        Bayer pattern of the first visible pixels; needed for a mosaic whose file does not state it.
-    black_level, white_level
-        Grey levels (DN); where nobody states them 0 and the largest value of the sample type.
-    shape, dtype
-        Rows and columns, and sample type (``"uint8"``, ``"uint16"`` little-endian, ``">u2"`` big-endian) of headerless
-        files.
+    **stated
+        What is stated of it. ``kind``: None is what the file states (three channels: ``"rgb"``), else ``"bayer"``.
+        ``cfa``: Bayer pattern of the first visible pixels; needed for a mosaic whose file does not state it.
+        ``black_level``, ``white_level``: grey levels (DN); where nobody states them 0 and the largest value of the
+        sample type. ``shape``, ``dtype``: rows and columns, and sample type (``"uint8"``, ``"uint16"`` little-endian,
+        ``">u2"`` big-endian) of headerless files.
 
     Returns
     -------
@@ -251,16 +243,10 @@ def read_frame(
     InputError
         A statement is not allowed by itself.
     """
+    if odd := stated.keys() - Statements.__annotations__:
+        raise TypeError(f"read_frame takes {', '.join(Statements.__annotations__)}, not {', '.join(odd)}")
     try:
-        stated = FrameSettings(
-            path=(str(path),),
-            kind=kind,
-            cfa=cfa,
-            black_level=black_level,
-            white_level=white_level,
-            shape=shape,
-            dtype=dtype,
-        )
+        settings = FrameSettings(path=(str(path),), **stated)
     except ConfigurationError as error:
         raise InputError(str(error).replace("frames.", "")) from None
-    return open_source(path, stated).read(0)
+    return open_source(path, settings).read(0)

@@ -12,7 +12,8 @@ import math
 import re
 import struct
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -286,20 +287,16 @@ class TiffFile(FrameSource):
     """A TIFF file of one image with 1 or 3 channels; a table of colours is refused."""
 
     def _shape(self) -> tuple[int, int]:
-        with tiff_pages(self.path) as pages:
-            page = _single_page(pages, self.path)
+        with _only_page(self.path) as page:
             return int(page.imagelength), int(page.imagewidth)
 
     def _stored(self, index: int) -> StoredFrame:
-        with tiff_pages(self.path) as pages:
-            page = _single_page(pages, self.path)
-            if page.compression in _BY_OPENCV:
-                return page_frame(page, self.path, _by_opencv(page, self.path))
-            return page_frame(page, self.path)
+        with _only_page(self.path) as page:
+            samples = _by_opencv(page, self.path) if page.compression in _BY_OPENCV else None
+            return page_frame(page, self.path, samples)
 
     def _rows(self, index: int, rows: range) -> StoredFrame:
-        with tiff_pages(self.path) as pages:
-            page = _single_page(pages, self.path)
+        with _only_page(self.path) as page:
             if (samples := page_rows(page, self.path, rows)) is not None:
                 return page_frame(page, self.path, samples)
         return FrameSource._rows(self, index, rows)
@@ -337,13 +334,15 @@ def page_frame(page: TiffPage, path: Path, samples: AnyArray | None = None) -> S
     return StoredFrame.plain(values, path, cfa_pattern(page))
 
 
-def _single_page(pages: list[TiffPage], path: Path) -> TiffPage:
-    if not pages:
-        raise damaged(path, "its header leads to no image")
-    if len(pages) > 1:
-        raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
-    checked_page(pages[0], path)
-    return pages[0]
+@contextmanager
+def _only_page(path: Path) -> Iterator[TiffPage]:
+    with tiff_pages(path) as pages:
+        if not pages:
+            raise damaged(path, "its header leads to no image")
+        if len(pages) > 1:
+            raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
+        checked_page(pages[0], path)
+        yield pages[0]
 
 
 def checked_page(page: TiffPage, path: Path) -> None:
@@ -372,7 +371,8 @@ def checked_page(page: TiffPage, path: Path) -> None:
 def _samples(page: TiffPage, path: Path) -> AnyArray:
     """Read the samples of a page as they are stored, (H, W) or (H, W, C)."""
     if page.compression not in (UNCOMPRESSED, *_BY_TIFFFILE):
-        raise _not_read(page, path)
+        name = getattr(page.compression, "name", page.compression)
+        raise FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
     if page.compression in _BY_TIFFFILE:
         _check_unpacked(page, path)
     values = np.asarray(page.asarray())
@@ -384,16 +384,11 @@ def _by_opencv(page: TiffPage, path: Path) -> AnyArray:
     """Read the samples of the only page of a file."""
     turned = (tag(page, _ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
     if turned:  # OpenCV turns such samples, some more than others
-        raise _not_read(page, path)
+        return _samples(page, path)  # which refuses them
     values = decode(path.read_bytes(), path)
     if (*values.shape[:2], values.dtype) != (page.imagelength, page.imagewidth, page.dtype):
         raise damaged(path, f"its header announces another image than its data hold, {values.shape} {values.dtype}")
     return values
-
-
-def _not_read(page: TiffPage, path: Path) -> FrameError:
-    name = getattr(page.compression, "name", page.compression)
-    return FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
 
 
 def _check_unpacked(page: TiffPage, path: Path) -> None:

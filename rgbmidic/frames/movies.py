@@ -25,7 +25,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import Integers, Recording, even_times
+from rgbmidic.frames.data import Integers, Recording, even_times, fraction
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import Layout, StoredFrame, damaged, unpack_bits
 
@@ -86,7 +86,6 @@ _NAMES = {
 _HEADER_BYTES = 4 * 2**20
 """Most bytes that are read of a header; those seen have 9 and 19 kB."""
 
-_NUMBER = re.compile(r"[0-9]{1,9}(\.[0-9]{1,6}|/[0-9]{1,9})?")
 _LARGEST = 2**40
 """Largest frame number: 12 days at a million frames a second."""
 
@@ -108,9 +107,6 @@ class MrawFile(Movie):
         if found is None:
             raise FrameError(f"{self.path} needs its header {self.path.stem}.cihx or {self.path.stem}.cih beside it")
         return _mraw_header(found)
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        return self._header().read(self.path, index, rows)
 
 
 def _beside(path: Path, *endings: str) -> Path | None:
@@ -163,10 +159,7 @@ class _Entries:
 
     def number(self, name: str) -> Fraction | None:
         """Return a positive number; None where there is none."""
-        text = self.text(name)
-        if not _NUMBER.fullmatch(text) or re.search("/0+$", text):
-            return None
-        return Fraction(text) or None
+        return fraction(self.text(name)) or None
 
 
 def _lines(content: bytes) -> dict[str, str]:
@@ -233,14 +226,8 @@ _SEQ_FIELDS = struct.Struct("<I24xi4x512x6I3Id16xi8xI32xI364x")
 """Magic; version; width, height, bits stored, bits used, bytes, format; frames, origin, distance; rate; pattern;
 compression; oldest frame."""
 
-_RAW: dict[int, tuple[Literal["<", ">"], bool]] = {
-    100: ("<", False),
-    101: ("<", False),
-    112: ("<", True),
-    113: ("<", True),
-    114: (">", True),
-    115: (">", True),
-}
+_RAW: dict[int, tuple[Literal["<", ">"], bool]] = dict.fromkeys((100, 101), ("<", False))
+_RAW |= dict.fromkeys((112, 113), ("<", True)) | dict.fromkeys((114, 115), (">", True))
 """Monochrome and raw Bayer formats: byte order, and whether a sample's highest bit is the highest of its type."""
 _BAYER = (101, 113, 115)
 _PACKED = range(131, 135)
@@ -254,9 +241,6 @@ class SeqFile(Movie):
 
     def _header(self) -> _Header:
         return _seq_header(self.path)
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        return self._header().read(self.path, index, rows)
 
 
 @remembered

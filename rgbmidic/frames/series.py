@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 
-from rgbmidic.errors import ConfigurationError, FrameError, disk_reason, legible
+from rgbmidic.errors import ConfigurationError, FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import advice, frame_endings, open_source
 from rgbmidic.frames.source import FrameSource, file_fingerprint
@@ -80,9 +80,7 @@ class FrameSeries:
         FrameError
             None can be read.
         """
-        for _, shape in self.shapes():
-            return shape
-        return self.lights[0][0].shape
+        return next((shape for _, shape in self.shapes()), None) or self.lights[0][0].shape
 
     @property
     def recording(self) -> Recording:
@@ -139,10 +137,8 @@ class FrameSeries:
         file is not read whole for it.
         """
         in_part = window is not None and not window.is_whole
-        sources = (source for source, _ in self._locate(index))
-        return {
-            legible(source.path): file_fingerprint(source.path) if in_part else source.fingerprint for source in sources
-        }
+        sources = [source for source, _ in self._locate(index)]
+        return {legible(one.path): file_fingerprint(one.path) if in_part else one.fingerprint for one in sources}
 
     def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
         """Return the SHA-256 of names and sampled content of all files, and the names of those that count without it.
@@ -216,13 +212,19 @@ def open_series(
     if len(set(counts)) > 1:
         numbers_given = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
         raise FrameError(f"lights fired in succession need equal numbers of frames; given are {numbers_given}")
+    begins: Sequence[int] = ()
     numbers = _numbers(settings, lights) if in_order else ()
     if settings.lights > 1:
-        begins, numbers = _turns(numbers or range(sum(map(len, lights[0]))), settings.lights)
-        series = FrameSeries(lights=lights, numbers=numbers, turn=settings.lights, begins=begins)
-    else:
-        series = FrameSeries(lights=lights, numbers=numbers)
-    _check_sizes(series)
+        begins, numbers = _turns(numbers or range(counts[0]), settings.lights)
+    series = FrameSeries(lights=lights, numbers=numbers, turn=settings.lights, begins=begins)
+    shapes = series.shapes()
+    for first, (rows, columns) in shapes:
+        for source, shape in shapes:
+            if shape != (rows, columns):
+                raise FrameError(
+                    f"all frames must have one size: {source.path} has {shape[0]} rows of {shape[1]} pixels, "
+                    f"{first.path} has {rows} of {columns}"
+                )
     return replace(series, chosen=chosen_frames(settings, len(series)))
 
 
@@ -295,17 +297,6 @@ def _listed(numbers: Sequence[int], most: int = 10) -> str:
     return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")
 
 
-def _check_sizes(series: FrameSeries) -> None:
-    shapes = series.shapes()
-    for first, (rows, columns) in shapes:
-        for source, shape in shapes:
-            if shape != (rows, columns):
-                raise FrameError(
-                    f"all frames must have one size: {source.path} has {shape[0]} rows of {shape[1]} pixels, "
-                    f"{first.path} has {rows} of {columns}"
-                )
-
-
 def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]:
     """List frame files in natural order (frame9 before frame10).
 
@@ -328,20 +319,23 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     """
     text, dataset = split_dataset(pattern)
     place = Path(base) / text
-    try:
+    with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
         if place.is_dir():
             found = sorted(file for file in place.iterdir() if file.name[0] != ".")
             files = [file for file in found if file.suffix.lower() in frame_endings()]
         else:
             found = files = _matching(Path(text), Path(base))
         files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read
-    except OSError as error:
-        raise FrameError(f"the frames {pattern} cannot be looked for: {disk_reason(error)}") from None
     if not files:
         what = "a folder without frames" if place.is_dir() else "no file matches"
         other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")
         raise FrameError(f"no frames: {what}: {pattern} (looked for in {Path(base).resolve()}){other}")
-    return tuple(Path(f"{file}:{dataset}") if dataset else file for file in sorted(files, key=_natural_key))
+
+    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
+        parts = re.split(r"([0-9]+)", str(file).casefold())
+        return [(int(part), "") if place % 2 else (0, part) for place, part in enumerate(parts)], str(file)
+
+    return tuple(Path(f"{file}:{dataset}") if dataset else file for file in sorted(files, key=natural))
 
 
 def _matching(pattern: Path, base: Path) -> list[Path]:
@@ -352,9 +346,3 @@ def _matching(pattern: Path, base: Path) -> list[Path]:
     if not parts:
         return [base]
     return [base / match for match in glob.glob(str(Path(*parts)), root_dir=base, recursive=True)]  # noqa: PTH207
-
-
-def _natural_key(path: Path) -> tuple[list[tuple[int, str]], str]:
-    parts = re.split(r"([0-9]+)", str(path).casefold())
-    keys = [(int(part), "") if position % 2 else (0, part) for position, part in enumerate(parts)]
-    return keys, str(path)

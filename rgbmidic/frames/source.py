@@ -11,7 +11,7 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from rgbmidic.errors import FrameError, disk_reason, legible
+from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings, regular
@@ -125,10 +125,13 @@ class MovieHeader(Protocol):
     def recording(self) -> Recording:
         """Number, times and settings of the frames."""
 
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame, the first of which is a whole multiple of 4."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Movie(FrameSource):
-    """A file of several frames, whose header is read when the number of its frames is asked for.
+    """A file of several frames, whose header is read when the number of its frames is asked for, and reads the frames.
 
     Of a frame only its own samples are read, whatever the size of the file; a header that is `remembered` is read once.
     """
@@ -160,17 +163,17 @@ class Movie(FrameSource):
     def _stored(self, index: int) -> StoredFrame:
         return self._rows(index, range(self._shape()[0]))
 
-    @abstractmethod
-    def _header(self) -> MovieHeader: ...
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        return self._header().read(self.path, index, rows)
 
     @abstractmethod
-    def _rows(self, index: int, rows: range) -> StoredFrame: ...
+    def _header(self) -> MovieHeader: ...
 
 
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
     """Check that there is something to read; what the disk refuses becomes a FrameError."""
-    try:
+    with disk_faults(FrameError, f"{path} cannot be read"):
         if path.is_symlink() and not path.exists():
             raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
         if not regular(path).is_file():
@@ -178,8 +181,6 @@ def _on_disk(path: Path) -> Iterator[None]:
         if path.stat().st_size == 0:
             raise damaged(path, "it is empty")
         yield
-    except OSError as error:
-        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
 
 
 def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
@@ -215,7 +216,8 @@ def file_hash(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    return _digest(path, _sha256)
+    with disk_faults(FrameError, f"{path} cannot be read"):
+        return _sha256(Path(path))
 
 
 def file_fingerprint(path: Path | str) -> str:
@@ -236,14 +238,8 @@ def file_fingerprint(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    return _digest(path, _sampled)
-
-
-def _digest(path: Path | str, function: Callable[[Path], str]) -> str:
-    try:
-        return function(Path(path))
-    except OSError as error:
-        raise FrameError(f"{path} cannot be read: {disk_reason(error)}") from None
+    with disk_faults(FrameError, f"{path} cannot be read"):
+        return _sampled(Path(path))
 
 
 @remembered

@@ -14,11 +14,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError, first_line, legible
+from rgbmidic.errors import FrameError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import (
@@ -30,6 +30,7 @@ from rgbmidic.frames.stored import (
     check_size,
     cut_short,
     damaged,
+    faults_of,
 )
 from rgbmidic.typing import AnyArray
 
@@ -47,16 +48,16 @@ _MAXIMUM_HEADER = 2**16
 class _Stack:
     """An array of frames: the shape of one, (H, W) or (H, W, 3), the type of its samples, and how they were recorded.
 
-    `name` is that of the dataset in an HDF5 file.
+    `place` is where it lies: the byte where it begins in a .npy file, the name of the dataset in an HDF5 file.
     """
 
     frame: tuple[int, ...]
     dtype: np.dtype[Any]
     recording: Recording
-    name: str = ""
+    place: Any
 
     @classmethod
-    def of(cls, shape: tuple[int, ...], dtype: np.dtype[Any], what: object) -> _Stack:
+    def of(cls, shape: tuple[int, ...], dtype: np.dtype[Any], what: object, place: Any) -> Self:
         """Take apart the shape of an array.
 
         Raises
@@ -71,7 +72,7 @@ class _Stack:
                 f"{what} is an array of shape {shape} and type {dtype}; allowed are (frames, rows, columns), the same "
                 "with 3 channels behind, or one frame alone, of uint8 or uint16"
             )
-        return cls(frame=shape[-axes:], dtype=dtype, recording=Recording(count=count))
+        return cls(frame=shape[-axes:], dtype=dtype, recording=Recording(count=count), place=place)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -95,17 +96,23 @@ class _Stack:
 class NpyFile(Movie):
     """A numpy array of frames, of which one is read at a time."""
 
-    def _header(self) -> _Stack:
-        return _npy_stack(self.path)[0]
+    def _header(self) -> _NpyStack:
+        return _npy_stack(self.path)
 
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        stack, layout = _npy_stack(self.path)
-        data = layout.read(self.path, index, rows, stack.frame[0])
-        return stack.stored(np.frombuffer(data, dtype=stack.dtype).reshape(len(rows), *stack.frame[1:]), self.path)
+
+class _NpyStack(_Stack):
+    """The array of a .npy file."""
+
+    def layout(self, path: Path) -> Layout:
+        return Layout.checked(path, count=self.count, start=self.place, size=self.size)
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        data = self.layout(path).read(path, index, rows, self.frame[0])
+        return self.stored(np.frombuffer(data, dtype=self.dtype).reshape(len(rows), *self.frame[1:]), path)
 
 
 @remembered
-def _npy_stack(path: Path) -> tuple[_Stack, Layout]:
+def _npy_stack(path: Path) -> _NpyStack:
     with path.open("rb") as file:
         head = io.BytesIO(file.read(_MAXIMUM_HEADER))
     try:
@@ -114,12 +121,13 @@ def _npy_stack(path: Path) -> tuple[_Stack, Layout]:
         shape, fortran, dtype = read(head)
     except Exception as error:  # a damaged header is parsed as Python and fails in many ways
         raise damaged(path, f"its header is not numpy's: {first_line(error)}") from None
-    stack = _Stack.of(shape, dtype, path)
+    stack = _NpyStack.of(shape, dtype, path, head.tell())
     if fortran:
         raise FrameError(
             f"{path} is stored in Fortran order; save it with numpy.save(file, numpy.ascontiguousarray(stack))"
         )
-    return stack, Layout.checked(path, count=stack.count, start=head.tell(), size=stack.size)
+    stack.layout(path)  # refused at once where it cannot be
+    return stack
 
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".nxs")
@@ -155,7 +163,7 @@ class Hdf5File(Movie):
         """Return the name of a frame: file, dataset where one is named, and the frame's index."""
         return f"{legible(self.path.name)}{self.dataset and ':'}{self.dataset} frame {index}"
 
-    def _header(self) -> _Stack:
+    def _header(self) -> _Dataset:
         stacks = _hdf5_stacks(self.path)
         if self.dataset:
             name = "/" + self.dataset.strip("/")
@@ -175,13 +183,17 @@ class Hdf5File(Movie):
         check_count(self.path, stacks[name].count)
         return stacks[name]
 
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        stack, part = self._header(), slice(rows.start, rows.stop)
-        with _opened(self.path) as file:
-            dataset = file[stack.name]
-            _check_written(dataset, index, stack, self.path)
-            values = np.asarray(dataset[index, part] if dataset.ndim > len(stack.frame) else dataset[part])
-        return stack.stored(values, self.path)
+
+class _Dataset(_Stack):
+    """A dataset of an HDF5 file."""
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        part = slice(rows.start, rows.stop)
+        with _opened(path) as file:
+            dataset = file[self.place]
+            _check_written(dataset, index, self, path)
+            values = np.asarray(dataset[index, part] if dataset.ndim > len(self.frame) else dataset[part])
+        return self.stored(values, path)
 
 
 @contextmanager
@@ -189,30 +201,25 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     """Open the file; what libhdf5 raises while it is open becomes a FrameError."""
     import h5py
 
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            yield file
-    except RgbmidicError:
-        raise
-    except Exception as error:  # h5py meets damaged files with many kinds of error
-        raise damaged(path, first_line(error)) from None
+    with faults_of(path), h5py.File(path, "r", locking=False) as file:
+        yield file
 
 
 @remembered
-def _hdf5_stacks(path: Path) -> dict[str, _Stack]:
+def _hdf5_stacks(path: Path) -> dict[str, _Dataset]:
     """Find what can be frames: every dataset of unsigned integers in two to four dimensions."""
     import h5py
 
-    found: dict[str, _Stack] = {}
+    found: dict[str, _Dataset] = {}
 
     def look(name: str, item: Any) -> None:
         if not isinstance(item, h5py.Dataset):
             return
         try:
-            stack = _Stack.of(item.shape or (), item.dtype, name)
+            stack = _Dataset.of(item.shape or (), item.dtype, name, f"/{name}")
         except (FrameError, TypeError):
             return
-        found[f"/{name}"] = replace(stack, name=name, recording=_recording(item, stack.count))
+        found[f"/{name}"] = replace(stack, recording=_recording(item, stack.count))
 
     with _opened(path) as file:
         file.visititems(look)

@@ -19,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, InputError
+from rgbmidic.errors import FrameError, InputError, RgbmidicError, first_line
 from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, shift_cfa
 from rgbmidic.settings import FrameKind, FrameSettings
 from rgbmidic.typing import AnyArray, FloatArray
@@ -36,6 +36,7 @@ __all__ = [
     "complaints",
     "cut_short",
     "damaged",
+    "faults_of",
     "raw_frame",
     "unpack_bits",
 ]
@@ -59,6 +60,17 @@ MAXIMUM_FRAMES = 2_000_000
 def damaged(path: Path, reason: object) -> FrameError:
     """Return the error for a file that cannot be read whole."""
     return FrameError(f"{path} is damaged or truncated: {reason}")
+
+
+@contextmanager
+def faults_of(path: Path, *passed: type[Exception]) -> Iterator[None]:
+    """Turn what another library raises over a damaged file, in many kinds, into a FrameError; but for `passed`."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, (RgbmidicError, *passed)):
+            raise
+        raise damaged(path, first_line(error)) from None
 
 
 def check_size(path: Path, *, needed: int, stored: int) -> None:

@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, RgbmidicError, first_line
-from rgbmidic.frames.stored import damaged
+from rgbmidic.errors import FrameError
+from rgbmidic.frames.stored import damaged, faults_of
 from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
@@ -25,8 +25,11 @@ if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
 __all__ = [
-    "HEADERS",
+    "COLUMNS",
+    "DESCRIPTION",
+    "ROWS",
     "UNCOMPRESSED",
+    "PageList",
     "RawStructure",
     "cfa_pattern",
     "is_dng",
@@ -40,13 +43,23 @@ __all__ = [
 # A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
-_BYTE_ORDERS: dict[bytes, Literal["little", "big"]] = {b"II*\0": "little", b"MM\0*": "big"}
-HEADERS = (*_BYTE_ORDERS, b"II+\0", b"MM\0+")
+_HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 """Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
 UNCOMPRESSED = 1
 _REDUCED = 1
 _RAW_PHOTOMETRIC = (32803, 34892)
 _DNG_VERSION = 50706
+COLUMNS, ROWS, DESCRIPTION = 256, 257, 270
+_NEW_TYPE = 254
+_SHORT = 3
+_CLASSIC = 4
+"""Bytes of an offset in TIFF; in BigTIFF, which LibRaw does not read, they are 8."""
+_PIECE = 512
+"""Bytes that are read of a page at once: its usual one to two dozen entries."""
+_MOST_ENTRIES = 4096
+"""Entries of a page beyond which it is no page: those seen have a few dozen."""
+_TEXT_BYTES = 256 * 2**20
+"""Most bytes of a description: OME uses some 300 for every frame."""
 _CFA_REPEAT, _CFA_PATTERN = 33421, 33422
 _ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715, 50716)
 
@@ -61,7 +74,14 @@ def tiff_pages(path: Path) -> Iterator[list[TiffPage]]:
         It is no TIFF file, or what is done inside fails over a damaged header.
     """
     with _opened(path) as tiff:
-        yield [page for page in _pages(tiff) if not int(page.subfiletype) & _REDUCED]
+        pages: dict[int, TiffPage] = {}
+        for frame in tiff.pages:
+            page = frame.aspage()
+            if page.offset in pages:  # tifffile would go round for ever
+                raise ValueError("its list of images leads back to itself")
+            pages[page.offset] = page
+        found = (one for page in pages.values() for one in (page, *(child.aspage() for child in page.pages or ())))
+        yield [page for page in found if not int(page.subfiletype) & _REDUCED]
 
 
 @contextmanager
@@ -85,41 +105,115 @@ def _opened(path: Path) -> Iterator[TiffFile]:
     import tifffile
 
     with regular(path).open("rb") as file:
-        if file.read(4) not in HEADERS:  # tifffile tries some camera raws that begin as a TIFF file does
+        if file.read(4) not in _HEADERS:  # tifffile tries some camera raws that begin as a TIFF file does
             raise damaged(path, "it is not a TIFF file")
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            yield tiff
-    except (RgbmidicError, OSError):
-        raise
-    except Exception as error:  # tifffile meets damaged headers with many kinds of error
-        raise damaged(path, first_line(error)) from None
+    with faults_of(path, OSError), tifffile.TiffFile(path) as tiff:
+        yield tiff
 
 
 def is_dng(path: Path) -> bool:
     """Return whether the first image has the tag of DNG, whatever the file's name; False for what cannot be read."""
     try:
         with regular(path).open("rb") as file:
-            head = file.read(8)
-            order = _BYTE_ORDERS.get(head[:4], "little")
-            file.seek(int.from_bytes(head[4:], order))
-            tags = file.read(12 * int.from_bytes(file.read(2), order))
-    except OSError:
+            pages = PageList.begin(file, path)
+            first = pages.content(pages.first) if pages.offset == _CLASSIC else None
+            return first is not None and pages.place(first, _DNG_VERSION) > 0
+    except (OSError, FrameError):
         return False
-    return head[:4] in _BYTE_ORDERS and _DNG_VERSION in (
-        int.from_bytes(tags[start : start + 2], order) for start in range(0, len(tags), 12)
-    )
 
 
-def _pages(tiff: TiffFile) -> Iterator[TiffPage]:
-    seen: set[int] = set()
-    for frame in tiff.pages:
-        page = frame.aspage()
-        if page.offset in seen:  # tifffile would go round for ever
-            raise ValueError("its list of images leads back to itself")
-        seen.add(page.offset)
-        yield page
-        yield from (child.aspage() for child in page.pages or ())
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PageList:
+    """The pages of an open TIFF file, found without tifffile, which takes seconds for a hundred thousand of them.
+
+    Attributes
+    ----------
+    file, size
+        The file and its bytes.
+    order
+        Its byte order.
+    offset, count, entry
+        Widths in bytes of an offset, of a number of entries, of an entry.
+    first
+        Where the first page begins.
+    """
+
+    file: BinaryIO
+    size: int
+    order: Literal["little", "big"]
+    offset: int
+    count: int
+    entry: int
+    first: int
+
+    @classmethod
+    def begin(cls, file: BinaryIO, path: Path) -> PageList:
+        """Read the header; a FrameError where it is no TIFF file's."""
+        head = file.read(4)
+        if head not in _HEADERS:
+            raise damaged(path, "it is not a TIFF file")
+        order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
+        offset, count, entry = (8, 8, 20) if head in _HEADERS[2:] else (4, 2, 12)
+        file.seek(offset)  # 4 or 8: of both headers the offset of the first page is the last field
+        first = int.from_bytes(file.read(offset), order)
+        size = file.seek(0, 2)
+        return cls(file=file, size=size, order=order, offset=offset, count=count, entry=entry, first=first)
+
+    def offsets(self, path: Path) -> tuple[list[int], bool]:
+        """Where the pages in full resolution begin, and whether their list leads out of the file."""
+        offset = self.first
+        found: list[int] = []
+        seen: set[int] = set()
+        while offset:
+            content = self.content(offset)
+            if offset in seen or (content is None and not found):
+                raise damaged(path, "its list of images leads back to itself" if found else "it leads to no image")
+            if content is None:
+                return found, True
+            seen.add(offset)
+            # entries come in the order of their codes, and that of reduced images is the lowest
+            if self._number(content, self.count, 2) != _NEW_TYPE or not self.value(content, _NEW_TYPE) & 1:
+                found.append(offset)
+            offset = self._number(content, len(content) - self.offset, self.offset)
+        if not found:
+            raise damaged(path, "its header leads to no image")
+        return found, False
+
+    def content(self, offset: int) -> bytes | None:
+        """Read the number of entries, the entries and the offset of the next page; None where the file ends before."""
+        if offset + self.count > self.size:
+            return None
+        self.file.seek(offset)
+        content = self.file.read(_PIECE)
+        number = self._number(content, 0, self.count)
+        needed = self.count + number * self.entry + self.offset
+        if not 0 < number <= _MOST_ENTRIES or offset + needed > self.size:
+            return None
+        return content[:needed] + self.file.read(max(needed - len(content), 0))
+
+    def value(self, content: bytes, code: int) -> int:
+        """Return the one value of an entry; 0 where there is none."""
+        found = self.place(content, code)
+        width = 2 if self._number(content, found + 2, 2) == _SHORT else 4
+        return self._number(content, found + 4 + self.offset, width) if found else 0
+
+    def text(self, content: bytes, code: int) -> str:
+        """Return the text of an entry; empty where there is none."""
+        found = self.place(content, code)
+        number = self._number(content, found + 4, self.offset) if found else 0
+        start = found + 4 + self.offset
+        if number <= self.offset:
+            return content[start : start + number].decode(errors="replace").rstrip("\0")
+        self.file.seek(min(self._number(content, start, self.offset), self.size))
+        return self.file.read(min(number, _TEXT_BYTES)).decode(errors="replace").rstrip("\0")
+
+    def place(self, content: bytes, code: int) -> int:
+        """Return where the entry begins; 0 where there is none."""
+        starts = range(self.count, len(content) - self.offset, self.entry)
+        return next((start for start in starts if self._number(content, start, 2) == code), 0)
+
+    def _number(self, content: bytes, start: int, width: int) -> int:
+        return int.from_bytes(content[start : start + width], self.order)
 
 
 def missing_data(page: TiffPage, size: int) -> str | None:

@@ -1,7 +1,4 @@
-"""TIFF and BigTIFF files of several frames: one page each, as ImageJ's hyperstacks and OME-TIFF are, too.
-
-The list of pages is followed by own code, once: a hundred thousand pages take tifffile seconds, for every frame anew.
-"""
+"""TIFF and BigTIFF files of several frames: one page each, as ImageJ's hyperstacks and OME-TIFF are, too."""
 
 from __future__ import annotations
 
@@ -9,17 +6,17 @@ import re
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Literal
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import Integers, Recording, even_times
+from rgbmidic.frames.data import Integers, Recording, even_times, fraction
 from rgbmidic.frames.images import checked_page, page_frame, page_rows
 from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import Layout, StoredFrame, check_count, damaged
-from rgbmidic.frames.tiff_pages import HEADERS, is_stored_as_is, tiff_page
+from rgbmidic.frames.stored import Layout, StoredFrame, check_count
+from rgbmidic.frames.tiff_pages import COLUMNS, DESCRIPTION, ROWS, PageList, is_stored_as_is, tiff_page
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
@@ -28,25 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["TiffStack", "is_tiff_stack"]
 
-_PIECE = 512
-"""Bytes that are read of a page at once: its usual one to two dozen entries."""
-_MOST_ENTRIES = 4096
-"""Entries of a page beyond which it is no page: those seen have a few dozen."""
-_DESCRIPTION_BYTES = 256 * 2**20
-"""Most bytes of a description: OME uses some 300 for every frame."""
-_SHORT = 3
-_NEW_TYPE, _COLUMNS, _ROWS, _DESCRIPTION = 254, 256, 257, 270
-_UNITS = {
-    "s": 1,
-    "sec": 1,
-    "seconds": 1,
-    "ms": 1000,
-    "msec": 1000,
-    "µs": 10**6,
-    "us": 10**6,
-    "usec": 10**6,
-    "ns": 10**9,
-}
+_UNITS = {"s": 1, "sec": 1, "seconds": 1}
+_UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": 10**9}
+"""Of time, by how many make a second."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,28 +36,6 @@ class TiffStack(Movie):
 
     def _header(self) -> _Stack:
         return _stack(self.path)
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        stack = _stack(self.path)
-        if index >= len(stack.offsets) > 1:
-            raise FrameError(
-                f"{self.path}: its list of frames ends after {index - 1}: truncated or still being written"
-            )
-        behind_one_page = len(stack.offsets) == 1
-        with tiff_page(self.path, int(stack.offsets[0 if behind_one_page else index])) as page:
-            checked_page(page, self.path)
-            if (page.imagelength, page.imagewidth) != stack.shape:
-                sizes = "{} rows of {} pixels, the first {} of {}".format(
-                    page.imagelength, page.imagewidth, *stack.shape
-                )
-                raise FrameError(f"{self.path}: frame {index} has {sizes}")
-            samples = (
-                _behind(page, self.path, index, stack.recording.count, rows)
-                if behind_one_page
-                else page_rows(page, self.path, rows)
-            )
-            stored = page_frame(page, self.path, samples)
-            return stored if samples is not None else replace(stored, values=stored.values[rows.start : rows.stop])
 
 
 def is_tiff_stack(path: Path) -> bool:
@@ -106,15 +65,30 @@ class _Stack:
     shape: tuple[int, int]
     recording: Recording
 
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame."""
+        if index >= len(self.offsets) > 1:
+            raise FrameError(f"{path}: its list of frames ends after {index - 1}: truncated or still being written")
+        alone = len(self.offsets) == 1
+        with tiff_page(path, int(self.offsets[0 if alone else index])) as page:
+            checked_page(page, path)
+            if (page.imagelength, page.imagewidth) != self.shape:
+                here = f"{page.imagelength} rows of {page.imagewidth} pixels"
+                raise FrameError(f"{path}: frame {index} has {here}, the first {self.shape[0]} of {self.shape[1]}")
+            count = self.recording.count
+            samples = _behind(page, path, index, count, rows) if alone else page_rows(page, path, rows)
+            stored = page_frame(page, path, samples)
+            return stored if samples is not None else replace(stored, values=stored.values[rows.start : rows.stop])
+
 
 @remembered
 def _stack(path: Path) -> _Stack:
     with regular(path).open("rb") as file:
-        pages = _Pages.begin(file, path)
+        pages = PageList.begin(file, path)
         offsets, ends_early = pages.offsets(path)
         content = pages.content(offsets[0]) or b""
-        text = pages.text(content, _DESCRIPTION)
-        shape = (pages.value(content, _ROWS), pages.value(content, _COLUMNS))
+        text = pages.text(content, DESCRIPTION)
+        shape = (pages.value(content, ROWS), pages.value(content, COLUMNS))
     images = re.search(r"^images=([0-9]{1,9})$", text, re.MULTILINE) if text.startswith("ImageJ=") else None
     count = int(images[1]) if images and len(offsets) == 1 else len(offsets) + (ends_early and len(offsets) > 1)
     check_count(path, count)
@@ -123,96 +97,13 @@ def _stack(path: Path) -> _Stack:
     return _Stack(offsets=np.array(offsets, dtype=np.int64), shape=shape, recording=recording)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Pages:
-    """The pages of an open file of `size` bytes; widths in bytes of an offset, a number of entries, an entry."""
-
-    file: BinaryIO
-    size: int
-    order: Literal["little", "big"]
-    offset: int
-    count: int
-    entry: int
-
-    @classmethod
-    def begin(cls, file: BinaryIO, path: Path) -> _Pages:
-        head = file.read(4)
-        if head not in HEADERS:
-            raise damaged(path, "it is not a TIFF file")
-        big = head in HEADERS[2:]
-        order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
-        widths = {"offset": 8, "count": 8, "entry": 20} if big else {"offset": 4, "count": 2, "entry": 12}
-        return cls(file=file, size=file.seek(0, 2), order=order, **widths)
-
-    def offsets(self, path: Path) -> tuple[list[int], bool]:
-        """Where the pages in full resolution begin, and whether their list leads out of the file."""
-        self.file.seek(self.offset)  # 4 or 8: of both headers the offset of the first page is the last field
-        offset = self._number(self.file.read(self.offset), 0, self.offset)
-        found: list[int] = []
-        seen: set[int] = set()
-        while offset:
-            content = self.content(offset)
-            if offset in seen or (content is None and not found):
-                raise damaged(path, "its list of images leads back to itself" if found else "it leads to no image")
-            if content is None:
-                return found, True
-            seen.add(offset)
-            if not self._reduced(content):
-                found.append(offset)
-            offset = self._number(content, len(content) - self.offset, self.offset)
-        if not found:
-            raise damaged(path, "its header leads to no image")
-        return found, False
-
-    def content(self, offset: int) -> bytes | None:
-        """Read the number of entries, the entries and the offset of the next page; None where the file ends before."""
-        if offset + self.count > self.size:
-            return None
-        self.file.seek(offset)
-        content = self.file.read(_PIECE)
-        number = self._number(content, 0, self.count)
-        needed = self.count + number * self.entry + self.offset
-        if not 0 < number <= _MOST_ENTRIES or offset + needed > self.size:
-            return None
-        return content[:needed] + self.file.read(max(needed - len(content), 0))
-
-    def value(self, content: bytes, code: int) -> int:
-        """Return the one value of an entry; 0 where there is none."""
-        found = self._entry(content, code)
-        width = 2 if self._number(content, found + 2, 2) == _SHORT else 4
-        return self._number(content, found + 4 + self.offset, width) if found else 0
-
-    def text(self, content: bytes, code: int) -> str:
-        """Return the text of an entry; empty where there is none."""
-        found = self._entry(content, code)
-        number = self._number(content, found + 4, self.offset) if found else 0
-        start = found + 4 + self.offset
-        if number <= self.offset:
-            return content[start : start + number].decode(errors="replace").rstrip("\0")
-        self.file.seek(min(self._number(content, start, self.offset), self.size))
-        return self.file.read(min(number, _DESCRIPTION_BYTES)).decode(errors="replace").rstrip("\0")
-
-    def _entry(self, content: bytes, code: int) -> int:
-        """Return where the entry begins; 0 where there is none."""
-        starts = range(self.count, len(content) - self.offset, self.entry)
-        return next((start for start in starts if self._number(content, start, 2) == code), 0)
-
-    def _reduced(self, content: bytes) -> bool:
-        # entries come in the order of their codes, and this one's is the lowest
-        return self._number(content, self.count, 2) == _NEW_TYPE and bool(self.value(content, _NEW_TYPE) & 1)
-
-    def _number(self, content: bytes, start: int, width: int) -> int:
-        return int.from_bytes(content[start : start + width], self.order)
-
-
 def _imagej_times(text: str, count: int) -> Integers | None:
     """Derive times from ImageJ's frame interval, where all images are frames in time."""
     entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
-    interval = _fraction(entries.get("finterval", ""))
     others = {"channels", "slices"} & entries.keys()
     if entries.get("frames", "" if others else str(count)) != str(count):
         return None
-    return _even(interval, entries.get("tunit", "s"), count)
+    return _even_times(entries.get("finterval", ""), entries.get("tunit", "s"), count)
 
 
 def _ome_times(text: str, count: int) -> Integers | None:
@@ -226,19 +117,19 @@ def _ome_times(text: str, count: int) -> Integers | None:
     if pixels is None or pixels.get("SizeT") != str(count):
         return None
     if pixels.get("TimeIncrement"):
-        return _even(_fraction(pixels.get("TimeIncrement", "")), pixels.get("TimeIncrementUnit", "s"), count)
+        return _even_times(pixels.get("TimeIncrement", ""), pixels.get("TimeIncrementUnit", "s"), count)
     planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
     each = [planes.get(str(index), pixels) for index in range(count)]
-    times = [(_fraction(plane.get("DeltaT", "")), _UNITS.get(plane.get("DeltaTUnit", "s"))) for plane in each]
-    if any(time is None or unit is None for time, unit in times):
-        return None
-    return np.array([round(time * 10**9 / unit) for time, unit in times if time is not None and unit], dtype=np.int64)
+    times = [_seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s")) for plane in each]
+    known = [round(time * 10**9) for time in times if time is not None]
+    return np.array(known, dtype=np.int64) if len(known) == count else None
 
 
-def _even(interval: Fraction | None, unit: str, count: int) -> Integers | None:
-    per_second = _UNITS.get(unit)
-    return even_times(range(count), interval / per_second) if interval and per_second else None
+def _even_times(interval: str, unit: str, count: int) -> Integers | None:
+    seconds = _seconds(interval, unit)
+    return even_times(range(count), seconds) if seconds else None
 
 
-def _fraction(text: str) -> Fraction | None:
-    return Fraction(text) if re.fullmatch(r"[0-9]{1,9}(\.[0-9]{1,15})?([eE]-?[0-9])?", text) else None
+def _seconds(text: str, unit: str) -> Fraction | None:
+    number = fraction(text)
+    return None if number is None or unit not in _UNITS else number / _UNITS[unit]

@@ -2,50 +2,42 @@
 
 `rgbmidic-calibrate` writes the file, the main job reads it. Camera channels = A . lights (rows of A: camera channels,
 columns: lights), every column divided by its largest entry, so that a light's image is in grey levels of the channel
-that sees it best. What reads a section raises KeyError, TypeError or ValueError where the file is damaged.
+that sees it best.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
-from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
 from rgbmidic.illumination.registration import Registration
-from rgbmidic.settings import FrameKind, regular
-from rgbmidic.typing import FloatArray
+from rgbmidic.settings import FrameKind, plain, read_section, read_table, regular
 
-__all__ = [
-    "SCHEMA_VERSION",
-    "Calibration",
-    "Crosstalk",
-    "crosstalk_document",
-    "read_crosstalk",
-    "read_json",
-    "read_level",
-    "read_positive",
-    "read_registration",
-    "read_section",
-    "registration_document",
-]
+__all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk"]
+
+_Section = TypeVar("_Section")
 
 SCHEMA_NAME = "rgbmidic-calibration"
 SCHEMA_VERSION = 1
 
 _PLANES = {"bayer": 4, "rgb": 3, "monochrome": 1}
 _CHANNELS = {"bayer": 3, "rgb": 3, "monochrome": 1}
+_CAMERA = ("kind", "cfa", "black_level", "white_level", "unevenness", "shape")
+"""Fields of a `Calibration` that are keys of the section ``camera``."""
+_PARAMETERS = ["shift_x_px", "shift_y_px", "rotation_rad", "scale", "radial_at_radius"]
+"""Names of the registration's parameters with their units, for readers of the file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """All that is known of camera and lights; a section that was not measured is None.
+    """Calibration of camera and lights; a section that was not measured is None.
 
     Attributes
     ----------
@@ -60,7 +52,7 @@ class Calibration:
     shape
         Rows and columns of the captures.
     name
-        What messages call it: its file.
+        Name in messages: its file.
     unevenness
         Of the grey levels' histogram in the captures (`rgbmidic.illumination.frame_check.unevenness`).
     provenance
@@ -182,7 +174,7 @@ class Calibration:
         """
         path = Path(path)
         try:
-            document = read_json(path)
+            document = _read_json(path)
         except FileNotFoundError:
             raise CalibrationError(f"calibration file not found: {path}") from None
         except (OSError, ValueError, RecursionError) as error:
@@ -203,46 +195,37 @@ class Calibration:
     @classmethod
     def _from_document(cls, document: dict[str, Any], name: str) -> Calibration:
         known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
-        camera, noise = (read_section(document, name) or {} for name in ("camera", "noise"))
-        if (cfa := camera.get("cfa")) is not None and cfa not in BAYER_PATTERNS:
+        camera, noise = read_table(document, "camera"), read_table(document, "noise")
+        if (cfa := camera.get("cfa")) not in (None, *BAYER_PATTERNS):
             raise ValueError(f"camera.cfa is {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
-        if (kind := camera.get("kind")) not in (None, *_PLANES):
-            raise ValueError(f"camera.kind is {kind!r}; allowed are {', '.join(_PLANES)}")
-        shape = camera.get("shape")
-        return cls(
+        return read_section(
+            cls,
+            "camera",
+            {key: camera[key] for key in _CAMERA if key in camera},
             name=name,
-            kind=kind,
-            crosstalk=read_crosstalk(read_section(document, "crosstalk")),
-            noise=NoiseModel(gain=read_positive(noise, "gain"), read_noise=read_positive(noise, "read_noise"))
-            if noise
-            else None,
-            camera_noise=CameraNoise.from_document(noise["planes"]) if "planes" in noise else None,
-            registration=read_registration(read_section(document, "registration")),
-            cfa=cfa,
-            black_level=read_level(camera, "black_level"),
-            white_level=read_level(camera, "white_level"),
-            shape=None if shape is None else (int(shape[0]), int(shape[1])),
-            unevenness=read_level(camera, "unevenness"),
-            provenance=read_section(document, "provenance") or {},
+            crosstalk=_read(Crosstalk, document, "crosstalk"),
+            noise=_read(NoiseModel, document, "noise"),
+            camera_noise=_read(CameraNoise, noise, "planes"),
+            registration=_read(Registration, document, "registration"),
+            provenance=read_table(document, "provenance"),
             extra={key: value for key, value in document.items() if key not in known},
         )
 
     def to_document(self) -> dict[str, Any]:
         """Return the JSON document, as plain dictionaries, lists and numbers."""
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION}
-        camera: dict[str, Any] = {
-            name: getattr(self, name) for name in ("kind", "cfa", "black_level", "white_level", "unevenness")
-        }
-        camera["shape"] = None if self.shape is None else list(self.shape)
+        camera = {name: plain(getattr(self, name)) for name in _CAMERA}
         document["camera"] = {key: value for key, value in camera.items() if value is not None}
+        for name in ("crosstalk", "noise", "registration"):
+            if (section := getattr(self, name)) is not None:
+                document[name] = plain(section)
         if self.crosstalk is not None:
-            document["crosstalk"] = crosstalk_document(self.crosstalk)
-        if self.noise is not None:
-            document["noise"] = {"gain": self.noise.gain, "read_noise": self.noise.read_noise}
-            if self.camera_noise is not None:
-                document["noise"]["planes"] = self.camera_noise.to_document()
+            document["crosstalk"]["condition_number"] = self.crosstalk.condition_number
+            document["crosstalk"]["noise_amplification"] = plain(self.crosstalk.noise_amplification)
+        if self.camera_noise is not None:
+            document["noise"]["planes"] = plain(self.camera_noise)
         if self.registration is not None:
-            document["registration"] = registration_document(self.registration)
+            document["registration"]["parameter_names"] = _PARAMETERS
         return {**document, **self.extra, "provenance": dict(self.provenance)}
 
     def write(self, path: Path | str) -> None:
@@ -270,7 +253,7 @@ _LARGEST = 1e30
 """Beyond it squares and products of figures would be infinite."""
 
 
-def read_json(path: Path) -> Any:
+def _read_json(path: Path) -> Any:
     """Read the document of a JSON file; OSError, ValueError or RecursionError where there is none."""
     text = regular(path).read_text(encoding="utf-8")
     return json.loads(
@@ -278,88 +261,12 @@ def read_json(path: Path) -> Any:
     )
 
 
-def read_crosstalk(section: dict[str, Any] | None) -> Crosstalk | None:
-    """Return the crosstalk of its section."""
-    if section is None:
+def _read(kind: type[_Section], document: dict[str, Any], name: str) -> _Section | None:
+    """Object of a section of the file, None where it is not there; what is derived from other keys is not read."""
+    if document.get(name) is None:
         return None
-    variation = read_section(section, "field")
-    return Crosstalk(
-        matrix=section["matrix"],
-        lights=_names(section["lights"]),
-        std=section.get("std"),
-        covariance=section.get("covariance"),
-        field=None
-        if variation is None
-        else CrosstalkField(
-            order=int(variation["order"]),
-            coefficients=variation["coefficients"],
-            shape=tuple(variation["shape"]),
-            std=variation.get("std"),
-        ),
-    )
-
-
-def crosstalk_document(crosstalk: Crosstalk) -> dict[str, Any]:
-    """Return the section of a crosstalk."""
-    document: dict[str, Any] = {
-        "lights": list(crosstalk.lights),
-        "matrix": crosstalk.matrix.tolist(),
-        "std": _listed(crosstalk.std),
-        "covariance": _listed(crosstalk.covariance),
-        "condition_number": crosstalk.condition_number,
-        "noise_amplification": crosstalk.noise_amplification.tolist(),
-    }
-    if (variation := crosstalk.field) is not None:
-        document["field"] = {
-            "order": variation.order,
-            "shape": list(variation.shape),
-            "coefficients": variation.coefficients.tolist(),
-            "std": _listed(variation.std),
-        }
-    return document
-
-
-def read_registration(section: dict[str, Any] | None) -> Registration | None:
-    """Return the registration of its section."""
-    if section is None:
-        return None
-    return Registration(
-        lights=_names(section["lights"]),
-        parameters=section["parameters"],
-        centre=tuple(section["centre"]),
-        radius=read_positive(section, "radius"),
-        covariance=section.get("covariance"),
-    )
-
-
-def registration_document(registration: Registration) -> dict[str, Any]:
-    """Return the section of a registration."""
-    return {
-        "lights": list(registration.lights),
-        "parameter_names": ["shift_x_px", "shift_y_px", "rotation_rad", "scale", "radial_at_radius"],
-        "parameters": registration.parameters.tolist(),
-        "centre": list(registration.centre),
-        "radius": registration.radius,
-        "covariance": _listed(registration.covariance),
-    }
-
-
-def _listed(values: FloatArray | None) -> Any:
-    return None if values is None else values.tolist()
-
-
-def read_section(document: dict[str, Any], name: str) -> dict[str, Any] | None:
-    """Return a section of the file, None where it is not there."""
-    section = document.get(name)
-    if section is not None and not isinstance(section, dict):
-        raise ValueError(f"{name} must be a section of keys, not {section!r}")
-    return section
-
-
-def _names(lights: Any) -> tuple[str, ...]:
-    if not isinstance(lights, list) or not all(isinstance(name, str) for name in lights):
-        raise ValueError(f"lights must be a list of names, not {lights!r}")
-    return tuple(lights)
+    table, keys = read_table(document, name), {entry.name for entry in fields(cast(Any, kind))}
+    return read_section(kind, name, {key: table[key] for key in table if key in keys})
 
 
 def _number(text: str) -> float:
@@ -368,19 +275,3 @@ def _number(text: str) -> float:
     if not abs(value) <= _LARGEST:
         raise ValueError(f"{text[:40]} is not a number of a calibration")
     return value
-
-
-def read_positive(section: dict[str, Any], key: str) -> float:
-    """Return a positive number of a section."""
-    value = section[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"{key} must be a positive number, not {value!r}")
-    return float(value)
-
-
-def read_level(camera: dict[str, Any], key: str) -> float | None:
-    """Return a grey level of the section of the camera; None where it is not stated."""
-    value = camera.get(key)
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
-        raise ValueError(f"camera.{key} must be a number, not {value!r}")
-    return None if value is None else float(value)

@@ -1,7 +1,7 @@
-"""Slope of each colour on the common texture, and what is channel-specific, block by block, from a single mosaic.
+"""Slope of each colour on the common texture, and its channel-specific variance, block by block, from a single mosaic.
 
 A sample of camera channel c is ``m_c = mean_c + alpha_c a + e_c``. alpha_c, the slope on the common texture a, is
-smooth; e_c is what only this channel shows there, the erratic part of a reflection and camera noise. Low-passed to the
+smooth; e_c is the channel-specific component, the erratic part of a reflection and camera noise. Low-passed to the
 band that all colours resolve, two channels have the moment ``alpha_c alpha_c'`` in common and nothing else, so three
 channels give three slopes (``alpha_1^2 = M_12 M_13 / M_23``, a one-factor analysis), free of the bias that noise gives
 a regression; what a channel's own moment has beyond that is the variance of e_c.
@@ -53,7 +53,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
-    """What is gathered from the mosaic before the texture is known.
+    """Local means and moments of a mosaic, from which its texture is learnt.
 
     Attributes
     ----------
@@ -89,25 +89,25 @@ class ColourFactors:
     ----------
     slope : (3, h, w) float64
         alpha_c in DN per standard deviation of the texture.
-    private : (3, h, w) float64
+    specific : (3, h, w) float64
         Variance of e_c without camera noise, relative to alpha_c².
     noise : (3, h, w) float64
         Variance of the camera noise, relative to alpha_c².
     """
 
     slope: FloatArray
-    private: FloatArray
+    specific: FloatArray
     noise: FloatArray
 
     @property
     def spread(self) -> FloatArray:
         """Standard deviation (3, h, w) of each channel's contrast without camera noise, DN."""
-        return np.asarray(self.slope * np.sqrt(1 + self.private))
+        return np.asarray(self.slope * np.sqrt(1 + self.specific))
 
     @property
     def common_fraction(self) -> FloatArray:
         """Fraction (3, h, w) of the common texture in each channel's variance, 0 to 1."""
-        return np.asarray(1 / (1 + self.private))
+        return np.asarray(1 / (1 + self.specific))
 
 
 def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel | None) -> Moments:
@@ -260,11 +260,11 @@ def colour_factors(
     moments
         See `gather_moments`.
     band
-        What the planes show of the texture (`TextureModel.band`).
+        Second moments of the low-passed planes for unit texture (`TextureModel.band`).
     crosstalk : (3, k)
         A in channels = A . lights: one light's sparkle is seen by all channels, which is taken out of their moments.
     coloured
-        `TextureModel.private`: 1 for a specimen on which no colour shows the common texture alone.
+        `TextureModel.specific`: 1 for a specimen on which no colour shows the common texture alone.
 
     Returns
     -------
@@ -287,8 +287,8 @@ def colour_factors(
         excess = own / square
         least = excess.min(axis=0)
         # at least one channel is free of reflections at each place, unless it shows too much of its own for that
-        private = excess - least + np.maximum(least - 1 - allowed, 0)
-        sparkle = private * square * band.own
+        specific = excess - least + np.maximum(least - 1 - allowed, 0)
+        sparkle = specific * square * band.own
     # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side
-    variance = np.maximum(private * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
-    return ColourFactors(slope=np.sqrt(square), private=variance, noise=moments.noise / square)
+    variance = np.maximum(specific * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
+    return ColourFactors(slope=np.sqrt(square), specific=variance, noise=moments.noise / square)

@@ -168,13 +168,13 @@ class FilterTable:
 
 
 def prediction_filters(
-    private: FloatArray, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
+    specific: FloatArray, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
 ) -> FilterTable:
     """Return the table of filters for tiles whose channels have some variance of their own.
 
     Parameters
     ----------
-    private : (3, h, w)
+    specific : (3, h, w)
         Channel-specific variance in each tile, relative to the common one.
     noise : (3,)
         Variance of the camera noise of each channel relative to the channel's own variance.
@@ -190,7 +190,7 @@ def prediction_filters(
     FilterTable
         With one output for each channel.
     """
-    level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(private, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
+    level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
     code = (level[0] * 1000 + level[1]) * 1000 + level[2]
     _, first, index = np.unique(code, return_index=True, return_inverse=True)
     fraction = 1 / (1 + 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE))
@@ -204,25 +204,39 @@ def prediction_filters(
 
 
 def _solved(fraction: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int) -> FloatArray:
-    """Return filters (T, 4, 3, size²) for fractions (T, 3) of the common texture."""
+    """Return filters (T, 4, 3, size²) for fractions (T, 3) of the common texture.
+
+    Covariances and Bayer pattern are alike left and right of the centre, and above and below it, and so are the
+    filters: what is solved for is the sum of the samples that lie alike, of which there are 9 among 25.
+    """
     common, fine = _covariances(texture, size)
     # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
-    private = texture.private * common + (1 - texture.private) * fine
-    centre, count = size * size // 2, len(fraction)
-    taps = np.empty((count, 4, 3, size * size))
+    specific = texture.specific * common + (1 - texture.specific) * fine
+    alike, first = _alike(size)
+    shared, centre = alike.T @ common @ alike, alike.T @ common[:, size * size // 2]
+    noisy, mine_centre = np.maximum(noise, 1e-8), alike.T @ specific[:, size * size // 2]
+    taps = np.empty((len(fraction), 4, 3, size * size))
     cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
     for phase, (p, q) in enumerate(np.ndindex(2, 2)):  # of the centre of the square
         channel = cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel()
+        own_part = alike.T @ ((channel[:, None] == channel) * specific) @ alike
+        channel = channel[first]
         root, own = np.sqrt(fraction[:, channel]), np.sqrt(1 - fraction[:, channel])
-        same = channel[:, None] == channel[None]
-        samples = root[:, :, None] * root[:, None] * common + own[:, :, None] * own[:, None] * (same * private)
-        samples[:, np.arange(size * size), np.arange(size * size)] += np.maximum(noise, 1e-8)[channel]
-        mine = channel[:, None] == np.arange(3)
-        wanted = root[:, :, None] * np.sqrt(fraction)[:, None] * common[:, centre, None]
-        wanted += (1 - fraction)[:, None] * (mine * private[:, centre, None])
-        solution = np.linalg.solve(samples, wanted)
-        taps[:, phase] = solution.transpose(0, 2, 1)
+        samples = root[:, :, None] * root[:, None] * shared + own[:, :, None] * own[:, None] * own_part
+        samples += np.diag(noisy[channel])
+        wanted = root[:, :, None] * np.sqrt(fraction)[:, None] * centre[:, None]
+        wanted += (1 - fraction)[:, None] * ((channel[:, None] == np.arange(3)) * mine_centre[:, None])
+        taps[:, phase] = (alike @ np.linalg.solve(samples, wanted)).transpose(0, 2, 1)
     return taps
+
+
+@lru_cache
+def _alike(size: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Return unit vectors (size², m) that are equal where samples lie alike about the centre, and one of these each."""
+    distance = np.abs(np.arange(size) - size // 2)
+    _, first, group = np.unique(distance[:, None] * size + distance, return_index=True, return_inverse=True)
+    alike = (group.reshape(-1, 1) == np.arange(first.size)).astype(np.float64)
+    return alike / np.sqrt(alike.sum(axis=0)), first
 
 
 @lru_cache(maxsize=64)
@@ -313,11 +327,11 @@ class ReflectionAwareDemosaicer:
         moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise)
         texture = learn_texture(moments) if self.texture is None else self.texture
         matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
-        factors = colour_factors(moments, texture.band, matrix, coloured=texture.private)
-        noise = np.median(factors.noise / (1 + factors.private), axis=(1, 2))
+        factors = colour_factors(moments, texture.band, matrix, coloured=texture.specific)
+        noise = np.median(factors.noise / (1 + factors.specific), axis=(1, 2))
         # a colour left to itself has only every other sample, so it needs to look farther
-        size = SIZE if texture.private < 0.5 else WIDE
-        table = prediction_filters(_per_tile(factors.private), noise, texture, mosaic.cfa, size=size)
+        size = SIZE if texture.specific < 0.5 else WIDE
+        table = prediction_filters(_per_tile(factors.specific), noise, texture, mosaic.cfa, size=size)
         mixing = np.eye(3) if mixing is None else mixing
         out, unknown = _predict(moments, factors, table, mixing, damaged=damaged)
         valid = np.ones(out.shape, dtype=bool)

@@ -14,7 +14,6 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import savgol_coeffs, savgol_filter
 from scipy.special import erf
 
 from rgbmidic.errors import ConfigurationError, FrameError
@@ -360,6 +359,8 @@ def unevenness(
     -------
     float
     """
+    from scipy.signal import savgol_coeffs, savgol_filter  # a second to import
+
     if samples.size < 1000:
         return float("nan")
     count = np.bincount(samples // step).astype(np.float64)

@@ -1,6 +1,6 @@
 """Grey levels proportional to light: black level subtracted, saturated samples marked.
 
-What the photon transfer method finds out about a camera, per colour plane, each figure with its uncertainty.
+The figures of a camera per colour plane, each with its uncertainty, come from the photon transfer method.
 
 Names and definitions follow EMVA standard 1288 (release 4.0): gain is 1/K, full well is the saturation capacity.
 """
@@ -8,13 +8,13 @@ Names and definitions follow EMVA standard 1288 (release 4.0): gain is 1/K, full
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.settings import bounded
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["QUANTISATION", "CameraNoise", "LinearChannels", "LinearMosaic", "NoiseModel", "Quantity", "linearise"]
@@ -32,8 +32,8 @@ class NoiseModel:
         Standard deviation of the signal-independent noise in grey levels (DN).
     """
 
-    gain: float
-    read_noise: float
+    gain: float = bounded(above=0)
+    read_noise: float = bounded(above=0)
 
     def variance(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
         """Return the variance (DN squared) of samples whose linearised values (DN above black) are `values`."""
@@ -211,33 +211,7 @@ class CameraNoise:
         """Saturation capacity over dark noise, in dB."""
         return np.asarray(20 * np.log10(self.full_well.value / np.maximum(self.dark_noise.value, 1e-9)))
 
-    def to_document(self) -> dict[str, Any]:
-        """Return plain dictionaries, lists and numbers; NaN becomes null."""
-        document: dict[str, Any] = {"planes": list(self.planes)}
-        for entry in fields(self):
-            if isinstance(quantity := getattr(self, entry.name), Quantity):
-                document[entry.name] = {"value": _listed(quantity.value), "std": _listed(quantity.std)}
-        document["defects"] = [list(defect) for defect in self.defects]
-        return document
-
-    @classmethod
-    def from_document(cls, document: dict[str, Any]) -> CameraNoise:
-        """Build it from what `to_document` gave; KeyError, TypeError or ValueError where it is damaged."""
-        quantities = {
-            entry.name: Quantity(
-                *(np.array([np.nan if v is None else v for v in document[entry.name][key]]) for key in ("value", "std"))
-            )
-            for entry in fields(cls)
-            if entry.name not in ("planes", "defects")
-        }
-        defects = tuple((int(row), int(column), str(kind)) for row, column, kind in document.get("defects", []))
-        return cls(planes=tuple(document["planes"]), defects=defects, **quantities)
-
 
 def _product(value: FloatArray, gain: Quantity, relative: FloatArray) -> Quantity:
     result = value * gain.value
     return Quantity(result, result * np.hypot(relative, gain.std / gain.value))
-
-
-def _listed(values: FloatArray) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]

@@ -73,8 +73,8 @@ class TextureModel:
     weights, widths : tuple of float
         w_m and s_m (px).
     offset : float
-        c: what the removal of the local mean has taken away; not positive.
-    private : float
+        c: the loss by the removal of the local mean; not positive.
+    specific : float
         Fraction (0 to 1) of the channel-specific component that is as coarse as the speckle: 0 for the sparkle of
         reflections, towards 1 for a coloured specimen.
     correlation : float
@@ -84,7 +84,7 @@ class TextureModel:
     weights: tuple[float, ...]
     widths: tuple[float, ...]
     offset: float = 0.0
-    private: float = 0.0
+    specific: float = 0.0
     correlation: float = 1.0
 
     def __post_init__(self) -> None:
@@ -92,10 +92,10 @@ class TextureModel:
         w, s = np.asarray(self.weights, float), np.asarray(self.widths, float)
         if w.ndim != 1 or w.shape != s.shape or not (w >= 0).all() or not w.sum() > 0 or not (s > 0).all():
             raise InputError(f"a texture needs weights >= 0 and widths > 0, equally many; given are {w} and {s}")
-        if not (0 <= self.private <= 1 and self.offset <= 0 and abs(w.sum() + self.offset - 1) < 1e-6):
+        if not (0 <= self.specific <= 1 and self.offset <= 0 and abs(w.sum() + self.offset - 1) < 1e-6):
             raise InputError(
                 "weights and offset of a texture sum to 1, its channel-specific fraction lies in 0 to 1; given are a "
-                f"sum of {w.sum() + self.offset} and {self.private}"
+                f"sum of {w.sum() + self.offset} and {self.specific}"
             )
 
     @classmethod
@@ -129,7 +129,7 @@ class TextureModel:
 
     @cached_property
     def band(self) -> BandEnergy:
-        """What the low-passed planes of a Bayer mosaic show of this texture."""
+        """Second moments of the low-passed planes of a Bayer mosaic for this texture."""
         own, adjacent, diagonal = np.asarray(self.weights) @ _band_energies(self.widths) + self.offset
         return BandEnergy(own=float(own), adjacent=float(adjacent), diagonal=float(diagonal))
 
@@ -174,7 +174,7 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
         r = np.broadcast_to(distance[:, None], met.shape)[met]
         # one colour's samples are two pixels apart and show nothing of what is finer
         coarse = WIDTHS[WIDTHS > 1]
-        return _mixture(r, sums[:, :3][met] / counts[:, :3][met], best, widths=coarse, private=1.0)
+        return _mixture(r, sums[:, :3][met] / counts[:, :3][met], best, widths=coarse, specific=1.0)
     pairs = counts[:, 3:] * correlations
     adjacent, diagonal = pairs[:, 0] + pairs[:, 2], pairs[:, 1]
     parity = LAGS.sum(axis=1) % 2 == 1
@@ -187,8 +187,8 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     finest, coarsest = (energies[:, 1] / energies[:, 0])[[0, -1]]
     ratio = float(np.clip(agreement, finest, coarsest))
     fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
-    model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, unit=unit, fine=fine)
-    return replace(model, private=_coarse_fraction(model, sums, counts, correlations))
+    model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, band=(unit, fine))
+    return replace(model, specific=_coarse_fraction(model, sums, counts, correlations))
 
 
 def _mixture(
@@ -197,21 +197,21 @@ def _mixture(
     correlation: float,
     *,
     widths: FloatArray = WIDTHS,
-    unit: FloatArray | None = None,
-    fine: FloatArray | None = None,
-    private: float = 0.0,
+    band: tuple[FloatArray, FloatArray] | None = None,
+    specific: float = 0.0,
 ) -> TextureModel:
     """Fit weights w >= 0 and offset c <= 0 of a texture by least squares.
 
-    ``sum w g(r) + c = product`` up to a factor, or, with `unit` (R, M) and `fine` (M + 1,),
+    ``sum w g(r) + c = product`` up to a factor, or, with unit (R, M) and fine (M + 1,) of the `band`,
     ``sum w (g(r) - product unit) + c (1 - product) = 0`` with ``sum w + c = 1`` and ``fine . (w, -c) = 0``.
     """
     gaussians = np.exp(-0.5 * (r[:, None] / widths) ** 2)
     importance = 1 / (1 + r)
-    if unit is None or fine is None:
+    if band is None:
         system = np.column_stack([gaussians, -np.ones(r.size)]) * importance[:, None]
         wanted = product * importance
     else:
+        unit, fine = band
         system = np.column_stack([gaussians - product[:, None] * unit, product - 1]) * importance[:, None]
         sum_to_one = np.append(np.ones(len(widths)), -1.0)
         # short distances hardly distinguish a constant from a wide Gaussian
@@ -228,7 +228,7 @@ def _mixture(
         weights=tuple(weights.tolist()),
         widths=tuple(widths[kept].tolist()),
         offset=min(float(1 - weights.sum()), 0.0),
-        private=private,
+        specific=specific,
         correlation=correlation,
     )
 

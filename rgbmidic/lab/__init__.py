@@ -6,11 +6,14 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rgbmidic.errors import ResultError
 
-__all__ = ["check_folder", "number_or_none", "write_document"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["check_folder", "number_or_none", "write_findings"]
 
 
 def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
@@ -35,16 +38,20 @@ def number_or_none(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def write_document(document: Mapping[str, Any], path: Path) -> None:
-    """Write a document as JSON; its folder is made where it does not exist.
+def write_findings(out: Path, name: str, document: Mapping[str, Any], figure: Figure) -> None:
+    """Write a document as NAME.json and a figure as NAME.png into a folder, which is made where it does not exist.
 
     Raises
     ------
     ResultError
-        The file cannot be written.
+        A file cannot be written.
     """
+    from rgbmidic.report.style import save_figure
+
+    path = out / f"{name}.json"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:
         raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
+    save_figure(figure, path.with_suffix(".png"))

@@ -18,42 +18,24 @@ from typing import Any
 import numpy as np
 
 from rgbmidic._kernels import are_compiled
-from rgbmidic.correlation import correlate
 from rgbmidic.errors import ResultError
 from rgbmidic.fields import at_nodes, field_rms
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.unmixing import align
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline import Plan, Separation, measure
+from rgbmidic.pipeline import Plan, Separation, correlate, measure
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = ["DemoRow", "run_demo"]
 
-Say = Callable[[str], None]
-
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
-[body]
-kind = "sphere"
-
-[[lights]]
-name = "red"
-position = [-190.0, -12.0, 90.0]
-
-[[lights]]
-name = "green"
-position = [200.0, 15.0, 90.0]
-
-[[lights]]
-name = "blue"
-position = [10.0, -220.0, 60.0]
-
+# Body, paint, lamps and camera are those that stand in where a scene states none (docs/planning.md).
 [camera]
 shape = [{size}, {size}]
-crosstalk = [[1.0, 0.10, 0.02], [0.14, 1.0, 0.16], [0.03, 0.12, 1.0]]
 
 [output]
 seed = 2026
@@ -106,7 +88,7 @@ class DemoRow:
 
 def run_demo(
     out: Path,
-    say: Say,
+    report: Callable[[str], None],
     calibrate: Callable[[Path], None],
     progress: Callable[[int, int, str], None] | None = None,
     *,
@@ -119,7 +101,7 @@ def run_demo(
     ----------
     out
         Folder; it must be empty or not exist.
-    say
+    report
         Called with a line about each step.
     calibrate
         Called with the folder of the virtual test; writes calibration.json from the captures there.
@@ -148,16 +130,16 @@ def run_demo(
     out.mkdir(parents=True, exist_ok=True)
     states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
     scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")
-    say(f"1 of 5: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
+    report(f"1 of 5: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
     with kernels_compiled_meanwhile():
         settings_file = write_dataset(scene, test, progress)
         (test / "calibration.json").rename(test / "true_calibration.json")
-        say("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from the captures with one light at a time")
+        report("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from captures with one light at a time")
         calibrate(test)
     settings = read_test(settings_file)
-    say(f"3 of 5: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")
+    report(f"3 of 5: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")
     result = measure(settings, out / "result", progress=progress)
-    say("4 of 5: the same with each colour alone, for comparison, some 5 s")
+    report("4 of 5: the same with each colour alone, for comparison, some 5 s")
     return _compare(settings, result)
 
 
@@ -165,7 +147,10 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
     with np.load(settings.base / "truth.npz") as archive:
         truth, angles = archive["displacement"].astype(np.float64), archive["angle_deg"]
     mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-    images = _separated(settings)
+    assert settings.calibration_file is not None
+    calibration = Calibration.read(settings.calibration_file)
+    separation, frames = Separation(calibration=calibration), open_series(settings.frames, settings.base, calibration)
+    images = [align(separation(frames.read(index))).values for index in range(len(frames))]
     options: dict[str, Any] = {
         "region": settings.region.rectangle,
         "element_size": settings.element_size,
@@ -187,15 +172,6 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
             )
         )
     return rows
-
-
-def _separated(settings: TestSettings) -> list[FloatImage]:
-    """Return the lights (k, H, W) of every frame."""
-    assert settings.calibration_file is not None
-    calibration = Calibration.read(settings.calibration_file)
-    separation = Separation(calibration=calibration)
-    frames = open_series(settings.frames, settings.base, calibration)
-    return [align(separation(frames.read(index))).values for index in range(len(frames))]
 
 
 def _rms(values: FloatArray) -> float:

@@ -211,7 +211,7 @@ def _claim_rim(owner: npt.NDArray[np.int32]) -> None:
 Index = npt.NDArray[np.intp]
 
 TERMS = ("value", "x", "y", "xx", "xy", "yy")
-"""What the operators of `quadratic_fit` give: the value, its first and its second derivatives."""
+"""Results of the operators of `quadratic_fit`: the value, its first and its second derivatives."""
 _WIDTH = 0.58
 """Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements then
 have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear fit's; with
@@ -246,7 +246,7 @@ def quadratic_fit(
     information : ndarray, shape (N,), optional
         How well each node is known (inverse variance, any unit): one that is known badly counts little elsewhere.
     offset : ndarray, shape (N, 3), optional
-        What the given values have beyond a field whose second derivative xx, xy or yy is 1, square px; 0 without.
+        Excess of the given values over a field whose second derivative xx, xy or yy is 1, square px; 0 without.
 
     Returns
     -------

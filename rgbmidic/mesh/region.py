@@ -19,17 +19,7 @@ from scipy.spatial import cKDTree
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = [
-    "Region",
-    "crack_paths",
-    "distance_to",
-    "edge_keys",
-    "halved",
-    "outline_mesh",
-    "sharp_corners",
-    "split_along",
-    "uncrowded",
-]
+__all__ = ["Region", "edge_keys", "outline_mesh"]
 
 logger = logging.getLogger(__name__)
 
@@ -417,8 +407,8 @@ def split_along(
     key, cut = edge_keys(corner[ends], len(nodes)), edge_keys(pieces, len(nodes))
     order = np.argsort(key)
     shared = (key[order][1:] == key[order][:-1]) & ~np.isin(key[order][1:], cut)
-    one, other = ends[order[:-1][shared]].ravel(), ends[order[1:][shared]].ravel()
-    graph = sp.coo_matrix((np.ones(one.size), (one, other)), shape=(corner.size, corner.size))
+    first_corner, second_corner = ends[order[:-1][shared]].ravel(), ends[order[1:][shared]].ravel()
+    graph = sp.coo_matrix((np.ones(first_corner.size), (first_corner, second_corner)), shape=(corner.size, corner.size))
     side = sp.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
     side[~np.isin(corner, pieces)] = 0
     _, first, index = np.unique(corner * np.int64(corner.size) + side, return_index=True, return_inverse=True)

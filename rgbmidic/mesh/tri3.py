@@ -111,8 +111,8 @@ class Tri3Mesh:
             )
         if region.rectangle is not None and not len(cracks):
             nodes, elements = _rectangle_mesh(region.rectangle, element_size)
-            return cls(nodes=nodes, elements=elements)
-        nodes, elements = outline_mesh(region.mask, element_size, cracks, region.origin)
+        else:
+            nodes, elements = outline_mesh(region.mask, element_size, cracks, region.origin)
         return cls(nodes=nodes, elements=elements)
 
     @property
@@ -220,8 +220,8 @@ class Tri3Mesh:
 
 def _legs(values: FloatArray, elements: npt.NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
     """Return the differences (C, E) of nodal values (N, C) from the first corner of elements to the others."""
-    own = values.T[:, elements]
-    return own[..., 1] - own[..., 0], own[..., 2] - own[..., 0]
+    at_corners = values.T[:, elements]
+    return at_corners[..., 1] - at_corners[..., 0], at_corners[..., 2] - at_corners[..., 0]
 
 
 def _rectangle_mesh(

@@ -1,6 +1,7 @@
 """The main job: raw frames in, displacement fields out."""
 
 from rgbmidic.pipeline.frame import measure_frame
+from rgbmidic.pipeline.pair import correlate
 from rgbmidic.pipeline.plan import Plan, read_region
 from rgbmidic.pipeline.run import measure, measure_sequence
 from rgbmidic.pipeline.separation import LightSeparation, Separation, correlated
@@ -11,6 +12,7 @@ __all__ = [
     "LightSeparation",
     "Plan",
     "Separation",
+    "correlate",
     "correlated",
     "measure",
     "measure_frame",

@@ -28,6 +28,7 @@ from rgbmidic.pipeline.separation import RawState, correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.weights import precision_method
 
 __all__ = ["failed_frame", "measure_frame", "next_reference", "read_state", "solve_frame"]
 
@@ -148,8 +149,8 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         step = -(-max(plan.window.shape) // _THUMBNAIL)
         thumbnail = _in_bytes(weights[:, *here][:, ::step, ::step])
         del weights, ready  # a tenth of what a frame needs
-    statistics = settings.weights.method == "statistics"
-    solution = reference_update.track(deformed, start, settings.solver, statistics=statistics)
+    method = precision_method(plan.weights, settings.weights.method)
+    solution = reference_update.track(deformed, start, settings.solver, method)
     if solution.status is not Status.CONVERGED:
         there = state
         if not isinstance(state, IlluminationImages):

@@ -18,7 +18,6 @@ from threading import Lock
 import numpy as np
 
 from rgbmidic.correlation import Reference
-from rgbmidic.correlation.correlate import as_weights
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
@@ -30,6 +29,7 @@ from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.pair import as_weights
 from rgbmidic.pipeline.separation import (
     LightSeparation,
     RawState,

@@ -10,7 +10,9 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,17 +21,17 @@ import numpy.typing as npt
 
 from rgbmidic._kernels import are_compiled
 from rgbmidic.correlation import Solution, Start, Status
-from rgbmidic.correlation.correlate import solver_settings
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame
+from rgbmidic.pipeline.pair import solver_settings
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, is_key, loses, parent, rank
+from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank
 from rgbmidic.pipeline.separation import LightSeparation
 from rgbmidic.pipeline.source import FrameSequence, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
-from rgbmidic.results import Origin, Result, ResultStore
+from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.store import listed
 from rgbmidic.settings import (
@@ -125,9 +127,8 @@ def measure(
     """
     if retry_failed and not resume:
         raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
-    given = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
-    plan = Plan.from_settings(settings, source=source, separation=separation, weights=weights, mesh=mesh)
-    plan = replace(plan, timings=timings)
+    given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
+    plan = replace(Plan.from_settings(settings, **given), timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
@@ -169,9 +170,12 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
             changed.append(place)
             continue
         tries[place] = kept["tries"]
-        if kept["unread"] and _can_be_read(plan, chosen[place]):
-            readable.append(place)
-        elif retry_failed and kept["status"] == Status.FAILED:
+        if kept["unread"]:
+            with suppress(FrameError):
+                read_state(plan, chosen[place])
+                readable.append(place)
+                continue
+        if retry_failed and kept["status"] == Status.FAILED:
             changed.append(place)
     lost = np.flatnonzero(damaged).tolist()
     again = {*lost, *changed, *readable, *dependants([*changed, *readable], tries)}
@@ -182,13 +186,6 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
             "measured again with what started from it, since it can be read now: %s", listed(readable, names)
         )
     store.discard(again)
-
-
-def _can_be_read(plan: Plan, index: int) -> bool:
-    try:
-        return bool(read_state(plan, index))
-    except FrameError:
-        return False
 
 
 def _places(chosen: range, frames: range | None) -> range:
@@ -332,7 +329,7 @@ def measure_sequence(
     plan = Plan.from_settings(
         replace(settings, frames=frames), source=latest, separation=separation, weights=counted, mesh=mesh, region=mask
     )
-    return _solutions(plan, latest, _with_first(reference, remaining) if own else remaining)
+    return _solutions(plan, latest, chain([reference], remaining) if own else remaining)
 
 
 @dataclass(slots=True)
@@ -351,11 +348,6 @@ class _Latest:
         if self.light_images and not hasattr(state, "values"):
             return np.asarray(state, dtype=np.float32)
         return state
-
-
-def _with_first(first: Any, remaining: Iterator[Any]) -> Iterator[Any]:
-    yield first
-    yield from remaining
 
 
 def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[Solution]:
@@ -398,9 +390,4 @@ def _solved(
         logger.warning("%s failed: %s", plan.series.name(index), error)
         mesh, lights = plan.reference.mesh, len(plan.images.names)
         return Solution.failed(mesh, lights, str(error), np.zeros(0)), start
-    solution: Solution = values["solution"]
-    if not solution.measured.any():
-        return solution, start
-    after = start.after(plan.reference.mesh, solution.displacement, solution.measured)
-    best = float(np.float32(values["best_match"]))  # as a result keeps it
-    return solution, replace(after, reference_updates=values["reference_updates"], best_match=best)
+    return values["solution"], following(plan, FrameRecord.from_solution(**values).values, start)

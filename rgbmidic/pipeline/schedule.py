@@ -23,11 +23,11 @@ from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Updated, Workers
-from rgbmidic.results import FrameRecord, ResultStore
-from rgbmidic.typing import FloatArray
+from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
+from rgbmidic.results import QUANTITIES, FrameRecord, ResultStore
+from rgbmidic.typing import AnyArray
 
-__all__ = ["STRIDE", "Schedule", "children", "dependants", "is_key", "lineage", "loses", "parent", "rank"]
+__all__ = ["STRIDE", "Schedule", "children", "dependants", "following", "is_key", "lineage", "loses", "parent", "rank"]
 
 logger = logging.getLogger("rgbmidic.pipeline.frame")
 
@@ -112,7 +112,10 @@ class Schedule:
     def _submit(self, workers: Workers, position: int, start: Start) -> None:
         # a key frame looks for what has been lost; those between follow what there is
         given = replace(start, unmeasured=0.0) if is_key(position) else start
-        future = workers.submit(self._index(position), given, self._renewed(start.reference_updates))
+        last = start.reference_updates[-2:]  # all that the reference which they make depends on
+        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
+        found = [_solution(mesh, lights, kept) for kept in self._store.table().each(_MEASURED, last)] if last else []
+        future = workers.submit(self._index(position), given, list(zip(map(self._index, last), found, strict=True)))
         self._running[future] = position, start
 
     def _index(self, position: int) -> int:
@@ -141,29 +144,30 @@ class Schedule:
         first = self._first_tries.pop(position, None)
         if first is None and is_key(position) and loses(record, start):
             self._first_tries[position] = record
-            self._measure_after(position - 1, position)
+            before = position - 1  # it may have to be measured first
+            if self._finished[before]:
+                heappush(self._ready, (position, self._start_after(before)))
+            else:
+                self._waiting.setdefault(before, []).append(position)
+                self._want(before)
             return
         if first is not None:
             better = first if rank(first) <= rank(record) else record
             record = replace(better, values={**better.values, "tries": 2})
         self._store.write_frame(position, record)
         self._finished[position] = True
-        following = self._following(record.values, start)
+        next_start = following(self._plan, record.values, start)
         released = [child for child in children(position, len(self._finished)) if self._wanted[child]]
         for after in (*released, *self._waiting.pop(position, ())):
-            heappush(self._ready, (after, following))
+            heappush(self._ready, (after, next_start))
         if progress is not None:
             places = self._places
-            done = int(self._finished[places.start : places.stop].sum())
-            progress(done, len(places), _line(self._plan.series.name(self._index(position)), record))
-
-    def _measure_after(self, before: int, position: int) -> None:
-        """Have a frame measured from one that may have to be measured first."""
-        if self._finished[before]:
-            heappush(self._ready, (position, self._start_after(before)))
-        else:
-            self._waiting.setdefault(before, []).append(position)
-            self._want(before)
+            done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
+            line = f"{status.name.lower().replace('_', ' ')}: {record.reason}"
+            if status is Status.CONVERGED:
+                measured = 1 - rank(record)[1]
+                line = f"converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
+            progress(done, len(places), f"{self._plan.series.name(self._index(position))}: {line}")
 
     def _want(self, position: int) -> None:
         """Have a frame measured, and all that it depends on."""
@@ -186,44 +190,31 @@ class Schedule:
         table = self._store.table()
         for kept in table.each(_KEPT, range(position, -1, -1)):
             if (kept["node_status"] == NodeStatus.MEASURED).any():
-                return self._following(kept, Start(displacement=None))
+                return following(self._plan, kept, Start(displacement=None))
         return Start(displacement=None)
 
-    def _following(self, kept: Mapping[str, Any], start: Start) -> Start:
-        """Where a frame starts that follows one that started from `start` and of which this is kept."""
-        measured = kept["node_status"] == NodeStatus.MEASURED
-        if not measured.any():
-            return start
-        after = start.after(self._plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
-        return replace(
-            after, reference_updates=tuple(kept["reference_updates"].tolist()), best_match=float(kept["best_match"])
-        )
 
-    def _renewed(self, reference_updates: tuple[int, ...]) -> Updated:
-        """Index and solution of the last two frames that became the reference."""
-        if not reference_updates:
-            return ()
-        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
-        last = reference_updates[-2:]
-        solutions = (_solution(mesh, lights, kept) for kept in self._store.table().each(_MEASURED, last))
-        return list(zip(map(self._index, last), solutions, strict=True))
+def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:
+    """Where a frame starts that follows one that started from `start` and of which this is kept."""
+    measured = kept["node_status"] == NodeStatus.MEASURED
+    if not measured.any():
+        return start
+    after = start.after(plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
+    updates, best = tuple(kept["reference_updates"].tolist()), float(kept["best_match"])
+    return replace(after, reference_updates=updates, best_match=best)
 
 
 def _solution(mesh: Tri3Mesh, lights: int, kept: Mapping[str, Any]) -> Solution:
-    """What a result keeps of a measured frame, as the solution that makes it a reference."""
-
-    def columns(*names: str) -> FloatArray:
-        return np.stack([kept[name].astype(np.float64) for name in names], axis=1)
-
-    return replace(
-        Solution.failed(mesh, lights, "", np.zeros(0)),
-        displacement=columns("u", "v"),
-        displacement_std=columns("u_std", "v_std"),
-        strain=columns("exx", "eyy", "exy"),
-        strain_std=columns("exx_std", "eyy_std", "exy_std"),
-        node_status=kept["node_status"],
-        rigid=kept["rigid"].astype(np.float64),
-    )
+    """What a result keeps of a measured frame, as the solution that makes it a reference: the field table undone."""
+    columns: dict[str, list[AnyArray]] = {}
+    for name in _MEASURED:
+        values = kept[name]
+        attribute = QUANTITIES[name].source.partition(".")[0]
+        columns.setdefault(attribute, []).append(values.astype(np.float64) if values.dtype.kind == "f" else values)
+    found: dict[str, Any] = {
+        name: np.stack(parts, axis=1) if len(parts) > 1 else parts[0] for name, parts in columns.items()
+    }
+    return replace(Solution.failed(mesh, lights, "", np.zeros(0)), **found)
 
 
 def _error(future: Future[Measured]) -> BaseException | None:
@@ -242,14 +233,6 @@ def loses(record: FrameRecord | Solution, start: Start) -> bool:
     """Whether a key frame is measured worse than the one it starts from."""
     status, unmeasured = rank(record)
     return status != Status.CONVERGED or unmeasured > start.unmeasured + _LOSS
-
-
-def _line(name: str, record: FrameRecord) -> str:
-    status = Status(record.status)
-    if status is Status.CONVERGED:
-        measured = float((record.node_status == NodeStatus.MEASURED).mean())
-        return f"{name}: converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
-    return f"{name}: {status.name.lower().replace('_', ' ')}: {record.reason}"
 
 
 STRIDE = 16
@@ -277,10 +260,10 @@ def children(position: int, count: int) -> Iterator[int]:
 
 def lineage(position: int) -> Iterator[int]:
     """A frame, its parent, the parent of that, and so on to the first."""
-    following: int | None = position
-    while following is not None:
-        yield following
-        following = parent(following)
+    yield position
+    while position:
+        position -= _step(position)
+        yield position
 
 
 def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:

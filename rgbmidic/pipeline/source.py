@@ -12,13 +12,13 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from rgbmidic.errors import FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.series import FrameSeries, chosen_frames
+from rgbmidic.frames.series import chosen_frames
 from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.pipeline.separation import RawState
@@ -33,7 +33,7 @@ sensitive: it is read by people, the checksum by the comparison."""
 
 
 class FrameSequence(Protocol):
-    """Frames by index, from 0: a numpy stack (T, H, W), an HDF5 dataset, a camera maker's library, a `FrameSeries`.
+    """Frames by index, from 0: a numpy stack (T, H, W), an HDF5 dataset, a camera maker's library.
 
     It may also have
 
@@ -49,7 +49,6 @@ class FrameSequence(Protocol):
 
     def __len__(self) -> int:
         """Number of frames."""
-        ...
 
     def __getitem__(self, index: int, /) -> Any:
         """One state.
@@ -63,64 +62,55 @@ class FrameSequence(Protocol):
         IlluminationImages, or ndarray of floats, shape (H, W) or (k, H, W)
             One image per light, which needs no separation; NaN where not valid.
         """
-        ...
 
 
+@runtime_checkable
 class Series(Protocol):
-    """What the pipeline reads frames from: a `FrameSeries` of files, or a `SourceSeries`."""
+    """What the pipeline reads frames from: a `SourceSeries`, or a source that can all this itself.
+
+    The series of files that `rgbmidic.frames.open_series` makes is one; it reads parts of frames.
+    """
 
     @property
     def numbers(self) -> Sequence[int]:
         """Number of each frame, with gaps where frames are missing."""
-        ...
 
     @property
     def chosen(self) -> range:
         """The frames that are to be measured."""
-        ...
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of every frame."""
-        ...
 
     @property
     def recording(self) -> Recording:
         """How the frames were recorded."""
-        ...
 
     @property
     def lost(self) -> int:
         """Number of frames missing between the first and the last chosen."""
-        ...
 
     def __len__(self) -> int:
         """Number of states."""
-        ...
 
     def read(self, index: int, window: Window | None = None) -> Any:
         """State `index` or a `window` of it: raw frames, or one image per light."""
-        ...
 
     def gone(self) -> str:
         """What exists no more and all frames are read from; empty where all is there."""
-        ...
 
     def name(self, index: int) -> str:
         """Name of state `index`."""
-        ...
 
     def time_ns(self, index: int) -> int | None:
         """When state `index` was taken, in ns; None where that is not known."""
-        ...
 
     def inputs(self, index: int, window: Window | None = None) -> dict[str, str]:
         """Path and fingerprint of every file that state `index` comes from."""
-        ...
 
     def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
         """A text that changes with the frames, and the names of those whose content it leaves out."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,42 +203,39 @@ class SourceSeries:
         Without a description of its own, the content of the first frame of the reference and of the last frame chosen
         belongs to it.
         """
-        told, without = describe(self.source), []
-        if not hasattr(self.source, "describe"):
-            told = f"{_class(self.source)} of {len(self)} frames"
-            for index in (self.stated.reference[0], self.chosen[-1]):
-                name = self.name(index)
-                content = "unread"
-                if name not in unread:
-                    with suppress(FrameError):
-                        state = self.read(index)
-                        parts = [state] if isinstance(state, IlluminationImages) else list(state)
-                        content = hashlib.sha256(b"".join(part.values.tobytes() for part in parts)).hexdigest()
-                if content == "unread":
-                    without.append(name)
-                told += f", {content[:16]}"
+        if hasattr(self.source, "describe"):
+            return describe(self.source), ()
+        told, without = f"{_class(self.source)} of {len(self)} frames", []
+        for index in (self.stated.reference[0], self.chosen[-1]):
+            name, content = self.name(index), "unread"
+            if name not in unread:
+                with suppress(FrameError):
+                    state = self.read(index)
+                    parts = [state] if isinstance(state, IlluminationImages) else state
+                    content = hashlib.sha256(b"".join(part.values.tobytes() for part in parts)).hexdigest()[:16]
+            if content == "unread":
+                without.append(name)
+            told += f", {content}"
         return told, tuple(without)
 
     def _state(self, state: Any, name: str) -> RawState:
         """What the source gives, as the pipeline takes it."""
         if isinstance(state, IlluminationImages):
             return state
-        if isinstance(state, Mosaic | ChannelFrame):
-            return (state,)
-        if isinstance(state, tuple | list) and state and all(isinstance(one, Mosaic | ChannelFrame) for one in state):
-            return tuple(state)
+        states = tuple(state) if isinstance(state, tuple | list) else (state,)
+        if states and all(isinstance(one, Mosaic | ChannelFrame) for one in states):
+            return states
         values = np.asarray(state)
-        if values.dtype.kind == "f" and values.ndim in (2, 3):
-            values = values if values.ndim == 3 else values[None]
-            lights = getattr(self.source, "lights", None) or [f"light {light + 1}" for light in range(len(values))]
-            return IlluminationImages(
-                values=values, valid=np.isfinite(values), names=tuple(lights), full_scale=self.full_scale
-            )
-        return (self._raw(values, name),)
+        if values.dtype.kind != "f" or values.ndim not in (2, 3):
+            return (self._raw(values, name),)
+        values = values if values.ndim == 3 else values[None]
+        lights = getattr(self.source, "lights", None) or [f"light {light + 1}" for light in range(len(values))]
+        valid = np.isfinite(values)
+        return IlluminationImages(values=values, valid=valid, names=tuple(lights), full_scale=self.full_scale)
 
     def _raw(self, values: AnyArray, name: str) -> Mosaic | ChannelFrame:
         """Whole numbers (H, W) or (C, H, W) as the raw frame that ``[frames]`` says they are."""
-        if values.dtype == np.bool_ or values.dtype.kind not in "ui" or values.ndim not in (2, 3):
+        if values.dtype.kind not in "ui" or values.ndim not in (2, 3):
             raise FrameError(
                 f"{name} of {_class(self.source)} is {values.dtype} of shape {values.shape}; allowed are whole numbers "
                 "(H, W) or (C, H, W), floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"
@@ -263,7 +250,7 @@ class SourceSeries:
         return raw_frame(StoredFrame.plain(np.ascontiguousarray(values), path), self.stated, path, self.camera)
 
 
-def open_sequence(source: FrameSequence | FrameSeries, stated: FrameSettings, camera: Camera | None) -> Series:
+def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera: Camera | None) -> Series:
     """The series that the pipeline reads from a source, checked on the first frame of the reference.
 
     Raises
@@ -273,7 +260,7 @@ def open_sequence(source: FrameSequence | FrameSeries, stated: FrameSettings, ca
     FrameError
         A reference frame, or the first or last frame, does not exist or cannot be read.
     """
-    if isinstance(source, FrameSeries):  # it reads in windows
+    if isinstance(source, Series):
         return source
     if not (hasattr(source, "__len__") and hasattr(source, "__getitem__")):
         raise InputError(

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rgbmidic.report.setup import NoiseFloor, TimeHistory
 from rgbmidic.report.style import GAP, LEGEND, LINES, NUMBERS, OKABE_ITO, draw_figure, finish_plot, literal, time_axis
 from rgbmidic.results import QUANTITIES, Histories, HistoryColumn
-from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from rgbmidic.results.physical import Physical
-
-__all__ = ["field_history_figure", "history_figure", "status_figure", "uncertainty_figure"]
 
 _COLOURS = [OKABE_ITO[name] for name in ("blue", "vermillion", "green")]
 _STATUS = QUANTITIES["node_status"].codes
@@ -33,45 +30,45 @@ _KINDS = ("velocity", "acceleration", "strain_rate", "rate", "strain", "extensio
 
 def field_history_figure(physical: Physical, history: TimeHistory) -> Figure:
     """Draw displacement and strain over the frames: median of the nodes as a line, 5 to 95 % of them as a band."""
-    panels: dict[str, tuple[str, ...]] = {f"displacement ({physical.units.length})": ("u", "v")}
-    panels[f"strain ({physical.measure_name})"] = ("exx", "eyy", "exy")
 
-    def draw(axes: list[Axes]) -> None:
-        _draw_medians(axes, panels, history)
-        for axis, names in zip(axes, panels.values(), strict=True):
-            for name, colour in zip(names, _COLOURS, strict=False):
-                low, _, high = history.quantiles[name].T
-                axis.fill_between(history.axis[0], low, high, color=colour, alpha=0.18, linewidth=0)
+    def band(axis: Axes, name: str, style: dict[str, Any]) -> None:
+        low, _, high = history.quantiles[name].T
+        axis.fill_between(history.axis[0], low, high, color=style["color"], alpha=0.18, linewidth=0)
 
-    return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
+    panels = {f"displacement ({physical.units.length})": ("u", "v")}
+    return _medians({**panels, f"strain ({physical.measure_name})": ("exx", "eyy", "exy")}, history, band)
 
 
 def uncertainty_figure(physical: Physical, history: TimeHistory, floor: NoiseFloor | None) -> Figure:
     """Draw the stated uncertainty over the frames, median of the nodes; the noise floor as thin lines."""
-    panels: dict[str, tuple[str, ...]] = {f"standard uncertainty ({physical.units.length})": ("u_std", "v_std")}
-    panels["standard uncertainty of strain"] = ("exx_std", "eyy_std", "exy_std")
 
-    def draw(axes: list[Axes]) -> None:
-        _draw_medians(axes, panels, history)
-        for axis, names in zip(axes, panels.values(), strict=True):
-            for name, colour, line in zip(names, _COLOURS, LINES, strict=False):
-                if floor is not None:
-                    axis.axhline(floor.measured[name.removesuffix("_std")], color=colour, linestyle=line, linewidth=0.6)
-            axis.set_ylim(bottom=0)
+    def level(axis: Axes, name: str, style: dict[str, Any]) -> None:
+        if floor is not None:
+            axis.axhline(floor.measured[name.removesuffix("_std")], linewidth=0.6, **style)
+        axis.set_ylim(bottom=0)
 
-    return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
+    panels = {f"standard uncertainty ({physical.units.length})": ("u_std", "v_std")}
+    return _medians({**panels, "standard uncertainty of strain": ("exx_std", "eyy_std", "exy_std")}, history, level)
 
 
-def _draw_medians(axes: Sequence[Axes], panels: Mapping[str, Sequence[str]], history: TimeHistory) -> None:
-    """Draw the median over the nodes of some quantities over the frames, a panel for each label."""
+def _medians(
+    panels: Mapping[str, Sequence[str]], history: TimeHistory, add: Callable[[Axes, str, dict[str, Any]], None]
+) -> Figure:
+    """Draw the median over the nodes of quantities over the frames, a panel for each label; `add` adds to each line."""
     times, label_of_times = history.axis
     marker = "o" if len(times) <= _MARKED else None
-    for axis, (label, names) in zip(axes, panels.items(), strict=True):
-        for name, colour, line in zip(names, _COLOURS, LINES, strict=False):
-            median = history.quantiles[name][:, 1]
-            axis.plot(times, median, line, color=colour, linewidth=1.2, label=name, marker=marker, markersize=2.5)
-        axis.legend(loc="best")
-        finish_plot(axis, label_of_times, label, whole=not history.timed)
+
+    def draw(axes: list[Axes]) -> None:
+        for axis, (label, names) in zip(axes, panels.items(), strict=True):
+            for name, colour, line in zip(names, _COLOURS, LINES, strict=False):
+                style: dict[str, Any] = {"color": colour, "linestyle": line}
+                median = history.quantiles[name][:, 1]
+                axis.plot(times, median, linewidth=1.2, label=name, marker=marker, markersize=2.5, **style)
+                add(axis, name, style)
+            axis.legend(loc="best")
+            finish_plot(axis, label_of_times, label, whole=not history.timed)
+
+    return draw_figure(draw, count=2, aspect=0.75, beside=NUMBERS)
 
 
 def status_figure(history: TimeHistory) -> Figure:
@@ -113,10 +110,15 @@ def history_figure(histories: Histories) -> Figure:
     def draw(axes: list[Axes]) -> None:
         for axis, ((kind, unit), quantities) in zip(axes, panels.items(), strict=False):
             for quantity in quantities:
-                _draw_quantity(axis, times, quantity)
-            known = np.concatenate([quantity.values[np.isfinite(quantity.values)] for quantity in quantities])
-            if known.size and np.ptp(known) > 0:  # the values set the limits, not the widest uncertainty among them
-                axis.set_ylim(known.min() - 0.1 * np.ptp(known), known.max() + 0.1 * np.ptp(known))
+                known = np.isfinite(quantity.values).sum()
+                shown: dict[str, Any] = {"marker": "o" if known <= _MARKED_OF_PROBE else None, "markersize": 2.5}
+                (line,) = axis.plot(times, quantity.values, linewidth=1, label=literal(quantity.name), **shown)
+                if quantity.std is not None:
+                    low, high = quantity.values - 2 * quantity.std, quantity.values + 2 * quantity.std
+                    axis.fill_between(times, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+            values = np.concatenate([quantity.values[np.isfinite(quantity.values)] for quantity in quantities])
+            if values.size and np.ptp(values) > 0:  # the values set the limits, not the widest uncertainty among them
+                axis.set_ylim(values.min() - 0.1 * np.ptp(values), values.max() + 0.1 * np.ptp(values))
             label = literal(f"{kind} ({unit})" if unit else kind)
             finish_plot(axis, label_of_times, label, whole=histories.times is None)
             axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
@@ -136,12 +138,3 @@ def _kind(quantity: HistoryColumn) -> str:
     name = quantity.name.removesuffix("_before").removesuffix("_after")
     kind = next((kind for kind in _KINDS if name.endswith(f"_{kind}") or name == kind), "")
     return kind.replace("_", " ") or {"deg": "rotation", "": "strain"}.get(quantity.unit, "displacement")
-
-
-def _draw_quantity(axis: Axes, times: FloatArray, quantity: HistoryColumn) -> None:
-    marker = "o" if np.isfinite(quantity.values).sum() <= _MARKED_OF_PROBE else None
-    label = literal(quantity.name)
-    (line,) = axis.plot(times, quantity.values, marker=marker, markersize=2.5, linewidth=1, label=label)
-    if quantity.std is not None:
-        low, high = quantity.values - 2 * quantity.std, quantity.values + 2 * quantity.std
-        axis.fill_between(times, low, high, color=line.get_color(), alpha=0.2, linewidth=0)

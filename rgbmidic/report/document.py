@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,28 +12,17 @@ import numpy as np
 
 from rgbmidic.errors import legible
 from rgbmidic.report import figures
+from rgbmidic.report import setup as tables
 from rgbmidic.report.curves import field_history_figure, history_figure, status_figure, uncertainty_figure
-from rgbmidic.report.setup import (
-    NoiseFloor,
-    TimeHistory,
-    analysis_rows,
-    hardware_rows,
-    noise_floor,
-    noise_text,
-    reference_text,
-    settings_rows,
-)
-from rgbmidic.report.style import embedded, time_text
+from rgbmidic.report.style import PAGE_DPI, embedded, time_text
 from rgbmidic.results import QUANTITIES, Result, probes_of
 from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rgbmidic.results.physical import Physical
-
-__all__ = ["Page", "write_report"]
 
 _MOST = 200
 """Frames that the time histories are drawn from at most: a panel is some 450 pixels wide, two for each."""
@@ -78,41 +66,31 @@ def write_report(
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
     """
-    from rgbmidic.results.physical import Physical  # numba comes with it
-
     out = Path(out)
     check_file(out, overwrite=overwrite)
     kept = result.provenance.get("settings", {}).get("setup", {})
     setup = read_section(SetupSettings, "setup", kept) if settings is None else settings.setup
     probes = probes_of(result) if settings is None else settings.probes
     physical = Physical.of(result, None if settings is None else settings.scale)
-    text = _Report.of(physical, setup, probes, frames).page().html
+    text = _Report(physical, setup, probes, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Report:
     """Data that all sections of a report are made from."""
 
-    physical: Physical
-    setup: SetupSettings
-    probes: ProbeSettings
-    history: TimeHistory
-    floor: NoiseFloor | None
-    shown: tuple[int, ...]
-
-    @classmethod
-    def of(
-        cls, physical: Physical, setup: SetupSettings, probes: ProbeSettings, frames: Sequence[int] | None
-    ) -> _Report:
+    def __init__(
+        self, physical: Physical, setup: SetupSettings, probes: ProbeSettings, frames: Sequence[int] | None
+    ) -> None:
         result = physical.result
         for frame in frames or ():
             result.frame(frame)  # an error of one is raised before the long work
-        history = TimeHistory.of(physical, figures.spread(figures.shown_frames(result), _MOST))
+        self.physical, self.setup, self.probes = physical, setup, probes
+        self.history = tables.TimeHistory(physical, figures.spread(figures.shown_frames(result), _MOST))
         measured = figures.spread(figures.measured_frames(result), _SHOWN)
-        shown = tuple(sorted({*measured, history.farthest})) if frames is None else tuple(frames)
-        floor = noise_floor(physical)
-        return cls(physical=physical, setup=setup, probes=probes, history=history, floor=floor, shown=shown)
+        self.shown = tuple(sorted({*measured, self.history.farthest})) if frames is None else tuple(frames)
+        self.floor = tables.noise_floor(physical)
+        self.maps = figures.MapDrawer(result, PAGE_DPI)
 
     def page(self) -> Page:
         """Build the page, section by section."""
@@ -122,8 +100,8 @@ class _Report:
         page.heading("Warnings")
         page.bullets(list(self._warnings()) or ["none"])
         page.heading("What was measured with what")
-        page.table(("set-up", ""), list(hardware_rows(self.physical, self.setup)))
-        page.table(("analysis", ""), list(analysis_rows(self.physical, self.floor)))
+        page.table(("set-up", ""), list(tables.hardware_rows(self.physical, self.setup)))
+        page.table(("analysis", ""), list(tables.analysis_rows(self.physical, self.floor)))
         self._fields(page)
         self._probes(page)
         self._uncertainty(page)
@@ -136,7 +114,7 @@ class _Report:
         """Summarise the test in a few sentences."""
         history, result, length = self.history, self.physical.result, self.physical.units.length
         x, y, x_std, y_std = *map(history.extreme, ("u", "v")), *map(history.median, ("u_std", "v_std"))
-        text = f"{len(result.deformed)} deformed frames against {reference_text(self.physical)}; "
+        text = f"{len(result.deformed)} deformed frames against {tables.reference_text(self.physical)}; "
         text += f"{len(result.nodes)} nodes, {history.fractions[:, 0].mean():.1%} of them measured. "
         if np.isfinite(x + y):
             text += f"The median node moves by up to {x:.4g} {length} in x and {y:.4g} {length} in y, known to "
@@ -187,9 +165,9 @@ class _Report:
         for frame in self.shown:
             values = physical.frame(frame)
             maps = {f"{name} ({length})": (values[name], values[f"{name}_std"]) for name in ("u", "v")}
-            _show(page, figures.field_figure(physical.result, frame, maps), f"displacement, {self._when(frame)}")
+            _show(page, self.maps.fields(frame, maps), f"displacement, {self._when(frame)}")
             maps = {name: (values[name], values[f"{name}_std"]) for name in ("exx", "eyy", "exy")}
-            _show(page, figures.field_figure(physical.result, frame, maps), f"strain, {self._when(frame)}")
+            _show(page, self.maps.fields(frame, maps), f"strain, {self._when(frame)}")
         caption = "over the test: median of the nodes (line) and 5 to 95 % of them (band)"
         _show(page, field_history_figure(physical, self.history), f"displacement and strain {caption}")
 
@@ -211,7 +189,7 @@ class _Report:
     def _uncertainty(self, page: Page) -> None:
         physical, length = self.physical, self.physical.units.length
         page.heading("Uncertainty")
-        page.text(f"Noise floor: {noise_text(physical, self.floor)}.")
+        page.text(f"Noise floor: {tables.noise_text(physical, self.floor)}.")
         if physical.units.mm_per_pixel_std:
             page.text(
                 "The uncertainty of the image scale is part of that of every length in mm, the same in all of them."
@@ -228,7 +206,7 @@ class _Report:
         _show(page, uncertainty_figure(physical, self.history, self.floor), caption)
         frame, values = self.shown[-1], physical.frame(self.shown[-1])
         maps = {f"{name} ({length})": (values[name], values[name] * 0) for name in ("u_std", "v_std")}
-        figure = figures.field_figure(physical.result, frame, maps, positive=True)
+        figure = self.maps.fields(frame, maps, positive=True)
         _show(page, figure, f"standard uncertainty, {self._when(frame)}")
 
     def _lights(self, page: Page) -> None:
@@ -238,7 +216,7 @@ class _Report:
         _show(page, figures.residual_figure(result), "residual of each light, and its fraction in the nodes")
         if len(result.lights) > 1:
             caption = f"fraction of each light in what determines the nodes, {self._when(frame)}"
-            _show(page, figures.fraction_figure(result, frame), caption)
+            _show(page, self.maps.fractions(frame), caption)
         for caption, figure in (
             ("reflection index of each light", figures.reflection_figure(result, frame)),
             ("part of each light that the weights exclude", figures.mask_figure(result, frame)),
@@ -263,7 +241,7 @@ class _Report:
         else:
             page.text("Every node is measured in every frame.")
         _show(page, figures.convergence_figure(result), "convergence: largest motion of a node in each iteration")
-        _show(page, figures.map_figure(result, frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
+        _show(page, self.maps.of_kind(frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
 
     def _provenance(self, page: Page) -> None:
         kept = self.physical.result.provenance
@@ -275,7 +253,7 @@ class _Report:
             rows.append(("calibration", f"{calibration['file']}, SHA-256 {calibration['sha256']}"))
         rows += [(f"input {name}", text) for name, text in kept["inputs"].items()]
         page.table(("what", ""), rows)
-        page.table(("setting", "value"), list(settings_rows(kept.get("settings", {}))))
+        page.table(("setting", "value"), list(tables.settings_rows(kept.get("settings", {}))))
 
     def _when(self, frame: int) -> str:
         times = self.physical.times

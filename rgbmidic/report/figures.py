@@ -8,46 +8,17 @@ from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
-from rgbmidic.report.style import (
-    BAR,
-    GAP,
-    LIGHT_COLOURS,
-    LINES,
-    NUMBERS,
-    add_colour_bar,
-    colour_scale,
-    draw_figure,
-    finish_picture,
-    finish_plot,
-    literal,
-    ordinary_values,
-    shade,
-    show_image,
-    view_limits,
-)
+from rgbmidic.report import style
 from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result, scale_of
+from rgbmidic.results.physical import Physical
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
-
-__all__ = [
-    "MAPS",
-    "brightness_figure",
-    "convergence_figure",
-    "field_figure",
-    "fraction_figure",
-    "map_figure",
-    "mask_figure",
-    "measured_frames",
-    "reflection_figure",
-    "residual_figure",
-    "shown_frames",
-    "spread",
-]
 
 MAPS = {
     "displacement": ("u", "v"),
@@ -60,8 +31,8 @@ _POSITIVE = ("uncertainty", "misfit")
 _FAILED = QUANTITIES["status"].codes.index("failed")
 _EQUAL = 1e-9
 """Fraction of the colour range by which a value may exceed it by rounding alone."""
-_RASTER = 600
-"""Points along the longer side of a map: a panel of 4.5 inches has as many pixels at 130 dpi."""
+_RASTER = 450
+"""Points along the longer side of a map: the panels of two maps have as many pixels at 150 dpi."""
 _MANY_FRAMES = 8
 """Frames up to which a legend names each: it fills half the height of a panel."""
 _MOST_LINES = 100
@@ -113,47 +84,7 @@ def map_figure(result: Result, frame: int, kind: str) -> Figure:
     ResultError
         The frame is damaged.
     """
-    record = result.frame(frame)
-    unit, lengths = _lengths(result, record)
-    known, maps = {**record.values, **lengths}, {}
-    for name in MAPS[kind]:
-        std = known.get(f"{name}_std", np.zeros(len(record.u)))
-        label = f"{name} ({unit})" if name in lengths else name
-        maps[label] = known[name], std
-    return field_figure(result, frame, maps, positive=kind in _POSITIVE)
-
-
-def field_figure(
-    result: Result, frame: int, fields: Mapping[str, tuple[FloatArray, FloatArray]], *, positive: bool = False
-) -> Figure:
-    """Draw maps of nodal fields of one frame, as `map_figure` does.
-
-    Parameters
-    ----------
-    result
-        The result.
-    frame
-        Index of the frame.
-    fields
-        Values (N,) and their uncertainties (N,) by their labels; nodes of large uncertainty do not set the colours.
-    positive
-        Whether the values are positive, and their colours logarithmic.
-
-    Returns
-    -------
-    Figure
-        The figure, one panel per field.
-
-    Raises
-    ------
-    InputError, ResultError
-        As `map_figure`.
-    """
-    maps = {}
-    for label, (values, std) in fields.items():
-        known = ordinary_values(values, std)
-        maps[label] = values, colour_scale(known, positive=positive) if known.size else None
-    return _maps(result, maps, "plasma" if positive else "viridis", _frame_title(result, frame, result.frame(frame)))
+    return MapDrawer(result).of_kind(frame, kind)
 
 
 def fraction_figure(result: Result, frame: int) -> Figure:
@@ -176,13 +107,7 @@ def fraction_figure(result: Result, frame: int) -> Figure:
     InputError, ResultError
         As `map_figure`.
     """
-    from matplotlib.colors import Normalize
-
-    record = result.frame(frame)
-    fractions = np.where(record.light_fraction.sum(axis=1, keepdims=True) > 0, record.light_fraction, np.nan)
-    titles = [literal(f"fraction of {light}") for light in result.lights]
-    maps = {title: (part, Normalize(0, 1)) for title, part in zip(titles, fractions.T, strict=True)}
-    return _maps(result, maps, "cividis", _frame_title(result, frame, record))
+    return MapDrawer(result).fractions(frame)
 
 
 def mask_figure(result: Result, frame: int) -> Figure | None:
@@ -286,7 +211,6 @@ def convergence_figure(result: Result) -> Figure:
         The figure, one line per deformed frame.
     """
     from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
     shown = shown_frames(result)
@@ -298,18 +222,18 @@ def convergence_figure(result: Result) -> Figure:
         if len(frames) > _MANY_FRAMES:  # no legend, but a colour bar
             norm = Normalize(frames[0], frames[-1])
             colours = [colormaps["viridis"](norm(frame)) for frame in frames]
-            add_colour_bar(axis, ScalarMappable(norm, "viridis"), label="frame")
+            style.add_colour_bar(axis, norm, "viridis", label="frame")
         for frame, history, colour in zip(frames, result.each("history", frames), colours, strict=True):
-            steps, name = np.arange(1, len(history) + 1), literal(result.names[frame])
+            steps, name = np.arange(1, len(history) + 1), style.literal(result.names[frame])
             axis.plot(steps, history, marker="o", markersize=2.5, linewidth=1, color=colour, label=name)
         if (tolerance := result.setting("solver", "tolerance")) is not None:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
         axis.set_yscale("log")
-        finish_plot(axis, "iteration", "largest motion of a measured node (px)")
+        style.finish_plot(axis, "iteration", "largest motion of a measured node (px)")
         if len(frames) <= _MANY_FRAMES:
             axis.legend(loc="upper right")
 
-    return draw_figure(draw, count=1, aspect=0.6, beside=BAR if len(frames) > _MANY_FRAMES else GAP)
+    return style.draw_figure(draw, count=1, aspect=0.6, beside=style.BAR if len(frames) > _MANY_FRAMES else style.GAP)
 
 
 def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
@@ -318,81 +242,144 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
 
     def draw(axes: list[Axes]) -> None:
         for axis, (label, values) in zip(axes, panels.items(), strict=True):
-            for light, line, series in zip(result.lights, cycle(LINES), values[frames].T, strict=False):
-                style: dict[str, Any] = {"linestyle": line, "color": LIGHT_COLOURS.get(light)}
-                style |= {"marker": "o", "markersize": 2.5, "linewidth": 1, "label": literal(light)}
-                axis.plot(result.number[frames], series, **style)
+            for light, line, series in zip(result.lights, cycle(style.LINES), values[frames].T, strict=False):
+                look: dict[str, Any] = {"linestyle": line, "color": style.LIGHT_COLOURS.get(light)}
+                look |= {"marker": "o", "markersize": 2.5, "linewidth": 1, "label": style.literal(light)}
+                axis.plot(result.number[frames], series, **look)
             if np.nanmin(values, initial=0) >= 0:
                 axis.set_ylim(bottom=0)
-            finish_plot(axis, "frame", label)
+            style.finish_plot(axis, "frame", label)
         axes[-1].legend(loc="best")
 
-    return draw_figure(draw, count=len(panels), aspect=0.75, beside=NUMBERS)
+    return style.draw_figure(draw, count=len(panels), aspect=0.75, beside=style.NUMBERS)
 
 
-def _lengths(result: Result, record: FrameRecord) -> tuple[str, dict[str, FloatArray]]:
-    """Return the unit of lengths, mm where the scale is known, and the displacements with their uncertainties in it."""
-    scale, values = scale_of(result), {name: record.values[name] for name in ("u", "v", "u_std", "v_std")}
-    if scale.mm_per_pixel is None:
-        return "px", values
-    from rgbmidic.results.physical import Physical  # numba comes with it
+class MapDrawer:
+    """Maps of a result's nodes over its reference image; the axes and the places of the mesh are made once.
 
-    units = Physical.untimed(result, scale).units
-    for name in ("u", "v"):
-        values[name], values[f"{name}_std"] = units.lengths(values[name], values[f"{name}_std"])
-    return units.length, values
+    A figure lasts until the next one of as many panels is drawn, in its place.
 
+    Parameters
+    ----------
+    result
+        The result.
+    dpi
+        Pixels per inch that all figures are written with; the axes are then drawn once. None: not known.
+    """
 
-def _maps(
-    result: Result, maps: Mapping[str, tuple[FloatArray, Normalize | None]], colour_map: str, title: str
-) -> Figure:
-    """Draw one map per nodal field, over the reference where there is one."""
-    x, y = _view(result, result.nodes)
-    reference = None if result.reference is None else result.reference.mean(axis=0, dtype=np.float32)
+    def __init__(self, result: Result, dpi: int | None = None) -> None:
+        from matplotlib.tri import Triangulation
 
-    def draw(axes: list[Axes]) -> None:
-        for axis, (label, (values, norm)) in zip(axes, maps.items(), strict=True):
-            if reference is not None:
-                show_image(axis, reference, result.reference_origin)
-            if norm is not None and np.isfinite(values).any():
-                _show_field(axis, result, values, norm, colour_map)
-            else:
-                box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-                axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
-            axis.set_title(label)
-            finish_picture(axis, x, y, first=axis is axes[0])
+        self.result, self._dpi = result, dpi
+        self._figures: dict[int, Figure] = {}
+        self._mesh = Triangulation(result.nodes[:, 0], result.nodes[:, 1], result.elements)
+        low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
+        step = float((high - low).max()) / _RASTER
+        x, y = (np.arange(start + step / 2, end, step) for start, end in zip(low, high, strict=True))
+        self._places = np.meshgrid(x, y)
+        self._extent = (low[0], low[0] + step * len(x), low[1] + step * len(y), low[1])
+        self._element: npt.NDArray[np.int32] = np.asarray(self._mesh.get_trifinder()(*self._places), dtype=np.int32)
 
-    return draw_figure(draw, count=len(maps), aspect=np.ptp(y) / np.ptp(x), beside=BAR, title=title)
+    def of_kind(self, frame: int, kind: str) -> Figure:
+        """Draw one of `MAPS` of a frame, as `map_figure` does."""
+        record = self.result.frame(frame)
+        values, scale, unit = {**record.values}, scale_of(self.result), "px"
+        if scale.mm_per_pixel is not None:
+            units = Physical.untimed(self.result, scale).units
+            unit = units.length
+            for name in ("u", "v"):
+                values[name], values[f"{name}_std"] = units.lengths(values[name], values[f"{name}_std"])
+        nothing, maps = np.zeros(len(record.u)), {}
+        for name in MAPS[kind]:
+            label = f"{name} ({unit})" if name.removesuffix("_std") in ("u", "v") else name
+            maps[label] = values[name], values.get(f"{name}_std", nothing)
+        return self.fields(frame, maps, positive=kind in _POSITIVE)
 
+    def fields(
+        self, frame: int, fields: Mapping[str, tuple[FloatArray, FloatArray]], *, positive: bool = False
+    ) -> Figure:
+        """Draw maps of nodal fields of one frame, blank where not measured.
 
-def _show_field(axis: Axes, result: Result, values: FloatArray, norm: Normalize, colour_map: str) -> None:
-    """Show a nodal field with its colour bar; blank where a node of the element is not measured."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullFormatter
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+        fields
+            Values (N,) and their uncertainties (N,) by their labels; nodes of large uncertainty do not set the colours.
+        positive
+            Whether the values are positive, and their colours logarithmic.
 
-    picture, extent = _raster(result, values)
-    axis.imshow(picture, extent=extent, cmap=colour_map, norm=norm, interpolation="nearest")
-    scaled = norm(values[np.isfinite(values)])
-    extend = ("neither", "min", "max", "both")[int(scaled.min() < -_EQUAL) + 2 * int(scaled.max() > 1 + _EQUAL)]
-    bar = add_colour_bar(axis, ScalarMappable(norm, colour_map), extend=extend)
-    bar.ax.yaxis.set_major_locator(MaxNLocator(6))
-    bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%.4g"))
-    bar.ax.yaxis.set_minor_formatter(NullFormatter())
+        Returns
+        -------
+        Figure
+            The figure, one panel per field.
 
+        Raises
+        ------
+        InputError, ResultError
+            As `map_figure`.
+        """
+        maps = {}
+        for label, (values, std) in fields.items():
+            ordinary = style.ordinary_values(values, std)
+            maps[label] = values, style.colour_scale(ordinary, positive=positive) if ordinary.size else None
+        return self._draw(frame, maps, "plasma" if positive else "viridis")
 
-def _raster(
-    result: Result, values: FloatArray
-) -> tuple[np.ma.MaskedArray[Any, Any], tuple[float, float, float, float]]:
-    """Sample a nodal field on a fine grid, linear inside each element as in the solve; return it and its extent."""
-    from matplotlib.tri import LinearTriInterpolator, Triangulation
+    def fractions(self, frame: int) -> Figure:
+        """Draw the fraction of each light in what determines the nodes of a frame, as `fraction_figure` does."""
+        from matplotlib.colors import Normalize
 
-    blank = ~np.isfinite(values)[result.elements].all(axis=1)
-    grid = Triangulation(result.nodes[:, 0], result.nodes[:, 1], triangles=result.elements, mask=blank)
-    low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
-    step = float((high - low).max()) / _RASTER
-    x, y = (np.arange(start + step / 2, end, step) for start, end in zip(low, high, strict=True))
-    picture = LinearTriInterpolator(grid, np.nan_to_num(values))(*np.meshgrid(x, y))
-    return picture, (low[0], low[0] + step * len(x), low[1] + step * len(y), low[1])
+        fractions = self.result.frame(frame).light_fraction
+        fractions = np.where(fractions.sum(axis=1, keepdims=True) > 0, fractions, np.nan)
+        titles = [style.literal(f"fraction of {light}") for light in self.result.lights]
+        maps = {title: (part, Normalize(0, 1)) for title, part in zip(titles, fractions.T, strict=True)}
+        return self._draw(frame, maps, "cividis")
+
+    def _draw(self, frame: int, maps: Mapping[str, tuple[FloatArray, Normalize | None]], colours: str) -> Figure:
+        """Draw one map per nodal field, over the reference where there is one."""
+        import matplotlib as mpl
+
+        if len(maps) not in self._figures:
+            self._figures[len(maps)] = self._panels(len(maps))
+        figure, kept = self._figures[len(maps)], int(self._dpi is None and self.result.reference is not None)
+        figure.texts[0].set_text(_frame_title(self.result, frame, self.result.frame(frame)))
+        with mpl.rc_context(style.STYLE):
+            for axis, (label, (values, norm)) in zip(figure.axes, maps.items(), strict=True):
+                for artist in (*axis.images[kept:], *axis.lines, *axis.patches, *axis.texts, *axis.artists):
+                    artist.remove()
+                self._show(axis, values, norm, colours)
+                axis.set_title(label)
+        return figure
+
+    def _panels(self, count: int) -> Figure:
+        """Draw what is the same in all figures of `count` maps: axes and reference image."""
+        result, (x, y) = self.result, _view(self.result, self.result.nodes)
+
+        def draw(axes: list[Axes]) -> None:
+            reference = None if result.reference is None else result.reference.mean(axis=0, dtype=np.float32)
+            for axis in axes:
+                if reference is not None:
+                    style.show_image(axis, reference, result.reference_origin)
+                style.finish_picture(axis, x, y, first=axis is axes[0])
+
+        figure = style.draw_figure(draw, count=count, aspect=np.ptp(y) / np.ptp(x), beside=style.BAR, title=" ")
+        if self._dpi is not None:
+            style.freeze_axes(figure, self._dpi)
+        return figure
+
+    def _show(self, axis: Axes, values: FloatArray, norm: Normalize | None, colours: str) -> None:
+        """Show a nodal field, linear in each element as in the solve; blank where one of its nodes has no data."""
+        if norm is None or not np.isfinite(values).any():
+            box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+            axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
+            return
+        planes = self._mesh.calculate_plane_coefficients(values)
+        x, y, constant = np.concatenate([planes, np.full((1, 3), np.nan)])[self._element].transpose(2, 0, 1)
+        picture = x * self._places[0] + y * self._places[1] + constant  # of no element, -1: NaN, the last row
+        axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
+        scaled = norm(values[np.isfinite(values)])
+        beyond = bool(scaled.min() < -_EQUAL), bool(scaled.max() > 1 + _EQUAL)
+        style.add_colour_bar(axis, norm, colours, beyond=beyond)
 
 
 def _shaded(
@@ -414,18 +401,18 @@ def _shaded(
 
     def draw(axes: list[Axes]) -> None:
         for axis, image, part, light in zip(axes, reference, cover, result.lights, strict=True):
-            show_image(axis, image, origin)
-            shade(axis, part, step, origin)
-            axis.set_title(literal(f"{light}: {title_of(part[rows, columns])}"))
-            finish_picture(axis, x, y, first=axis is axes[0])
+            style.show_image(axis, image, origin)
+            style.shade(axis, part, step, origin)
+            axis.set_title(style.literal(f"{light}: {title_of(part[rows, columns])}"))
+            style.finish_picture(axis, x, y, first=axis is axes[0])
 
     title = f"{_frame_title(result, frame, record)}, over the reference image"
-    return draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=GAP, title=title)
+    return style.draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=style.GAP, title=title)
 
 
 def _view(result: Result, points: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the limits in x and in y of a picture around points (N, 2), inside the image."""
-    low, high = view_limits(points)
+    low, high = style.view_limits(points)
     if result.reference is not None:
         first, size = np.array(result.reference_origin), np.array(result.reference.shape[:0:-1])
         low, high = (np.clip(end, first - 0.5, first + size - 0.5) for end in (low, high))
@@ -437,4 +424,4 @@ def _frame_title(result: Result, frame: int, record: FrameRecord) -> str:
     blank = np.isnan(record.u).mean()
     missing = f", {blank:.1%} of the nodes not measured" if blank else ""
     end = QUANTITIES["status"].codes[record.status]
-    return f"frame {frame}: {literal(result.names[frame])} ({end}, {record.iterations} iterations{missing})"
+    return f"frame {frame}: {style.literal(result.names[frame])} ({end}, {record.iterations} iterations{missing})"

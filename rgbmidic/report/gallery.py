@@ -13,26 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rgbmidic.errors import ResultError
-from rgbmidic.report.figures import (
-    MAPS,
-    brightness_figure,
-    convergence_figure,
-    fraction_figure,
-    map_figure,
-    mask_figure,
-    measured_frames,
-    reflection_figure,
-    residual_figure,
-    spread,
-)
-from rgbmidic.report.style import save_figure
+from rgbmidic.report import figures
+from rgbmidic.report.style import DPI, save_figure
 from rgbmidic.results import Result
 from rgbmidic.results.files import writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = ["REPORT", "remove_figures", "remove_report", "write_figures"]
 
 REPORT = "report.html"
 """Name of the report that lies in a result's folder."""
@@ -40,19 +27,19 @@ REPORT = "report.html"
 _FRAMES = 3
 """Frames that get pictures where none are named, as in the report."""
 _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
-    "convergence": convergence_figure,
-    "residual": residual_figure,
-    "brightness": brightness_figure,
+    "convergence": figures.convergence_figure,
+    "residual": figures.residual_figure,
+    "brightness": figures.brightness_figure,
 }
-_OF_FRAME: Mapping[str, Callable[[Result, int], Figure | None]] = {
-    **{kind: partial(map_figure, kind=kind) for kind in MAPS},
-    "fractions": lambda result, frame: fraction_figure(result, frame) if len(result.lights) > 1 else None,
-    "masks": mask_figure,
-    "reflections": reflection_figure,
+_OF_FRAME: Mapping[str, Callable[[figures.MapDrawer, int], Figure | None]] = {
+    **{kind: partial(figures.MapDrawer.of_kind, kind=kind) for kind in figures.MAPS},
+    "fractions": lambda maps, frame: maps.fractions(frame) if len(maps.result.lights) > 1 else None,
+    "masks": lambda maps, frame: figures.mask_figure(maps.result, frame),
+    "reflections": lambda maps, frame: figures.reflection_figure(maps.result, frame),
 }
 _NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)})_[0-9]{{6,}})\.png")
-_FEW = 5
-"""Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.5 s."""
+_FEW = 20
+"""Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.15 s."""
 
 _Picture = tuple[str, int | None]
 """Kind of a picture, and its frame if it is of one."""
@@ -91,7 +78,7 @@ def write_figures(
     folder = Path(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    frames = spread(measured_frames(result), _FRAMES) if frames is None else frames
+    frames = figures.spread(figures.measured_frames(result), _FRAMES) if frames is None else frames
     for frame in frames:
         result.frame(frame)  # an error of one is raised before the first picture
     pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]
@@ -114,9 +101,9 @@ def write_figures(
 
 def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
     """Write pictures one after the other, so that only one is in memory; return the files of those that exist."""
-    files = []
+    files, maps = [], figures.MapDrawer(result, DPI)
     for kind, frame in pictures:
-        figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](result, frame)
+        figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](maps, frame)
         if figure is not None:
             files.append(_file(folder, kind, frame))
             save_figure(figure, files[-1])

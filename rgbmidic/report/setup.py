@@ -19,18 +19,6 @@ from rgbmidic.typing import FloatArray
 if TYPE_CHECKING:
     from rgbmidic.results.physical import Physical
 
-__all__ = [
-    "NoiseFloor",
-    "TimeHistory",
-    "analysis_rows",
-    "hardware_rows",
-    "noise_floor",
-    "noise_text",
-    "reference_text",
-    "settings_rows",
-    "speckle_size",
-]
-
 Rows = Iterator[tuple[str, str]]
 
 _PREFILTERS = {"none": "none", "binomial": "[1 2 1]/4 along x and y", "gaussian": "Gaussian, σ = 1 px"}
@@ -155,9 +143,15 @@ _STATIC = 50
 relative uncertainty 1 / sqrt(2 n N) for independent nodes: below 1 % from 100 nodes on."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TimeHistory:
-    """Quantiles over the nodes of the fields of some frames, frame by frame.
+    """Quantiles over the nodes of the fields of some frames, read one frame after the other.
+
+    Parameters
+    ----------
+    physical
+        The result in the units of its scale.
+    frames
+        Indices of the frames in the result.
 
     Attributes
     ----------
@@ -173,59 +167,31 @@ class TimeHistory:
         Fraction of the nodes with each `node_status`.
     fastest : float
         Largest velocity of a node between two neighbouring ones of these frames, px per unit of time; 0 where unknown.
+
+    Raises
+    ------
+    ResultError
+        A frame is damaged.
     """
 
-    frames: tuple[int, ...]
-    axis: tuple[FloatArray, str]
-    timed: bool
-    quantiles: dict[str, FloatArray]
-    fractions: FloatArray
-    fastest: float
-
-    @classmethod
-    def of(cls, physical: Physical, frames: Sequence[int]) -> TimeHistory:
-        """Read frames of a result one after the other.
-
-        Parameters
-        ----------
-        physical
-            The result in the units of its scale.
-        frames
-            Indices of the frames.
-
-        Returns
-        -------
-        TimeHistory
-            Their quantiles.
-
-        Raises
-        ------
-        ResultError
-            A frame is damaged.
-        """
-        rows: dict[str, list[FloatArray]] = {name: [] for name in _READ}
-        codes = range(len(QUANTITIES["node_status"].codes))
-        fractions, fastest, before = [], 0.0, None
-        for frame in frames:
+    def __init__(self, physical: Physical, frames: Sequence[int]) -> None:
+        self.frames, self.timed, times = tuple(frames), physical.units.timed, physical.times[list(frames)]
+        self.axis = time_axis(times if self.timed else None, physical.result.number[list(frames)])
+        self.quantiles = {name: np.full((len(times), len(_QUANTILES)), np.nan) for name in _READ}
+        self.fractions = np.empty((len(times), len(QUANTITIES["node_status"].codes)))
+        self.fastest, before = 0.0, np.array(np.nan)
+        for place, frame in enumerate(frames):
             values = physical.frame(frame)
-            for name, row in rows.items():
-                known = values[name][np.isfinite(values[name])]
-                row.append(np.quantile(known, _QUANTILES) if known.size else np.full(len(_QUANTILES), np.nan))
-            fractions.append([float((values["node_status"] == code).mean()) for code in codes])
+            for name, quantiles in self.quantiles.items():
+                if (known := values[name][np.isfinite(values[name])]).size:
+                    quantiles[place] = np.quantile(known, _QUANTILES)
+            codes = range(self.fractions.shape[1])
+            self.fractions[place] = [(values["node_status"] == code).mean() for code in codes]
             here = np.stack([values["u"], values["v"]]) / physical.length
-            if before is not None:
-                step = np.hypot(*(here - before[1])) / (physical.times[frame] - physical.times[before[0]])
-                fastest = max(fastest, float(np.nan_to_num(step).max(initial=0)))
-            before = frame, here
-        chosen = list(frames)
-        return cls(
-            frames=tuple(frames),
-            axis=time_axis(physical.times[chosen] if physical.units.timed else None, physical.result.number[chosen]),
-            timed=physical.units.timed,
-            quantiles={name: np.array(row) for name, row in rows.items()},
-            fractions=np.array(fractions),
-            fastest=fastest,
-        )
+            if place:
+                step = np.hypot(*(here - before)) / (times[place] - times[place - 1])
+                self.fastest = max(self.fastest, float(np.nan_to_num(step).max(initial=0)))
+            before = here
 
     def medians(self, name: str) -> FloatArray:
         """Return the medians over the nodes of a quantity, of the frames in which it is finite; else one NaN."""

@@ -17,7 +17,7 @@ from xarray.core import indexing
 
 from rgbmidic._version import __version__
 from rgbmidic.results.physical import frame_times, scale_of
-from rgbmidic.results.quantities import QUANTITIES, SHARED, ResultQuantity
+from rgbmidic.results.quantities import QUANTITIES, SHARED
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.timing import STAGES
@@ -77,27 +77,16 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
         if not entry.stackable or name.removesuffix("_std") in _COMPONENTS or name == "number":
             continue
         axes = ("frame", *(axis if isinstance(axis, str) else dimension for axis in entry.axes))
-        variables[name] = _lazy(result, axes, (name,), _attributes(entry))
+        variables[name] = xr.Variable(axes, indexing.LazilyIndexedArray(_Frames(result, (name,))), entry.attributes)
     for end, meaning in {"": "small strain", "_std": "standard uncertainty of strain"}.items():
         names = tuple(f"{name}{end}" for name in _COMPONENTS)
         about = {"units": "1", "long_name": meaning}
         if not end:
             about["description"] = "; ".join(f"{name}: {QUANTITIES[name].meaning}" for name in names)
-        variables[f"strain{end}"] = _lazy(result, ("frame", "node", "component"), names, about)
-    variables["elements"] = xr.Variable(("element", "corner"), result.elements, _attributes(SHARED["elements"]))
+        read = indexing.LazilyIndexedArray(_Frames(result, names))
+        variables[f"strain{end}"] = xr.Variable(("frame", "node", "component"), read, about)
+    variables["elements"] = xr.Variable(("element", "corner"), result.elements, SHARED["elements"].attributes)
     return xr.Dataset(variables, _coordinates(result, scale), _provenance(result, scale))
-
-
-def _lazy(result: Result, axes: tuple[str, ...], names: tuple[str, ...], about: dict[str, Any]) -> xr.Variable:
-    return xr.Variable(axes, indexing.LazilyIndexedArray(_Frames(result, names)), about)
-
-
-def _attributes(entry: ResultQuantity) -> dict[str, Any]:
-    about: dict[str, Any] = {"units": entry.unit or "1", "long_name": entry.meaning}
-    if entry.codes:
-        about["flag_values"] = np.arange(len(entry.codes), dtype=entry.dtype)
-        about["flag_meanings"] = " ".join(code.replace(" ", "_") for code in entry.codes)
-    return about
 
 
 def _coordinates(result: Result, scale: ScaleSettings) -> dict[str, xr.Variable]:
@@ -106,7 +95,7 @@ def _coordinates(result: Result, scale: ScaleSettings) -> dict[str, xr.Variable]
     factors = {"px": 1.0} | ({} if scale.mm_per_pixel is None else {"mm": scale.mm_per_pixel})
     coordinates = {
         "frame": xr.Variable("frame", np.arange(len(result)), {"long_name": "place of the frame in the result"}),
-        "number": xr.Variable("frame", result.number, _attributes(QUANTITIES["number"])),
+        "number": xr.Variable("frame", result.number, QUANTITIES["number"].attributes),
         "name": xr.Variable("frame", list(result.names), {"long_name": "name of the frame"}),
         "light": xr.Variable("light", list(result.lights), {"long_name": "name of the light"}),
         "component": xr.Variable("component", list(_COMPONENTS), {"long_name": "component of the strain tensor"}),

@@ -74,9 +74,8 @@ def write_hdf5(physical: Physical, file: BinaryIO) -> None:
     """
     sizes = {"node": len(physical.mesh.nodes), "element": len(physical.mesh.elements)}
     sizes["light"] = len(physical.result.lights)
-    frame = (
-        sum(entry.unmeasured(sizes).nbytes for entry in physical.quantities.values()) + _TURNED_BYTES * sizes["node"]
-    )
+    frame = sum(entry.unmeasured(sizes).nbytes for entry in physical.quantities.values())
+    frame += _TURNED_BYTES * sizes["node"]
     shared = _SHARED_BYTES * (len(physical.result) + sum(sizes.values())) + _HEADERS
     if shutil.disk_usage(Path(file.name).parent).free < frame * len(physical.result) + shared:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # before HDF5 itself meets a full disk
@@ -147,11 +146,7 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     out.create_dataset("provenance", data=json.dumps(dict(result.provenance)), dtype=text)
     meaning = "time of the frame" if units.timed else "place of the frame, counted from 0"
     scales: dict[str, tuple[AnyArray, str, str]] = {
-        "time": (
-            physical.times,
-            units.time,
-            "time of the frame" if units.timed else "place of the frame, counted from 0",
-        ),
+        "time": (physical.times, units.time, meaning),
         "node": (np.arange(len(mesh.nodes), dtype=np.int32), "1", "index of the node, as in elements"),
         "element": (np.arange(len(mesh.elements), dtype=np.int32), "1", "index of the element"),
         "corner": (np.arange(3, dtype=np.int32), "1", "corner of the element"),
@@ -172,11 +167,11 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
 
 
 def _add(out: h5py.File, name: str, values: AnyArray, axes: tuple[str, ...], unit: str, meaning: str) -> h5py.Dataset:
-    return _describe(out, out.create_dataset(name, data=values), axes, unit, meaning)
+    return _describe(out, out.create_dataset(name, data=values), axes, {"units": unit, "long_name": meaning})
 
 
-def _describe(out: h5py.File, dataset: h5py.Dataset, axes: tuple[str, ...], unit: str, meaning: str) -> h5py.Dataset:
-    dataset.attrs.update({"units": unit or "1", "long_name": meaning})
+def _describe(out: h5py.File, dataset: h5py.Dataset, axes: tuple[str, ...], about: dict[str, Any]) -> h5py.Dataset:
+    dataset.attrs.update(about)
     for axis, name in zip(dataset.dims, axes, strict=False):
         axis.attach_scale(out[name])
     return dataset
@@ -190,18 +185,11 @@ def _declare(out: h5py.File, physical: Physical, entry: ResultQuantity) -> None:
             _add(out, name, np.arange(int(axis), dtype=np.int32), (), "1", "index").make_scale(name)
     shape = (len(physical.result), *(len(out[axis]) for axis in axes))
     dataset = _room(out, entry.name, shape, entry.dtype)
-    _describe(out, dataset, ("time", *axes), entry.unit, entry.meaning)
-    if entry.codes:
-        words = " ".join(code.replace(" ", "_") for code in entry.codes)
-        dataset.attrs.update({"flag_values": np.arange(len(entry.codes), dtype=entry.dtype), "flag_meanings": words})
+    _describe(out, dataset, ("time", *axes), entry.attributes)
     if physical.is_strain(entry.name):
+        length = f"{physical.gauges.length * physical.length:.6g} {physical.units.length}"
         dataset.attrs["measure"] = "hencky" if entry.name.startswith("equivalent") else physical.measure
-        gauge = (
-            "element"
-            if "element" in axes
-            else f"{physical.gauges.length * physical.length:.6g} {physical.units.length}"
-        )
-        dataset.attrs["gauge"] = gauge
+        dataset.attrs["gauge"] = "element" if "element" in axes else length
 
 
 def _declare_grid(group: h5py.Group, physical: Physical) -> None:
@@ -225,12 +213,7 @@ def _declare_grid(group: h5py.Group, physical: Physical) -> None:
     steps.attrs["NSteps"] = frames
     steps["Values"] = physical.times
     steps["NumberOfParts"] = first + 1
-    for name, shape in {
-        "Part": (frames,),
-        "Point": (frames,),
-        "Cell": (frames, 1),
-        "ConnectivityId": (frames, 1),
-    }.items():
+    for name, shape in {"Part": (-1,), "Point": (-1,), "Cell": (-1, 1), "ConnectivityId": (-1, 1)}.items():
         steps[f"{name}Offsets"] = first.reshape(shape)
     _room(data, "displacement", (frames * nodes, 3), np.float32)
     for entry in physical.quantities.values():

@@ -6,10 +6,8 @@ names a process that writes into the folder, and the frames that it writes.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
-import math
 import os
 import random
 import secrets
@@ -18,13 +16,14 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from rgbmidic.errors import ResultError, disk_reason
+from rgbmidic.errors import ResultError, disk_faults
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
@@ -37,7 +36,6 @@ __all__ = [
     "write_arrays",
     "write_complete",
     "write_json",
-    "write_new_json",
     "writing",
 ]
 
@@ -72,33 +70,22 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, AnyArray]:
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
-    """Read one array after a check that its header promises what the file holds."""
+    """Read one array; a header that promises more than the file holds takes no memory."""
     entry = archive.getinfo(f"{name}.npy")
     if entry.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{name} is compressed")
-    file = io.BytesIO(archive.read(entry))
+    content = archive.read(entry)
+    file = io.BytesIO(content)
     np.lib.format.read_magic(file)
-    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    promised, held = math.prod(shape) * dtype.itemsize, entry.file_size - file.tell()
-    if promised != held:
-        raise ValueError(f"the header of {name} promises {promised} bytes, the file holds {held}")
-    file.seek(0)
-    array: AnyArray = np.lib.format.read_array(file, allow_pickle=False)
-    return array
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    array = np.frombuffer(content, dtype, offset=file.tell())  # one that the header's shape does not fit is an error
+    return array.reshape(shape, order="F" if fortran else "C").copy()
 
 
-def write_json(path: Path, document: Any) -> None:
-    """Write a JSON file."""
-    write_complete(path, lambda file: file.write(_text(document)))
-
-
-def write_new_json(path: Path, document: Any) -> bool:
-    """Write a JSON file where there is none; of several processes at once one gets True, the others False."""
-    return write_complete(path, lambda file: file.write(_text(document)), _name_new)
-
-
-def _text(document: Any) -> bytes:
-    return json.dumps(document, indent=2).encode() + b"\n"
+def write_json(path: Path, document: Any, *, new: bool = False) -> None:
+    """Write a JSON file; a `new` one is not written where there is one, also where several processes begin at once."""
+    content = json.dumps(document, indent=2).encode() + b"\n"
+    write_complete(path, lambda file: file.write(content), new=new)
 
 
 def read_json(path: Path) -> Any:
@@ -119,36 +106,37 @@ def read_json(path: Path) -> Any:
         raise ResultError(f"{path} is damaged: {error}") from None
 
 
-def _rename(temporary: Path, path: Path) -> bool:
-    """Rename, over an older file where there is one."""
-    temporary.replace(path)
-    return True
+def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool = False) -> None:
+    """Write a file under another name and rename it when all of it is on the disk; else nothing is left of it.
 
-
-def _name_new(temporary: Path, path: Path) -> bool:
-    """Rename where there is none yet."""
-    try:
-        path.hardlink_to(temporary)
-    except FileExistsError:
-        return False
-    except OSError:  # a disk without links, where nobody else starts in the same millisecond
-        return not path.exists() and _rename(temporary, path)
-    return True
-
-
-def write_complete(
-    path: Path, write: Callable[[BinaryIO], object], rename: Callable[[Path, Path], bool] = _rename
-) -> bool:
-    """Write a file under another name and `rename` it when all of it is on the disk; else nothing is left of it."""
+    Parameters
+    ----------
+    path
+        The file.
+    write
+        Writes its content.
+    new
+        Whether a file of this name stays as it is, also one that another process writes at the same time; else it is
+        replaced.
+    """
     temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{os.getpid()}.part")
     try:
         with writing(path), temporary.open("wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-            return rename(temporary, path)
+            if new:
+                try:
+                    path.hardlink_to(temporary)
+                    return
+                except FileExistsError:
+                    return
+                except OSError:  # a disk without links, where nobody else starts in the same millisecond
+                    if path.exists():
+                        return
+            temporary.replace(path)
     finally:
-        with contextlib.suppress(OSError):  # a read-only disk refuses even to remove what is not there
+        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
             temporary.unlink()
 
 
@@ -169,13 +157,9 @@ def check_file(out: Path, *, overwrite: bool) -> None:
             raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
 
 
-@contextlib.contextmanager
-def writing(path: Path | str) -> Iterator[None]:
+def writing(path: Path | str) -> AbstractContextManager[None]:
     """Turn an error of the disk inside the block into a `ResultError` that names the file."""
-    try:
-        yield
-    except OSError as error:
-        raise ResultError(f"{path} cannot be written: {disk_reason(error)}") from None
+    return disk_faults(ResultError, f"{path} cannot be written")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,5 +242,5 @@ def _may_live(holder: dict[str, Any]) -> bool:
     except ProcessLookupError:
         return False
     except (KeyError, TypeError, OverflowError, OSError):
-        return True
+        pass
     return True

@@ -24,7 +24,6 @@ from rgbmidic.fields import (
     Probe,
     RigidMotion,
     Units,
-    column,
     make_probe,
     rates,
 )
@@ -44,29 +43,8 @@ _FAST = 95
 """Percentile of the nodes' speeds that stands for the fast ones: single outliers do not count."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class HistoryColumn:
-    """A column of `Histories`: one quantity over the frames in the reader's unit.
-
-    Attributes
-    ----------
-    name
-        Without its unit.
-    unit
-        Such as ``"mm"``, ``"px/frame"``, ``"1/s"``; empty for a strain.
-    values, std : ndarray, shape (T,)
-        NaN where not known; `std` is None for what was not measured by the images.
-    """
-
-    name: str
-    unit: str
-    values: FloatArray
-    std: FloatArray | None
-
-    @property
-    def column(self) -> str:
-        """Name of its column, with the unit."""
-        return column(self.name, self.unit)
+HistoryColumn = History
+"""A column of `Histories`: one quantity over the frames in the reader's unit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,7 +140,6 @@ def read_histories(
     *,
     scale: ScaleSettings | None = None,
     channels: Channels | None = None,
-    offset: float = 0.0,
     area: float | None = None,
     force: str | None = None,
 ) -> Histories:
@@ -180,8 +157,6 @@ def read_histories(
         It replaces the ``[scale]`` that was kept with the result; None: that one.
     channels
         Recorded beside the test.
-    offset
-        Seconds that are added to the times of the channels.
     area
         Cross-section of the specimen in square mm, for a stress.
     force
@@ -231,8 +206,7 @@ def read_histories(
         for history in read
         for column in _in_units(history, units, clock, probes.window, shared_part(result), references)
     ]
-    beside = _channels(channels, times, offset)
-    stress = _stress(channels, beside, area, force)
+    beside, stress = _beside(channels, times, area, force)
     strain = next((column.name for column in quantities if column.name.endswith(("_strain", "_e1"))), None)
     return Histories(
         frames=there,
@@ -287,7 +261,13 @@ def _in_units(
     """Convert a history to the reader's units; add its rates over a window of frames, at kinks those of both sides."""
     length = history.unit == "px"
     unit = units.length if length else history.unit
-    yield _column(history.name, unit, history.values, history.std, units if length else None)
+
+    def column(name: str, unit: str, values: FloatArray, std: FloatArray) -> HistoryColumn:
+        values, std = units.lengths(values, std) if length else (values, std)
+        return HistoryColumn(name=name, unit=unit, values=values, std=std)
+
+    assert history.std is not None
+    yield column(history.name, unit, history.values, history.std)
     if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
@@ -295,43 +275,30 @@ def _in_units(
     for power, name in enumerate(("velocity", "acceleration") if length else ("velocity",), start=1):
         for side in ("", "_before", "_after"):
             values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")
-            if side and not np.isfinite(values).any():
-                continue  # no kink
-            title = f"{history.name}_{name if length else 'rate'}{side}"
-            yield _column(title, units.per_time(unit, power), values, std, units if length else None)
+            if not side or np.isfinite(values).any():  # else no kink
+                title = f"{history.name}_{name if length else 'rate'}{side}"
+                yield column(title, units.per_time(unit, power), values, std)
 
 
-def _column(name: str, unit: str, values: FloatArray, std: FloatArray, lengths: Units | None) -> HistoryColumn:
-    values, std = (values, std) if lengths is None else lengths.lengths(values, std)
-    return HistoryColumn(name=name, unit=unit, values=values, std=std)
-
-
-def _channels(channels: Channels | None, times: FloatArray | None, offset: float) -> list[HistoryColumn]:
-    """Interpolate the channels at the times of the frames."""
+def _beside(
+    channels: Channels | None, times: FloatArray | None, area: float | None, force: str | None
+) -> tuple[list[HistoryColumn], list[HistoryColumn]]:
+    """Interpolate the channels at the times of the frames; compute the stress where a cross-section (mm²) is known."""
+    if area is not None and (channels is None or not area > 0):
+        raise InputError(f"a stress needs channels with a force and an area above 0 mm², not {area:g}")
     if channels is None:
-        return []
+        return [], []
     if times is None:
         raise InputError(
             f"the channels {channels.path} cannot be brought to the frames, whose times are not known: state "
             "frame_rate in [scale]"
         )
-    return [
-        HistoryColumn(name=name, unit="", values=values, std=None)
-        for name, values in channels.at(times, offset).items()
-    ]
-
-
-def _stress(
-    channels: Channels | None, beside: list[HistoryColumn], area: float | None, force: str | None
-) -> list[HistoryColumn]:
-    """Compute the stress where a cross-section (square mm) is known."""
+    read = channels.at(times)
+    beside = [HistoryColumn(name=name, unit="", values=values, std=None) for name, values in read.items()]
     if area is None:
-        return []
-    if channels is None or not area > 0:
-        raise InputError(f"a stress needs channels with a force and an area above 0 mm², not {area:g}")
+        return beside, []
     name, newtons = channels.force(force)
-    values = next(column.values for column in beside if column.name == name)
-    return [HistoryColumn(name="stress", unit="MPa", values=values * newtons / area, std=None)]
+    return beside, [HistoryColumn(name="stress", unit="MPa", values=read[name] * newtons / area, std=None)]
 
 
 def _remarks(

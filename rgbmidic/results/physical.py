@@ -146,20 +146,30 @@ class Channels:
     path
         The file.
     times : ndarray, shape (n,)
-        In seconds, rising.
+        In seconds, rising, by the clock of the frames.
     values
         Name of each channel to its values (n,).
+    offset
+        Seconds that were added to the recorded times to make them those of the frames.
     """
 
     path: Path
     times: FloatArray
     values: Mapping[str, FloatArray]
+    offset: float = 0.0
 
     @classmethod
-    def read(cls, path: Path | str) -> Self:
+    def read(cls, path: Path | str, offset: float = 0.0) -> Self:
         """Read a CSV file: a header line, then rows; the first column is ``time_s``, ``time_ms`` or ``time_us``.
 
         Columns are separated by commas, semicolons (then a comma may be the decimal point) or tabs.
+
+        Parameters
+        ----------
+        path
+            The file.
+        offset
+            Seconds that are added to its times to make them those of the frames.
 
         Raises
         ------
@@ -185,31 +195,29 @@ class Channels:
         times = table[:, 0] * _SECONDS[(unit[1] or "s").lower()]
         if len(times) < 2 or not (np.diff(times) > 0).all():
             raise InputError(f"the times of the channels {path} must rise from row to row, over two rows or more")
-        return cls(path=path, times=times, values=dict(zip(names[1:], table[:, 1:].T, strict=True)))
+        values = dict(zip(names[1:], table[:, 1:].T, strict=True))
+        return cls(path=path, times=times + offset, values=values, offset=offset)
 
-    def at(self, times: FloatArray, offset: float = 0.0) -> dict[str, FloatArray]:
+    def at(self, times: FloatArray) -> dict[str, FloatArray]:
         """Interpolate each channel linearly at the times (T,) of the frames; NaN beyond its values.
 
         Parameters
         ----------
         times
             In seconds.
-        offset
-            Seconds that are added to the times of the channels to make them those of the frames.
 
         Raises
         ------
         InputError
             No frame lies within the times of the channels.
         """
-        recorded = self.times + offset
-        if not ((times >= recorded[0]) & (times <= recorded[-1])).any():
+        first, last = self.times[[0, -1]]
+        if not ((times >= first) & (times <= last)).any():
             raise InputError(
-                f"the channels {self.path} span {recorded[0]:.9g} to {recorded[-1]:.9g} s (offset {offset:g} s "
-                f"included), the frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state the --offset between "
-                "both clocks"
+                f"the channels {self.path} span {first:.9g} to {last:.9g} s (offset {self.offset:g} s included), the "
+                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state the --offset between both clocks"
             )
-        return {name: np.interp(times, recorded, values, np.nan, np.nan) for name, values in self.values.items()}
+        return {name: np.interp(times, self.times, values, np.nan, np.nan) for name, values in self.values.items()}
 
     def force(self, name: str | None = None) -> tuple[str, float]:
         """Return the name of the channel with a force, and its unit in newtons.
@@ -300,11 +308,10 @@ class Physical:
     def of(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
         scale = scale_of(result) if scale is None else scale
-        times, units = frame_times(result, scale), units_of(result, scale)
-        mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
+        untimed, times = cls.untimed(result, scale), frame_times(result, scale)
         if times is None or not (np.diff(times) > 0).all():
-            times, units = np.arange(len(result), dtype=np.float64), replace(units, timed=False)
-        return cls(result=result, scale=scale, units=units, times=times, mesh=mesh)
+            return untimed
+        return replace(untimed, times=times, units=replace(untimed.units, timed=True))
 
     @classmethod
     def untimed(cls, result: Result, scale: ScaleSettings) -> Self:

@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"
@@ -182,14 +182,15 @@ def is_result(path: Path) -> bool:
     ResultError
         It has a foreign file of that name, or one that is no JSON.
     """
-    return _document(path) is not None
-
-
-def _document(path: Path) -> dict[str, Any] | None:
     try:
-        document = read_json(path / PROVENANCE)
+        _document(path)
     except FileNotFoundError:
-        return None
+        return False
+    return True
+
+
+def _document(path: Path) -> dict[str, Any]:
+    document = read_json(path / PROVENANCE)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA_NAME:
         raise ResultError(f'{path / PROVENANCE} does not belong to a result: its "schema" is not "{SCHEMA_NAME}"')
     return document
@@ -203,9 +204,10 @@ def read_provenance(path: Path) -> dict[str, Any]:
     ResultError
         The folder is no result, has another schema version, or the file was changed.
     """
-    document = _document(path)
-    if document is None:
-        raise ResultError(f"{path} is not a result folder: it has no {PROVENANCE}")
+    try:
+        document = _document(path)
+    except FileNotFoundError:
+        raise ResultError(f"{path} is not a result folder: it has no {PROVENANCE}") from None
     if (version := document.get("schema_version")) != SCHEMA_VERSION:
         raise ResultError(
             f"{path} has schema version {version!r}, this version of rgbmidic reads {SCHEMA_VERSION}; measure the test "

@@ -66,6 +66,15 @@ class ResultQuantity:
         """Whether all frames make one array: no axis is open, and it is no text."""
         return None not in self.shape({"node": 0, "light": 0}) and self.dtype is not np.str_
 
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Description by the CF conventions: units ("1" where there is none), long_name, and what a status means."""
+        about: dict[str, Any] = {"units": self.unit or "1", "long_name": self.meaning}
+        if self.codes:
+            about["flag_values"] = np.arange(len(self.codes), dtype=self.dtype)
+            about["flag_meanings"] = " ".join(code.replace(" ", "_") for code in self.codes)
+        return about
+
     def convert(self, value: Any, sizes: Mapping[str, int]) -> Any:
         """Return `value` in the type of the table; an `InputError` where it has another shape."""
         array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
@@ -92,6 +101,11 @@ _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
 _EXACT: dict[str, Any] = {"dtype": np.float64}
+_NUMBER = "number of the frame: a frame that is missing leaves a gap"
+_INPUTS = "path and SHA-256 of each file that the frame was read from"
+_AT_NODE = "against the reference, at the node"
+_NOT_FIT = "(not the best linear fit's nodal value)"
+_FRACTION = "fraction of each light in the information that determines a node"
 _AROUND = "slope of the quadratic through the nodes around; NaN also beside a node that is not measured"
 _TIME = "time of the frame from the trigger; the smallest 64-bit integer where it is not known"
 _MISFIT = "weighted rms residual around a node over its median: 1 is ordinary, 3 is suspicious"
@@ -125,9 +139,7 @@ _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
-    ResultQuantity(
-        "number", (), "", "", "number of the frame: a frame that is missing leaves a gap", dtype=np.int64, blank=-1
-    ),
+    ResultQuantity("number", (), "", "", _NUMBER, dtype=np.int64, blank=-1),
     ResultQuantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
     ResultQuantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
     ResultQuantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
@@ -135,21 +147,10 @@ _TABLE = (
     ResultQuantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
     ResultQuantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
     ResultQuantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
-    ResultQuantity(
-        "inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT
-    ),
+    ResultQuantity("inputs", ("file", 2), "", "", _INPUTS, **_TEXT),
     ResultQuantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
-    ResultQuantity(
-        "u",
-        _NODE,
-        "px",
-        "displacement.0",
-        "displacement in x against the reference, at the node (not the best linear fit's nodal value)",
-        **_EXACT,
-    ),
-    ResultQuantity(
-        "v", _NODE, "px", "displacement.1", "displacement in y against the reference, at the node", **_EXACT
-    ),
+    ResultQuantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_EXACT),
+    ResultQuantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),
     ResultQuantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
     ResultQuantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
     ResultQuantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
@@ -162,14 +163,7 @@ _TABLE = (
     ResultQuantity("best_match", (), "", "", _BEST, blank=0),
     ResultQuantity("reference_updates", ("reference_update",), "", "", _UPDATES, dtype=np.int64, blank=0),
     ResultQuantity("misfit", _NODE, "", "misfit", _MISFIT),
-    ResultQuantity(
-        "light_fraction",
-        ("node", "light"),
-        "",
-        "light_fraction",
-        "fraction of each light in the information that determines a node",
-        blank=0,
-    ),
+    ResultQuantity("light_fraction", ("node", "light"), "", "light_fraction", _FRACTION, blank=0),
     ResultQuantity("residual", _LIGHT, "", "residual", _RESIDUAL),
     ResultQuantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
     ResultQuantity("brightness", ("light", 2), "", "", _BRIGHTNESS),

@@ -17,7 +17,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results.provenance import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.results.shards import FrameTable
-from rgbmidic.results.store import check_complete, listed, load_frames, read_mesh, read_names, read_reference
+from rgbmidic.results.store import check_complete, listed, load_frames, load_result, read_reference
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -102,19 +102,17 @@ class Result:
             The folder is not a result, is damaged, or is incomplete (unless `partial`).
         """
         path = Path(path)
-        provenance = read_provenance(path)
-        names, lights = read_names(path, provenance), tuple(provenance["lights"])
-        mesh = read_mesh(path, provenance)
-        sizes, ended = {"node": len(mesh["nodes"]), "light": len(lights)}, "finished" in provenance
-        table = load_frames(path, sizes, len(names), fingerprint(provenance))
+        made = cls(path=path, **load_result(path))
+        ended = "finished" in made.provenance
         if not partial:
-            check_complete(path, names, table, ended=ended)
+            check_complete(path, made.names, made.table, ended=ended)
         elif check:
-            table = table.without_damaged(ended=ended)
-            if (lost := np.flatnonzero(table.damaged).tolist()) or table.gaps:
-                files = "".join(f"; {file} is damaged between its records" for file in table.gaps)
-                logger.warning("%s is damaged: frames lost: %s%s", path, listed(lost, names) or "unknown", files)
-        return cls(path=path, table=table, **mesh, names=names, lights=lights, provenance=provenance)
+            made = replace(made, table=made.table.without_damaged(ended=ended))
+            lost, gaps = np.flatnonzero(made.table.damaged).tolist(), made.table.gaps
+            if lost or gaps:
+                files = "".join(f"; {file} is damaged between its records" for file in gaps)
+                logger.warning("%s is damaged: frames lost: %s%s", path, listed(lost, made.names) or "unknown", files)
+        return made
 
     def refresh(self) -> Self:
         """Open the result again, with the frames that were added since.

@@ -6,9 +6,9 @@ they look for the next one of the same run. A process that is killed leaves at m
 pass over it, and nobody appends to a file of another writer. A frame that is written twice counts as it is in the file
 with the higher number, there as it was written last; one that is discarded has `_NO_FRAME` in its header.
 
-A record begins with a head of unsigned 32-bit numbers: the CRC-32 of each quantity and, of each quantity that is not
-stackable, its shape and its size in bytes. The quantities of one shape in all frames follow raw, the smallest first;
-then the others: texts as JSON, pictures packed by zlib, other arrays raw. All numbers are little-endian.
+A record begins with a head of unsigned 32-bit numbers: the CRC-32 of each quantity, its size in bytes and, of each
+that is not stackable, its shape. The quantities of one shape in all frames follow raw, the smallest first; then the
+others: texts as JSON, pictures packed by zlib, other arrays raw. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import re
 import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
@@ -31,10 +31,10 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import ResultError
+from rgbmidic.errors import ResultError, disk_faults
 from rgbmidic.results.files import writing
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
-from rgbmidic.results.quantities import QUANTITIES, FrameRecord, ResultQuantity
+from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.typing import BoolArray
 
 __all__ = ["FrameTable", "RecordLayout", "ShardWriter", "discard", "shard_files"]
@@ -45,39 +45,29 @@ _BUFFER = 2**16
 """Bytes that the system is asked for at once: a call takes some us, as long as copying these. Small records come by the
 dozen, large ones pass by the buffer."""
 _AHEAD = 1024
-"""Bytes read where single quantities are asked for: the head (some 250 bytes) and the plain numbers lie in them."""
+"""Bytes read where single quantities are asked for: the head (some 300 bytes) and the plain numbers lie in them."""
 _FAST = 1
 """zlib's quickest level."""
 _RATIO = 1032
 """How many times its size packed content can have at most (zlib's technical details, "Maximum Compression Factor")."""
-_NAME = re.compile(r"([0-9]{6,})\.(frames|index)")
-"""Index files were written by earlier versions, and go with their result."""
+_NAME = re.compile(r"([0-9]{6,})\.frames")
 _HEADER = struct.Struct("<16sQQII")
 """Digest of the run, frame, bytes of the record, CRC-32 of the record's head, CRC-32 of these 36 bytes."""
 _CHECKED = _HEADER.size - 4
 _NO_FRAME = 2**63 - 1
 _NUMBER_SIZE = 4
 """Bytes of a number of the head."""
+_PLACE = np.dtype([(name, np.int64) for name in ("shard", "start", "length", "head")])
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
 
 
-class _Fixed(NamedTuple):
-    """Where a quantity lies that has one shape in all frames: first byte, size, checksum in the head, type, shape."""
+class _Place(NamedTuple):
+    """Where a quantity lies: its place in the order of all, its type, and its shape, or where the head has it."""
 
-    first: int
-    size: int
-    check: int
+    order: int
     dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-
-
-class _Open(NamedTuple):
-    """Places in the head of the numbers of another quantity: its checksum, its shape, its size in bytes."""
-
-    check: int
-    shape: range
-    size: int
+    shape: tuple[int, ...] | slice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,46 +78,33 @@ class RecordLayout:
     ----------
     sizes
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
+    places
+        Of every quantity, in the order in which they lie.
     head
         Bytes of the head.
-    fixed, open
-        The quantities in the order in which they lie: those of one shape in all frames, then the others.
-    length
-        Bytes of head and fixed quantities.
     """
 
     sizes: Mapping[str, int]
+    places: Mapping[str, _Place]
     head: int
-    fixed: Mapping[str, _Fixed]
-    open: Mapping[str, _Open]
-    length: int
 
     @classmethod
     def of(cls, sizes: Mapping[str, int]) -> RecordLayout:
         """Lay out records with these sizes of ``"node"`` and ``"light"``."""
-        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items() if entry.stackable}
-        fixed, count, open_ = sorted(blank, key=lambda name: blank[name].nbytes), len(QUANTITIES), {}
-        for check, name in enumerate((name for name in QUANTITIES if name not in blank), start=len(fixed)):
-            axes = len(QUANTITIES[name].axes)
-            open_[name] = _Open(check, range(count, count + axes), count + axes)
-            count += axes + 1
-        head = count * _NUMBER_SIZE
-        sums = accumulate((blank[name].nbytes for name in fixed), initial=head)
-        places = {
-            name: _Fixed(first, blank[name].nbytes, check, _stored(QUANTITIES[name]), blank[name].shape)
-            for check, (name, first) in enumerate(zip(fixed, sums, strict=False))
-        }
-        length = head + sum(one.size for one in places.values())
-        return cls(sizes=dict(sizes), head=head, fixed=places, open=open_, length=length)
+        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
+        fixed = sorted((name for name in blank if QUANTITIES[name].stackable), key=lambda name: blank[name].nbytes)
+        places, end = dict[str, _Place](), 2 * len(blank)
+        for order, name in enumerate(dict.fromkeys([*fixed, *blank])):
+            begin, end = end, end + (0 if name in fixed else blank[name].ndim)
+            dtype = np.dtype(QUANTITIES[name].dtype).newbyteorder("<")
+            places[name] = _Place(order, dtype, blank[name].shape if name in fixed else slice(begin, end))
+        return cls(sizes=dict(sizes), places=places, head=end * _NUMBER_SIZE)
 
     def encode(self, values: Mapping[str, Any]) -> tuple[bytes, int]:
         """Return the bytes of a record with these quantities, and the CRC-32 of its head."""
-        parts = [np.asarray(values[name], dtype=one.dtype).tobytes() for name, one in self.fixed.items()]
-        packed = {name: _packed(QUANTITIES[name], values[name]) for name in self.open}
-        parts += packed.values()
-        numbers = [zlib.crc32(part) for part in parts]
-        for name, part in packed.items():
-            numbers += [*np.shape(values[name]), len(part)]
+        parts = [_packed(place, values[name]) for name, place in self.places.items()]
+        shapes = (np.shape(values[name]) for name, place in self.places.items() if isinstance(place.shape, slice))
+        numbers = [*map(zlib.crc32, parts), *map(len, parts), *itertools.chain(*shapes)]
         head = struct.pack(f"<{len(numbers)}I", *numbers)
         return b"".join([head, *parts]), zlib.crc32(head)
 
@@ -159,51 +136,42 @@ class RecordLayout:
         """
         file.seek(start)
         block = file.read(length if names is None or length < _AHEAD else _AHEAD)
-        if length < self.length or zlib.crc32(block[: self.head]) != check:
+        if length < self.head or zlib.crc32(block[: self.head]) != check:
             raise ResultError("its head is damaged, or of another mesh or other lights")
-        numbers = struct.unpack_from(f"<{self.head // _NUMBER_SIZE}I", block)
-        ends = accumulate((numbers[entry.size] for entry in self.open.values()), initial=self.length)
-        firsts = dict(zip(self.open, ends, strict=False))
+        numbers, count = struct.unpack_from(f"<{self.head // _NUMBER_SIZE}I", block), len(self.places)
+        ends = list(accumulate(numbers[count : 2 * count], initial=self.head))
         values = {}
-        for name in (*self.fixed, *self.open) if names is None else names:
-            quantity, fixed = QUANTITIES[name], self.fixed.get(name)
-            first, size = (fixed.first, fixed.size) if fixed else (firsts[name], numbers[self.open[name].size])
-            part = block[first : first + size]
-            if first + size > len(block):
+        for name in self.places if names is None else names:
+            quantity, place = QUANTITIES[name], self.places[name]
+            first, end = ends[place.order : place.order + 2]
+            part = block[first:end]
+            if end > len(block):
                 file.seek(start + first)
-                part = file.read(min(size, length))
-            if zlib.crc32(part) != numbers[(fixed or self.open[name]).check]:
+                part = file.read(min(end - first, length))
+            if zlib.crc32(part) != numbers[place.order]:
                 raise ResultError(f"the checksum of {name} is wrong")
-            if fixed is None:
-                shape = [numbers[place] for place in self.open[name].shape]
-                values[name] = quantity.convert(_unpacked(quantity, part, shape), self.sizes)
+            if isinstance(place.shape, slice):
+                values[name] = quantity.convert(_unpacked(place, part, numbers[place.shape]), self.sizes)
             else:
-                array = np.frombuffer(part, dtype=fixed.dtype)
-                values[name] = array.reshape(fixed.shape).astype(quantity.dtype) if fixed.shape else array.item()
+                array = np.frombuffer(part, dtype=place.dtype)
+                values[name] = array.reshape(place.shape).astype(quantity.dtype) if place.shape else array.item()
         return values
 
 
-def _stored(entry: ResultQuantity) -> np.dtype[Any]:
-    return np.dtype(entry.dtype).newbyteorder("<")
-
-
-def _packed(entry: ResultQuantity, value: Any) -> bytes:
-    if entry.dtype is np.str_:
+def _packed(place: _Place, value: Any) -> bytes:
+    if place.dtype.kind == "U":
         return json.dumps(np.asarray(value).tolist()).encode("ascii")
-    raw = np.asarray(value, dtype=_stored(entry)).tobytes()
-    return zlib.compress(raw, _FAST) if entry.dtype is np.uint8 else raw
+    raw = np.asarray(value, dtype=place.dtype).tobytes()
+    return zlib.compress(raw, _FAST) if place.dtype == np.uint8 and isinstance(place.shape, slice) else raw
 
 
-def _unpacked(entry: ResultQuantity, part: bytes, shape: Sequence[int]) -> Any:
+def _unpacked(place: _Place, part: bytes, shape: Sequence[int]) -> Any:
     """Undo `_packed`; a head that promises more than there is is an error before memory is taken for it."""
-    if entry.dtype is np.str_:
+    if place.dtype.kind == "U":
         return np.array(json.loads(part), dtype=np.str_).reshape(shape)
-    promised = math.prod(shape) * _stored(entry).itemsize
-    if entry.dtype is np.uint8:
-        part = zlib.decompressobj().decompress(part, min(promised, _RATIO * len(part)) + 1)
-    if len(part) != promised:
-        raise ResultError(f"the head promises {promised} bytes of {entry.name}, there are {len(part)}")
-    return np.frombuffer(part, dtype=_stored(entry)).reshape(shape).astype(entry.dtype)
+    if place.dtype == np.uint8:
+        part = zlib.decompressobj().decompress(part, min(math.prod(shape), _RATIO * len(part)) + 1)
+    return np.frombuffer(part, dtype=place.dtype).reshape(shape).copy()
 
 
 def shard_files(folder: Path) -> list[Path]:
@@ -252,7 +220,11 @@ class ShardWriter:
         if self._count == _SHARD_FRAMES:
             self.close()
         if self._file is None:
-            self._file = _new_file(self.folder)
+            number = max(map(_number, shard_files(self.folder)), default=-1)
+            while self._file is None:  # of a number that nobody has
+                number += 1
+                with writing(self.folder), suppress(FileExistsError):
+                    self._file = (self.folder / f"{number:06d}.frames").open("xb", buffering=0)
         try:
             with writing(self._file.name):
                 self._file.seek(self._end)
@@ -280,15 +252,6 @@ class ShardWriter:
                 os.fsync(file.fileno())
 
 
-def _new_file(folder: Path) -> BinaryIO:
-    """Open a file of a number that nobody has."""
-    used = [_number(file) for file in shard_files(folder)]
-    for number in itertools.count(max(used, default=-1) + 1):
-        with writing(folder), suppress(FileExistsError):
-            return (folder / f"{number:06d}.frames").open("xb", buffering=0)
-    raise AssertionError("numbers do not end")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameTable:
     """Which frames a result holds at the time it is loaded, and where; reads them.
@@ -299,10 +262,9 @@ class FrameTable:
         Of the records.
     files
         Files of records.
-    shard : ndarray, shape (T,), int64
-        Which of the files each frame is in; -1 where it is not measured yet.
-    start, length, head : ndarray, shape (T,), int64
-        First byte of each record, its bytes, checksum of its head.
+    places : ndarray, shape (T,), of the fields ``shard``, ``start``, ``length``, ``head``
+        Which of the files each frame is in, -1 where it is not measured yet; first byte of its record, its bytes, and
+        the checksum of its head.
     damaged : ndarray, shape (T,), bool
         Frames that are known to be lost to damage; they are not `finished`.
     gaps
@@ -311,10 +273,7 @@ class FrameTable:
 
     layout: RecordLayout
     files: Sequence[Path]
-    shard: npt.NDArray[np.int64]
-    start: npt.NDArray[np.int64]
-    length: npt.NDArray[np.int64]
-    head: npt.NDArray[np.int64]
+    places: npt.NDArray[np.void]
     damaged: BoolArray
     gaps: tuple[Path, ...]
 
@@ -338,24 +297,21 @@ class FrameTable:
         ResultError
             A file cannot be read, or holds frames of another run.
         """
-        shard, start, length, head = np.full(count, -1), *np.zeros((3, count), dtype=np.int64)
-        files = [file for file in shard_files(folder) if file.suffix == ".frames"]
-        gaps = []
+        places, files, gaps = np.zeros(count, dtype=_PLACE), shard_files(folder), []
+        places["shard"] = -1
         for number, file in enumerate(files):
             records, damaged = _records(file, run)
             gaps += [file] if damaged else []
-            table = np.array(records, dtype=np.int64).reshape(-1, 4)
-            frames, *columns = table[table[:, 0] != _NO_FRAME].T
-            shard[frames] = number
-            start[frames], length[frames], head[frames] = columns
+            for frame, *place in records:
+                if frame != _NO_FRAME:
+                    places[frame] = (number, *place)
         lost = np.zeros(count, dtype=bool)
-        places = {"shard": shard, "start": start, "length": length, "head": head}
-        return cls(layout=layout, files=files, damaged=lost, gaps=tuple(gaps), **places)
+        return cls(layout=layout, files=files, places=places, damaged=lost, gaps=tuple(gaps))
 
     @property
     def finished(self) -> BoolArray:
         """Which frames there are, shape (T,)."""
-        return np.asarray(self.shard >= 0)
+        return np.asarray(self.places["shard"] >= 0)
 
     def without_damaged(self, *, ended: bool) -> FrameTable:
         """Read every record once and return the table without the damaged ones.
@@ -371,7 +327,9 @@ class FrameTable:
                 next(self.each(None, [frame]))
             except ResultError:
                 damaged[frame] = True
-        return replace(self, shard=np.where(damaged, -1, self.shard), damaged=damaged)
+        places = self.places.copy()
+        places["shard"][damaged] = -1
+        return replace(self, places=places, damaged=damaged)
 
     def read(self, frame: int) -> FrameRecord:
         """Read all of one frame; a frame that is not measured yet gives a blank record with that as its reason.
@@ -404,32 +362,28 @@ class FrameTable:
             A record is damaged; the message names file and frame.
         """
         chosen = np.fromiter(frames, dtype=np.int64)
-        columns = (column[chosen].tolist() for column in (self.shard, self.start, self.length, self.head))
-        opened, file = -1, None
-        blanks: dict[bool, dict[str, Any]] = {}
-        try:
-            for frame, shard, start, length, head in zip(chosen.tolist(), *columns, strict=True):
-                if shard < 0:
-                    lost = bool(self.damaged[frame])
-                    if lost not in blanks:
-                        reason, sizes = _DAMAGED if lost else _NOT_YET, self.layout.sizes
+        opened, blanks = -1, dict[str, dict[str, Any]]()
+        with ExitStack() as stack:
+            try:
+                for frame, (shard, start, length, head) in zip(
+                    chosen.tolist(), self.places[chosen].tolist(), strict=True
+                ):
+                    if shard >= 0:
+                        if shard != opened:
+                            stack.close()
+                            file = stack.enter_context(self.files[shard].open("rb", buffering=_BUFFER))
+                            opened = shard
+                        yield self.layout.decode(file, start, length, head, names)
+                        continue
+                    reason, sizes = _DAMAGED if self.damaged[frame] else _NOT_YET, self.layout.sizes
+                    if reason not in blanks:
                         blank = FrameRecord.failed(reason, nodes=sizes["node"], lights=sizes["light"]).values
-                        blanks[lost] = {name: blank[name] for name in (blank if names is None else names)}
-                    yield dict(blanks[lost])
-                    continue
-                if shard != opened:
-                    if file is not None:
-                        file.close()
-                    opened, file = shard, self.files[shard].open("rb", buffering=_BUFFER)
-                assert file is not None
-                yield self.layout.decode(file, start, length, head, names)
-        except OSError as error:
-            raise ResultError(f"{self.files[shard]} cannot be read: {error.strerror or error}") from None
-        except (ResultError, ValueError, TypeError, RecursionError, zlib.error) as error:
-            raise ResultError(f"{self.files[shard]} is damaged in frame {frame}: {error}; {_REMEDY}") from None
-        finally:
-            if file is not None:
-                file.close()
+                        blanks[reason] = {name: blank[name] for name in (blank if names is None else names)}
+                    yield dict(blanks[reason])
+            except OSError as error:
+                raise ResultError(f"{self.files[shard]} cannot be read: {error.strerror or error}") from None
+            except (ResultError, ValueError, TypeError, RecursionError, zlib.error) as error:
+                raise ResultError(f"{self.files[shard]} is damaged in frame {frame}: {error}; {_REMEDY}") from None
 
 
 def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], bool]:
@@ -441,41 +395,36 @@ def _records(file: Path, run: bytes) -> tuple[list[tuple[int, int, int, int]], b
         It cannot be read, or holds a record of another run.
     """
     records, damaged, place, search = [], False, 0, 0
-    try:
-        with file.open("rb", buffering=0) as opened:
-            size = os.fstat(opened.fileno()).st_size
-            while place < size:
-                opened.seek(place)
-                header = opened.read(_HEADER.size)
-                found = _parsed(header, file, run)
-                search = search if found is None else place + 1
-                if found is not None and place + len(header) + found[1] <= size:
-                    frame, length, head = found
-                    records.append((frame, place + len(header), length, head))
-                    place += len(header) + length
-                    continue
-                with mmap.mmap(opened.fileno(), size, access=mmap.ACCESS_READ) as content:
-                    place = content.find(run, search, max(size - _HEADER.size + len(run), 0))
-                # a record that is not whole at the end is what a killed process leaves
-                damaged |= place >= 0 or (found is None and len(header) == _HEADER.size)
-                if place < 0:
-                    break
-                search = place + 1
-    except OSError as error:
-        raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
+    with disk_faults(ResultError, f"{file} cannot be read"), file.open("rb", buffering=0) as opened:
+        size = os.fstat(opened.fileno()).st_size
+        while place < size:
+            opened.seek(place)
+            header = opened.read(_HEADER.size)
+            found = _parsed(header, file, run)
+            search = search if found is None else place + 1
+            if found is not None and place + len(header) + found[1] <= size:
+                frame, length, head = found
+                records.append((frame, place + len(header), length, head))
+                place += len(header) + length
+                continue
+            with mmap.mmap(opened.fileno(), size, access=mmap.ACCESS_READ) as content:
+                place = content.find(run, search, max(size - _HEADER.size + len(run), 0))
+            # a record that is not whole at the end is what a killed process leaves
+            damaged |= place >= 0 or (found is None and len(header) == _HEADER.size)
+            if place < 0:
+                break
+            search = place + 1
     return records, damaged
 
 
 def _parsed(header: bytes, file: Path, run: bytes) -> tuple[int, int, int] | None:
     """Frame, length and checksum of the head that a header states; None where it is damaged."""
-    if len(header) < _HEADER.size:
+    if len(header) < _HEADER.size or zlib.crc32(header[:_CHECKED]) != int.from_bytes(header[_CHECKED:], "little"):
         return None
-    owner, frame, length, head, check = _HEADER.unpack(header)
-    if zlib.crc32(header[:_CHECKED]) != check:
-        return None
+    owner, *stated, _ = _HEADER.unpack(header)
     if owner != run:
         raise ResultError(f"{file} is of another run than {file.parent.parent / PROVENANCE}: {PUT_BACK}")
-    return frame, length, head
+    return tuple(stated)
 
 
 def _header(run: bytes, frame: int, length: int, head: int) -> bytes:
@@ -491,7 +440,7 @@ def discard(folder: Path, run: bytes, frames: Collection[int]) -> None:
     ResultError
         The disk refuses.
     """
-    for file in (file for file in shard_files(folder) if file.suffix == ".frames"):
+    for file in shard_files(folder):
         old = [record for record in _records(file, run)[0] if record[0] in frames]
         with writing(file), file.open("r+b") as opened:
             for _, start, length, head in old:

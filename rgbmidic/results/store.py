@@ -24,7 +24,6 @@ from rgbmidic.results.files import (
     read_json,
     write_arrays,
     write_json,
-    write_new_json,
     writing,
 )
 from rgbmidic.results.provenance import (
@@ -41,7 +40,7 @@ from rgbmidic.results.provenance import (
 )
 from rgbmidic.results.quantities import SHARED, FrameRecord
 from rgbmidic.results.shards import FrameTable, RecordLayout, ShardWriter, discard, shard_files
-from rgbmidic.typing import AnyArray, BoolArray, FloatImage
+from rgbmidic.typing import AnyArray, BoolArray
 
 __all__ = [
     "ResultStore",
@@ -49,6 +48,7 @@ __all__ = [
     "finish_result",
     "listed",
     "load_frames",
+    "load_result",
     "read_mesh",
     "read_names",
     "read_reference",
@@ -232,12 +232,9 @@ def finish_result(path: Path | str) -> None:
         The folder is no result, a frame is missing or damaged, or it cannot be written.
     """
     path = Path(path)
-    provenance = read_provenance(path)
-    names = read_names(path, provenance)
-    sizes = {"node": len(read_mesh(path, provenance)["nodes"]), "light": len(provenance["lights"])}
-    ended = "finished" in provenance
-    table = load_frames(path, sizes, len(names), fingerprint(provenance)).without_damaged(ended=ended)
-    check_complete(path, names, table, ended=ended)
+    kept = load_result(path)
+    provenance, ended = kept["provenance"], "finished" in kept["provenance"]
+    check_complete(path, kept["names"], kept["table"].without_damaged(ended=ended), ended=ended)
     if not ended:
         write_json(path / PROVENANCE, sealed({**provenance, "finished": now()}))
 
@@ -263,6 +260,15 @@ def listed(frames: Sequence[int], names: Sequence[str]) -> str:
     """List the first of some frames with their names, and how many more there are."""
     more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
     return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:_LISTED]) + more
+
+
+def load_result(path: Path) -> dict[str, Any]:
+    """Read what a `Result` is made of, as far as the folder has come; a `ResultError` where something is damaged."""
+    provenance = read_provenance(path)
+    names, mesh, lights = read_names(path, provenance), read_mesh(path, provenance), tuple(provenance["lights"])
+    sizes = {"node": len(mesh["nodes"]), "light": len(lights)}
+    table = load_frames(path, sizes, len(names), fingerprint(provenance))
+    return {"table": table, "names": names, "lights": lights, "provenance": provenance, **mesh}
 
 
 def load_frames(path: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
@@ -315,15 +321,6 @@ def _read(path: Path, names: Iterable[str], sizes: Mapping[str, int]) -> dict[st
         raise ResultError(f"{path} is damaged: {error}") from None
 
 
-def _pictures(images: FloatImage) -> npt.NDArray[np.uint8]:
-    """Stretch each image to 8 bit between its percentiles 1 and 99; 0 where unknown."""
-    known = np.isfinite(images).any(axis=(1, 2), keepdims=True)
-    low, high = np.nanpercentile(np.where(known, images, 0), [1, 99], axis=(1, 2), keepdims=True)
-    scaled = 255 * (images - low) / np.maximum(high - low, 1e-6)
-    pictures: npt.NDArray[np.uint8] = np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8)
-    return pictures
-
-
 def _make_room(path: Path, *, overwrite: bool) -> None:
     """Empty the folder of an old result, its provenance last; nothing else in it is touched."""
     if not is_result(path):
@@ -349,7 +346,7 @@ def _start(path: Path, origin: Origin) -> bytes:
     if not (path / PROVENANCE).exists():  # looked at after the others: it is the first to appear
         if foreign:
             raise ResultError(f"{path} holds a {foreign[0].name} that is not of a result; give another folder")
-        write_new_json(path / PROVENANCE, sealed(stated))
+        write_json(path / PROVENANCE, sealed(stated), new=True)
     kept = read_provenance(path)
     check_same(path, kept, stated)
     with writing(path):
@@ -360,7 +357,11 @@ def _start(path: Path, origin: Origin) -> bytes:
     if not _readable(lambda: read_mesh(path, kept)):
         write_arrays(path / _MESH, origin.mesh)
     if origin.reference is not None and not _readable(lambda: read_reference(path, sizes, run)):
-        pictures = _pictures(np.asarray(origin.reference, dtype=np.float32))
+        images = np.asarray(origin.reference, dtype=np.float32)  # stretched to 8 bit between percentiles 1 and 99
+        known = np.isfinite(images).any(axis=(1, 2), keepdims=True)
+        low, high = np.nanpercentile(np.where(known, images, 0), [1, 99], axis=(1, 2), keepdims=True)
+        scaled = 255 * (images - low) / np.maximum(high - low, 1e-6)
+        pictures = np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8)
         write_arrays(path / _REFERENCE, {"reference": pictures, "run": np.frombuffer(run, dtype=np.uint8)})
     return run
 

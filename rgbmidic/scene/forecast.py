@@ -43,17 +43,7 @@ from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "Energies",
-    "Forecast",
-    "Instrument",
-    "channel_mixing",
-    "expected_std",
-    "light_pull",
-    "node_constant",
-    "pixel_size",
-    "trace_change",
-]
+__all__ = ["Forecast", "Instrument", "expected_std", "light_pull", "node_constant", "pixel_size", "trace_change"]
 
 
 WRINKLE_AREA = 0.085
@@ -140,17 +130,14 @@ class Forecast:
         change when a reflection moves.
     weight_fraction : ndarray, shape (k, ...)
         Fraction of the information about the displacement that each light gives.
-    residual : ndarray, shape (k, ...)
-        Standard deviation of the residual of each light, in units of its local mean.
     """
 
     std: FloatArray
     bias: FloatArray
     weight_fraction: FloatArray
-    residual: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Energies:
     """Variance, of a pixel or of the right-hand side, that image errors of unit strength add.
 
@@ -236,19 +223,13 @@ class Instrument:
         if camera.kind == "bayer":
             noise, mosaic = separation_spectra(scene, patch.texture, demosaic)
         else:
-            unmixing = np.linalg.pinv(channel_mixing(scene))
+            unmixing = np.linalg.pinv(_channel_mixing(scene))
             noise = np.einsum("jc,kc->cjk", unmixing, unmixing)[..., None, None]
             mosaic = np.zeros((3, *noise.shape[1:]))
 
         def energies(measure: Callable[[FloatArray], FloatArray], contrast: float) -> Energies:
             erratic, dome = measure(spectrum.optics), measure(spectrum.slope * relief[1, 1])
-            return Energies(
-                noise=measure(noise),
-                mosaic=measure(mosaic),
-                erratic=float(erratic),
-                dome=float(dome),
-                contrast=contrast,
-            )
+            return Energies(measure(noise), measure(mosaic), float(erratic), float(dome), contrast)
 
         return cls(
             scene=scene,
@@ -276,7 +257,7 @@ class Instrument:
         """
         residual = self.variance(self.residual, before, after, change)
         seen = np.isfinite(residual) & ~self.saturated(before) & ~self.saturated(after)
-        contrast = np.where(seen, 1 - (before.share + after.share) / 2, 0.0)
+        contrast = np.where(seen, 1 - (before.fraction + after.fraction) / 2, 0.0)
         pull = light_pull(contrast, residual)
         information = self.energy * pull * contrast
         total = information.sum(axis=0)
@@ -291,7 +272,6 @@ class Instrument:
             std=np.where(sees, std, np.nan),
             bias=np.where(sees, bias, np.nan),
             weight_fraction=np.where(sees, fraction, 0.0),
-            residual=np.where(seen, np.sqrt(np.where(seen, residual, 0.0)), np.nan),
         )
 
     def weights(self, before: Zones, after: Zones, *, known: bool = True) -> FloatImage:
@@ -311,7 +291,7 @@ class Instrument:
         -------
         ndarray, shape (k, ...), float32
         """
-        change = np.full((3, *before.share.shape[1:]), 2.0)
+        change = np.full((3, *before.fraction.shape[1:]), 2.0)
         variance = self.variance(self.score, before, after, change, common=float(known))
         seen = np.isfinite(variance) & ~self.saturated(before) & ~self.saturated(after)
         inverse = np.where(seen, 1 / np.where(seen, variance, 1.0), 0.0)
@@ -362,7 +342,7 @@ class Instrument:
         """
         variance = self._reflections(self.score, before, after)
         variance += 2 * float(self.score.mosaic[:, light, light].sum())
-        mixing = channel_mixing(self.scene)
+        mixing = _channel_mixing(self.scene)
         others = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
         for zones in (before, after):
             for colour, factor in enumerate(self.score.noise[:, light, light]):
@@ -384,7 +364,7 @@ class Instrument:
         """Variance (k, ...) that comes from a change of the reflections; between the lights it is independent."""
         first, second = self._dome_factor(before), self._dome_factor(after)
         domes = (first**2 + second**2 - 2 * common * first * second).sum(axis=1)
-        contrast = before.share**2 + after.share**2 - 2 * common * before.share * after.share
+        contrast = before.fraction**2 + after.fraction**2 - 2 * common * before.fraction * after.fraction
         erratic = self._erratic(before, after, common)
         return np.asarray(energies.erratic * erratic + energies.dome * domes + energies.contrast * contrast)
 
@@ -397,7 +377,7 @@ class Instrument:
         """
         a2, b2 = self._roughness
         parts = [
-            _facet_covariance(one.geometry.slopes, other.geometry.slopes, a2, b2) * one.share * other.share
+            _facet_covariance(one.geometry.slopes, other.geometry.slopes, a2, b2) * one.fraction * other.fraction
             for one, other in ((before, before), (after, after), (before, after))
         ]
         area = WRINKLE_AREA * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
@@ -409,7 +389,7 @@ class Instrument:
         A slope s changes the reflection at the half-way slope h by the factor exp(h.s/(a^2 + b^2)); its linear part is
         taken.
         """
-        return np.asarray(zones.share[:, None] * zones.geometry.slopes / sum(self._roughness))
+        return np.asarray(zones.fraction[:, None] * zones.geometry.slopes / sum(self._roughness))
 
     @property
     def _roughness(self) -> tuple[float, float]:
@@ -420,9 +400,9 @@ class Instrument:
 
     def saturated(self, zones: Zones) -> BoolArray:
         """Where white paint is expected to saturate a channel that the light needs, (k, ...)."""
-        channels = _channels(channel_mixing(self.scene), self.white_level(zones))
+        channels = _channels(_channel_mixing(self.scene), self.white_level(zones))
         full = channels > _SATURATED * self.scene.camera.full_scale
-        unmixing = np.abs(np.linalg.pinv(channel_mixing(self.scene)))
+        unmixing = np.abs(np.linalg.pinv(_channel_mixing(self.scene)))
         needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
         return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)
 
@@ -433,7 +413,7 @@ class Instrument:
 
     def _sample_variance(self, zones: Zones) -> FloatArray:
         """Noise variance (C, ...) of one sample of each colour at the mean grey level, DN squared."""
-        levels = _channels(channel_mixing(self.scene), zones.level)
+        levels = _channels(_channel_mixing(self.scene), zones.level)
         return np.asarray(self.scene.camera.noise.variance(levels) + QUANTISATION)
 
 
@@ -451,7 +431,7 @@ def pixel_size(scene: Scene) -> float:
     return scene.body.front[2] / scene.camera.focal_px
 
 
-def channel_mixing(scene: Scene) -> FloatArray:
+def _channel_mixing(scene: Scene) -> FloatArray:
     """Camera samples from lights, (C, k); before a monochrome camera every light has a frame of its own."""
     if scene.camera.kind == "monochrome":
         return np.eye(len(scene.lights))

@@ -20,14 +20,7 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = [
-    "LIMIT_DEG",
-    "Reflectance",
-    "Reflection",
-    "angle_weights",
-    "reflection",
-    "surface_from_heights",
-]
+__all__ = ["LIMIT_DEG", "Reflectance", "Reflection", "angle_weights", "reflection", "surface_from_heights"]
 
 
 LIMIT_DEG = 15.0
@@ -108,7 +101,7 @@ class Reflection:
         lobe = np.exp(-square / (2 * math.radians(reflectance.width_deg) ** 2))
         return np.asarray(reflectance.specular * lobe / self.half)
 
-    def share(self, reflectance: Reflectance) -> FloatArray:
+    def fraction(self, reflectance: Reflectance) -> FloatArray:
         """Return the expected specular fraction q/(d + q) of the light that reaches the camera, (k, ...), 0 to 1."""
         q = self.specular(reflectance)
         return np.asarray(q / (self.diffuse(reflectance) + q))

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
 from rgbmidic.scene.camera import PIXEL, Camera, Light, Vector, reference_camera, rotation, three_lights
-from rgbmidic.scene.surface import AffineField, Finish, InPlaneField, MeshField, Surface
-from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_toml, regular
+from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
+from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
 from rgbmidic.typing import FloatArray
 
 __all__ = [
@@ -289,33 +289,23 @@ def read_scene(path: Path | str) -> Experiment:
 def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
     sections = ("body", "surface", "lights", "camera", "states", "output")
     check_names(document, sections, "section", "the file")
-    table = _table(document, "body")
+    table = read_table(document, "body")
     kind = convert_value(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
-    body: Body = _build(BODIES[kind], table, "body", base)
-    table, paints = _table(document, "surface"), {}
-    for name, albedo in (("white", 0.80), ("black", 0.10)):
-        paint = {"albedo": albedo, **_table(table, name)}
-        table.pop(name, None)
-        paints[name] = _build(Finish, paint, f"surface.{name}", base)
+    body: Body = read_section(BODIES[kind], "body", table, base)
+    table, albedos = read_table(document, "surface"), {"white": 0.80, "black": 0.10}
+    paints = {name: {"albedo": albedo, **read_table(table, name)} for name, albedo in albedos.items()}
     lights = _tables(document, "lights")
     scene = Scene(
         body=body,
-        surface=_build(Surface, table, "surface", base, **paints),
+        surface=read_section(Surface, "surface", {**table, **paints}, base),
         lights=tuple(_light(table, body, base) for table in lights) if lights else three_lights(body.front),
-        camera=_camera(_table(document, "camera"), body, base),
+        camera=_camera(read_table(document, "camera"), body, base),
     )
     return Experiment(
         scene=scene,
         states=tuple(_state(table, body, base) for table in _tables(document, "states")),
-        output=_build(DatasetSettings, _table(document, "output"), "output", base),
+        output=read_section(DatasetSettings, "output", read_table(document, "output"), base),
     )
-
-
-def _table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
-    table = document.get(name, {})
-    if not isinstance(table, Mapping):
-        raise ConfigurationError(f"[{name}] must be a section with keys, not {table!r}")
-    return dict(table)
 
 
 def _tables(document: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
@@ -325,23 +315,11 @@ def _tables(document: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
     return [dict(table) for table in tables]
 
 
-def _build(kind: Any, table: Mapping[str, Any], where: str, base: Path, **ready: Any) -> Any:
-    """Return an object of a settings class from a table of plain values; `ready` holds fields that are objects."""
-    hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in ready}
-    check_names(table, hints, "key", f"[{where}]")
-    given = {key: convert_value(value, hints[key], f"{where}.{key}", base) for key, value in table.items()}
-    for entry in fields(kind):
-        required = entry.default is MISSING and entry.default_factory is MISSING
-        if required and entry.name not in given and entry.name not in ready:
-            raise ConfigurationError(f"{where}.{entry.name} is missing")
-    return kind(**given, **ready)
-
-
 def _light(table: dict[str, Any], body: Body, base: Path) -> Light:
     name = table.get("name", "?")
     led = {key: table.pop(f"led_{key}") for key in ("centre", "width") if f"led_{key}" in table}
-    spectrum = _build(Led, led, f"lights.{name}.led", base) if led else None
-    light: Light = _build(Light, table, f"lights.{name}", base, spectrum=spectrum)
+    spectrum = read_section(Led, f"lights.{name}.led", led, base) if led else None
+    light = read_section(Light, f"lights.{name}", table, base, spectrum=spectrum)
     return light if "power" in table else light.aimed(body.front)
 
 
@@ -363,7 +341,7 @@ def _camera(table: dict[str, Any], body: Body, base: Path) -> Camera:
         raise ConfigurationError(f"camera.mm_per_pixel must be positive, not {pixel}")
     table.setdefault("shape", list(_SIZE))
     table.setdefault("focal_px", body.front[2] / pixel)
-    camera: Camera = _build(Camera, table, "camera", base, **ready)
+    camera = read_section(Camera, "camera", table, base, **ready)
     if ready["crosstalk"] is None and ready["sensitivities"] is None and camera.kind != "monochrome":
         return replace(camera, crosstalk=reference_camera(camera.shape).crosstalk)
     return camera
@@ -371,8 +349,7 @@ def _camera(table: dict[str, Any], body: Body, base: Path) -> Camera:
 
 def _state(table: dict[str, Any], body: Body, base: Path) -> State:
     given = {key: table.pop(key) for key in _FIELD_KEYS if key in table}
-    state: State = _build(State, table, "states", base, displacement=_field(given, body, base))
-    return state
+    return read_section(State, "states", table, base, displacement=_field(given, body, base))
 
 
 def _field(given: Mapping[str, Any], body: Body, base: Path) -> InPlaneField | None:

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.render import PLATE
 from rgbmidic.correlation.images import PREFILTERS
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import sampled_channels, shift_cfa
@@ -67,20 +66,16 @@ class SpecklePatch:
         """Return a piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
         camera, surface = scene.camera, scene.surface
         pixel = scene.body.front[2] / camera.focal_px
-        smooth = replace(
-            surface, white=replace(surface.white, slope_deg=0.0), black=replace(surface.black, slope_deg=0.0)
-        )
+        white, black = (replace(paint, slope_deg=0.0) for paint in (surface.white, surface.black))
         place = (np.arange(size * _SUBSAMPLES) + 0.5) / _SUBSAMPLES * pixel
-        x, y = np.meshgrid(place, place)
-        points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-        cover, height, _ = smooth.sample(points, np.array([PLATE, 0.0, np.inf, np.inf]))
+        cover, height = replace(surface, white=white, black=black).on_plate(place, place)
         albedo = surface.white.albedo + cover * (surface.black.albedo - surface.white.albedo)
         texture = _seen(albedo, size, camera.lens_blur)
         return cls(texture=texture / texture.mean(), domes=_seen(height / pixel, size, camera.lens_blur))
 
 
 def _seen(fine: FloatArray, size: int, blur: float) -> FloatArray:
-    """Fine samples (flat) averaged over the pixels and blurred by the lens."""
+    """Fine samples averaged over the pixels and blurred by the lens."""
     whole = fine.reshape(size, _SUBSAMPLES, size, _SUBSAMPLES).mean(axis=(1, 3))
     line = np.exp(-2 * (np.pi * blur * np.fft.fftfreq(size)) ** 2)
     return np.asarray(np.fft.ifft2(np.fft.fft2(whole) * np.outer(line, line)).real)

@@ -158,6 +158,13 @@ class Surface:
         sample_paint(out, np.ascontiguousarray(points, dtype=float), body, *self.parameters())
         return out[:, 0], out[:, 1], out[:, 2:]
 
+    def on_plate(self, columns: npt.ArrayLike, rows: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Cover by black paint (0 to 1) and height (mm), both (h, w), on a plate at x of columns and y of rows (mm)."""
+        x, y = np.meshgrid(columns, rows)
+        points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+        cover, height, _ = self.sample(points, np.array([PLATE, 0.0, np.inf, np.inf]))
+        return cover.reshape(x.shape), height.reshape(x.shape)
+
 
 def height_map(
     surface: Surface, *, size: float, pitch: float, corner: tuple[float, float] = (0.0, 0.0)
@@ -183,10 +190,8 @@ def height_map(
     if not (pitch > 0 and size >= 2 * pitch):
         raise InputError(f"a height map has at least 3 points a side; given are size {size} mm, pitch {pitch} mm")
     steps = np.arange(round(size / pitch) + 1) * pitch
-    x, y = np.meshgrid(corner[0] + steps, corner[1] + steps)
-    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    cover, height, _ = surface.sample(points, np.array([PLATE, 0.0, np.inf, np.inf]))
-    return height.reshape(x.shape), cover.reshape(x.shape)
+    cover, height = surface.on_plate(corner[0] + steps, corner[1] + steps)
+    return height, cover
 
 
 def _poisson_table(mean: float) -> FloatArray:

@@ -227,9 +227,9 @@ class Zones:
     reflectance: Reflectance
 
     @property
-    def share(self) -> FloatArray:
+    def fraction(self) -> FloatArray:
         """Specular fraction (k, ...) of the light that reaches the camera."""
-        return self.geometry.share(self.reflectance)
+        return self.geometry.fraction(self.reflectance)
 
     @property
     def level(self) -> FloatArray:

@@ -40,8 +40,8 @@ def probe_marks(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
     """Return the marks of each complete probe by its name, such as ``point_1``: those of a kind in the order set."""
     found: dict[str, list[Mark]] = {}
     for kind, count in KINDS.items():
-        own = [mark for mark in marks if mark.kind == kind]
-        found |= {f"{kind}_{n + 1}": own[n * count : (n + 1) * count] for n in range(len(own) // count)}
+        of_kind = [mark for mark in marks if mark.kind == kind]
+        found |= {f"{kind}_{n + 1}": of_kind[n * count : (n + 1) * count] for n in range(len(of_kind) // count)}
     return found
 
 
@@ -113,16 +113,16 @@ class ViewState:
         """
         texts = {key: values[-1].decode("utf-8", "replace") for key, values in query.items() if values}
         asked = {entry.name: _value(entry.name, texts.get(entry.name, ""), names) for entry in fields(cls)}
-        known: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-        view = cls(**{"frame": frame, **known})
+        stated: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+        view = cls(**{"frame": frame, **stated})
         view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1)), cls()
         return view if view.low < view.high else replace(view, low=plain.low, high=plain.high, range="frame")
 
     def query(self) -> str:
         """Return the address without the frame: all that differs from the defaults."""
         plain = type(self)()
-        kept = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "frame"}
-        texts = {name: _text(value) for name, value in kept.items() if value != getattr(plain, name)}
+        entries = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "frame"}
+        texts = {name: _text(value) for name, value in entries.items() if value != getattr(plain, name)}
         return urlencode(texts, safe=":,;")
 
 

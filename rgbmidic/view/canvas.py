@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,18 +20,28 @@ from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.address import Mark
 from rgbmidic.view.picture import Window
 
-__all__ = ["Canvas", "DirectionLayer", "Tiles", "small"]
+__all__ = ["Canvas", "DirectionLayer", "Tiles", "columns", "plain_plot"]
 
+_IMAGE = "image x y dw dh"
 _BAR = 80
 """Px of the screen for the colour bar: seven digits of 12 px, which change with the frame."""
 _SOON = 40
 """Ms in which the moves of a view are collected: the picture follows at 25 a second."""
 
 
-def small(plot: Any) -> None:
-    """Set the size of the text at the axes of a plot to that of the page."""
+def plain_plot(**options: Any) -> Any:
+    """Plot as large as its place, with the text size of the page and no tools; `options` of bokeh's `figure` count."""
+    plain = {"sizing_mode": "stretch_both", "min_border": 4, "tools": [], "toolbar_location": None}
+    plot = figure(**{**plain, **options})
     for axis in plot.axis:
         axis.update(major_label_text_font_size="12px", axis_label_text_font_size="12px")
+    return plot
+
+
+def columns(names: str, rows: Iterable[Sequence[Any]] = ()) -> dict[str, list[Any]]:
+    """Columns of a data source, by their names with spaces between them, from rows of values."""
+    values = [list(column) for column in zip(*rows, strict=True)]
+    return dict(zip(names.split(), values or [[] for _ in names.split()], strict=True))
 
 
 class Canvas:
@@ -64,36 +74,30 @@ class Canvas:
         left, top, right, bottom = self.wanted = tuple(map(float, edges))
         self.window = Window(left=left, top=top, right=right, bottom=bottom, width=800, height=600).fitted()
         self._document, self._redraw, self._coming = document, redraw, False
-        self.plot = figure(
+        self.plot = plain_plot(
             x_range=bk.Range1d(self.window.left, self.window.right),
             y_range=bk.Range1d(self.window.bottom, self.window.top),
             title=" ",
-            sizing_mode="stretch_both",
-            min_border=4,
             min_border_right=_BAR,
             x_axis_label="x (px)",
             y_axis_label="y (px)",
-            tools=[],
             toolbar_location="above",
         )
         self.plot.grid.visible = False
-        self._image = bk.ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")}, name="image")
-        self.plot.image_rgba("image", "x", "y", "dw", "dh", source=self._image)
+        self._image = bk.ColumnDataSource(columns(_IMAGE), name="image")
+        self.plot.image_rgba(*_IMAGE.split(), source=self._image)
         self.colours = bk.LinearColorMapper(palette=["#000000"], low=0, high=1, name="colours")
         self.bar = bk.ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
-        small(self.plot)
         self.plot.add_layout(self.bar, "right")
-        self.marks = bk.ColumnDataSource({"x": [], "y": [], "kind": []}, name="marks")
+        self.marks = bk.ColumnDataSource(columns("x y kind"), name="marks")
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
-        self._dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
+        dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
         pan, wheel = bk.PanTool(), bk.WheelZoomTool(zoom_on_axis=False)
-        draw = [
-            bk.PointDrawTool(renderers=[self._dots], default_overrides={"kind": kind}, visible=False) for kind in kinds
-        ]
+        hidden = {"renderers": [dots], "visible": False}
+        draw = [bk.PointDrawTool(default_overrides={"kind": kind}, **hidden) for kind in kinds]
         self.tools = (pan, *draw)
-        self.plot.add_tools(
-            pan, wheel, bk.BoxZoomTool(match_aspect=True), bk.ResetTool(), bk.SaveTool(filename="field"), *draw
-        )
+        box, reset, save = bk.BoxZoomTool(match_aspect=True), bk.ResetTool(), bk.SaveTool(filename="field")
+        self.plot.add_tools(pan, wheel, box, reset, save, *draw)
         self.plot.toolbar.active_drag, self.plot.toolbar.active_scroll, self.plot.toolbar.logo = pan, wheel, None
         self.plot.on_event(RangesUpdate, self._moved)
         for name in ("inner_width", "inner_height"):
@@ -108,12 +112,11 @@ class Canvas:
     def show(self, image: AnyArray) -> None:
         """Show a picture (rows, columns), uint32, of the window."""
         w = self.window
-        place = {"x": [w.left], "y": [w.top], "dw": [w.right - w.left], "dh": [w.bottom - w.top]}
-        self._image.data = {"image": [image], **place}
+        self._image.data = columns(_IMAGE, [(image, w.left, w.top, w.right - w.left, w.bottom - w.top)])
 
     def clear(self) -> None:
         """Show neither picture nor colour bar."""
-        self._image.data = {name: [] for name in self._image.data}
+        self._image.data = columns(_IMAGE)
         self.plot.title.text, self.bar.visible = " ", False
 
     def colour(self, ends: tuple[float, float], colours: Sequence[str], title: str) -> None:
@@ -132,8 +135,7 @@ class Canvas:
     def place(self, marks: Sequence[Mark]) -> None:
         """Place marks on the plot, unless they are there."""
         if list(marks) != self.set:
-            data = {"x": [m.x for m in marks], "y": [m.y for m in marks], "kind": [m.kind for m in marks]}
-            self.marks.data = data
+            self.marks.data = columns("x y kind", [(mark.x, mark.y, mark.kind) for mark in marks])
 
     def resize(self) -> None:
         """Take the size that the browser reports."""
@@ -170,8 +172,8 @@ class Canvas:
 
 
 _ACROSS = 24
-"""Lines across the view. Chosen: they follow the directions and do not touch each other."""
-_COLUMNS = ("x0", "y0", "x1", "y1")
+"""Lines across the view: each then has some 30 px of a screen of 800, longer than wide and apart from the next."""
+_ENDS = "x0 y0 x1 y1"
 
 
 class DirectionLayer:
@@ -184,52 +186,43 @@ class DirectionLayer:
     """
 
     def __init__(self, canvas: Canvas) -> None:
-        self._canvas, self._lines = canvas, bk.ColumnDataSource({name: [] for name in _COLUMNS}, name="directions")
+        self._canvas, self._lines = canvas, bk.ColumnDataSource(columns(_ENDS), name="directions")
         for colour, width in (("#15181c", 3.0), ("#ffffff", 1.4)):
-            canvas.plot.segment(*_COLUMNS, source=self._lines, line_color=colour, line_width=width)
+            canvas.plot.segment(*_ENDS.split(), source=self._lines, line_color=colour, line_width=width)
 
     def hide(self) -> None:
         """Show no lines."""
         if len(self._lines.data["x0"]):
-            self._lines.data = {name: [] for name in _COLUMNS}
+            self._lines.data = columns(_ENDS)
 
     def show(self, nodes: FloatArray, degrees: FloatArray) -> None:
         """Show the directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
         window = self._canvas.window
         cell = max(window.right - window.left, window.bottom - window.top) / _ACROSS
-        known = np.flatnonzero(np.isfinite(degrees) & np.isfinite(nodes).all(axis=1))
-        places = np.floor(nodes[known] / cell).astype(int)
-        kept = known[np.unique(places, axis=0, return_index=True)[1]]
-        angle = np.radians(degrees[kept])
+        measured = np.flatnonzero(np.isfinite(degrees) & np.isfinite(nodes).all(axis=1))
+        places = np.floor(nodes[measured] / cell).astype(int)
+        thinned = measured[np.unique(places, axis=0, return_index=True)[1]]
+        angle = np.radians(degrees[thinned])
         half = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        ends = np.concatenate([nodes[kept] - half, nodes[kept] + half], axis=1)
-        self._lines.data = dict(zip(_COLUMNS, ends.T, strict=True))
+        ends = np.concatenate([nodes[thinned] - half, nodes[thinned] + half], axis=1)
+        self._lines.data = dict(zip(_ENDS.split(), ends.T, strict=True))
 
 
 _WIDE = 260
 """Columns of a small picture."""
 _STEP, _GAP = 1.06, 0.2
 """From one to the next, and the room for a name over each, in widths of one."""
-_TILES_COLUMNS = ("image", "x", "y", "dw", "name")
+_TILE = "image x y dw name"
 
 
 class Tiles:
     """Plot of small pictures in rows; hidden until there are some."""
 
     def __init__(self) -> None:
-        self._shown = bk.ColumnDataSource({name: [] for name in _TILES_COLUMNS}, name="tiles")
-        self.plot = figure(
-            sizing_mode="scale_width",
-            x_range=bk.Range1d(0, 1),
-            y_range=bk.Range1d(1, 0),
-            tools=[],
-            toolbar_location=None,
-            min_border=0,
-            visible=False,
-            background_fill_color=None,
-            border_fill_color=None,
-            outline_line_color=None,
-        )
+        self._shown = bk.ColumnDataSource(columns(_TILE), name="tiles")
+        bare = dict.fromkeys(("background_fill_color", "border_fill_color", "outline_line_color"))
+        ranges = {"x_range": bk.Range1d(0, 1), "y_range": bk.Range1d(1, 0)}
+        self.plot = plain_plot(sizing_mode="scale_width", min_border=0, visible=False, **ranges, **bare)
         self.plot.axis.visible = self.plot.grid.visible = False
         greys = [f"#{level:02x}{level:02x}{level:02x}" for level in range(256)]
         self._drawn = self.plot.image("image", "x", "y", "dw", 1, source=self._shown, palette=greys)
@@ -240,22 +233,16 @@ class Tiles:
     def show(self, rows: Sequence[Mapping[str, npt.NDArray[np.uint8]]]) -> None:
         """Show rows of pictures (H, W) of one size by their names, aligned at the right."""
         height, width = next(iter(rows[0].values())).shape
-        tall = height / width
-        across = max(map(len, rows))
-        places = [
-            (name, picture, x, y)
+        tall, across = height / width, max(map(len, rows))
+        size = (_WIDE, max(1, round(_WIDE * tall)))
+        self._drawn.glyph.dh = tall
+        tiles = [
+            (picture, x * _STEP, y * (tall + _GAP) + _GAP, 1.0, name)
             for y, row in enumerate(rows)
             for x, (name, picture) in enumerate(row.items(), start=across - len(row))
         ]
-        size = (_WIDE, max(1, round(_WIDE * tall)))
-        self._drawn.glyph.dh = tall
-        self._shown.data = {
-            "image": [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for _, picture, *_ in places],
-            "x": [x * _STEP for *_, x, _ in places],
-            "y": [y * (tall + _GAP) + _GAP for *_, y in places],
-            "dw": [1.0] * len(places),
-            "name": [name for name, *_ in places],
-        }
+        small = [(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), *place) for picture, *place in tiles]
+        self._shown.data = columns(_TILE, small)
         down = len(rows) * (tall + _GAP)
         self.plot.x_range.end, self.plot.y_range.start = across * _STEP, down
         self.plot.update(visible=True, aspect_ratio=across * _STEP / down)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import io
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -13,7 +12,6 @@ import bokeh.models as bk
 import numpy as np
 import numpy.typing as npt
 from bokeh.document import Document
-from bokeh.plotting import figure
 
 from rgbmidic.errors import ResultError
 from rgbmidic.report.style import OKABE_ITO, time_axis
@@ -22,7 +20,8 @@ from rgbmidic.results.histories import history_csv, read_histories
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import KINDS, Mark, probe_marks
-from rgbmidic.view.canvas import small
+from rgbmidic.view.canvas import columns, plain_plot
+from rgbmidic.view.fields import Background
 
 __all__ = ["CurvePanel", "Progress", "TimeLine", "as_csv", "band", "groups", "places", "probes", "read"]
 
@@ -33,9 +32,9 @@ def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings) -> ProbeS
     Strain gauges have the length `gauge` (px); strain measure and window are those `stated`.
     """
     places: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
-    for own in probe_marks(marks).values():
-        place = tuple(coordinate for mark in own for coordinate in (mark.x, mark.y))
-        places[f"{own[0].kind}s"] += ((*place, gauge) if own[0].kind == "strain_gauge" else place,)
+    for pair in probe_marks(marks).values():
+        place = tuple(coordinate for mark in pair for coordinate in (mark.x, mark.y))
+        places[f"{pair[0].kind}s"] += ((*place, gauge) if pair[0].kind == "strain_gauge" else place,)
     return ProbeSettings(measure=stated.measure, window=stated.window, **places)
 
 
@@ -83,6 +82,7 @@ def _probe(name: str) -> str:
     return "_".join(parts[: next(place for place, part in enumerate(parts) if part.isdecimal()) + 1])
 
 
+_LINES, _BANDS = "xs ys colour name", "xs ys colour"
 _AT_ONCE = 100
 """Frames that are read before the page is served again. Measured: 10 ms."""
 _NOT_YET, _DAMAGED = -1, 3
@@ -94,7 +94,7 @@ NOW = {"dimension": "height", "level": "overlay", "line_color": "#8e5bd0", "line
 
 def places(result: Result) -> npt.NDArray[np.int64]:
     """Return the places of the frames' records, shape (T, 2): a frame that is measured again has another place."""
-    return np.stack([result.table.shard, result.table.start], axis=1)
+    return np.stack([result.table.places[name] for name in ("shard", "start")], axis=1)
 
 
 class Progress:
@@ -171,19 +171,11 @@ class TimeLine:
 
     def __init__(self, frames: int, now: int) -> None:
         self._drawn = -1
-        self._fractions = bk.ColumnDataSource({"x": [], "y": []})
-        self._faults = bk.ColumnDataSource({"x": [], "colour": []}, name="faults")
-        self.plot = figure(
-            sizing_mode="stretch_both",
-            x_range=bk.Range1d(-0.5, max(frames - 0.5, 0.5)),
-            y_range=bk.Range1d(0, 105),
-            y_axis_label="nodes (%)",
-            tools=[],
-            toolbar_location=None,
-            min_border=2,
-        )
+        self._fractions = bk.ColumnDataSource(columns("x y"))
+        self._faults = bk.ColumnDataSource(columns("x colour"), name="faults")
+        ranges = {"x_range": bk.Range1d(-0.5, max(frames - 0.5, 0.5)), "y_range": bk.Range1d(0, 105)}
+        self.plot = plain_plot(y_axis_label="nodes (%)", min_border=2, **ranges)
         self.plot.yaxis.ticker = [0, 50, 100]
-        small(self.plot)
         self.plot.varea("x", 0, "y", source=self._fractions, fill_color="#6baed6", fill_alpha=0.6)
         self.plot.segment("x", 0, "x", 100, source=self._faults, line_color="colour", line_width=2)
         self.now = bk.Span(location=now, **NOW)
@@ -195,8 +187,8 @@ class TimeLine:
             return
         self._drawn, known = progress.changes, np.flatnonzero(np.isfinite(progress.fraction))
         self._fractions.data = {"x": known, "y": 100 * progress.fraction[known]}
-        bad = [(frame, colour) for code, colour in _FAULTS.items() for frame in np.flatnonzero(progress.status == code)]
-        self._faults.data = {"x": [int(frame) for frame, _ in bad], "colour": [colour for _, colour in bad]}
+        bad = [(at, colour) for code, colour in _FAULTS.items() for at in np.flatnonzero(progress.status == code)]
+        self._faults.data = columns("x colour", [(int(at), colour) for at, colour in bad])
 
 
 class CurvePanel:
@@ -225,34 +217,43 @@ class CurvePanel:
         self.histories: Histories | None = None
         self.reading = False
         self.colours: Mapping[str, str] = {}
-        self._document, self._select, self._message, self._hint, self._chosen = document, select, message, hint, chosen
-        self._reader, self._number, self._task = ThreadPoolExecutor(1), 0, Future[Histories | None]()
-        self.plot, self._lines, self._bands = _plot()
-        self.now = bk.Span(**NOW)
+        self._select, self._message, self._hint, self._chosen = select, message, hint, chosen
+        self._reader = Background(document)
+        self._lines = bk.ColumnDataSource(columns(_LINES), name="lines")
+        self._bands = bk.ColumnDataSource(columns(_BANDS), name="bands")
+        self.plot, self.now = self._new_plot(), bk.Span(**NOW)
         self.plot.add_layout(self.now)
         select.on_change("value", lambda attr, old, new: self.draw())
-        document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
+
+    def _new_plot(self) -> Any:
+        wheel, hover = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False)
+        tools = [bk.PanTool(), wheel, bk.BoxZoomTool(), bk.ResetTool(), hover]
+        plot = plain_plot(tools=tools, title="Curves", toolbar_location="above")
+        plot.toolbar.logo, plot.toolbar.active_scroll = None, wheel
+        plot.patches("xs", "ys", source=self._bands, fill_color="colour", fill_alpha=0.25, line_alpha=0)
+        style = {"line_color": "colour", "line_width": 1.5, "legend_field": "name"}
+        drawn = plot.multi_line("xs", "ys", source=self._lines, **style)
+        plot.x_range.renderers = plot.y_range.renderers = [drawn]  # the values rule, not the widest band
+        hover.renderers, hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
+        plot.legend.visible, plot.legend.label_text_font_size, plot.legend.ncols = False, "11px", 2
+        plot.add_layout(plot.legend[0], "below")
+        return plot
 
     def read(self, result: Result, marks: Sequence[Mark], gauge: float, shown: Callable[[], None]) -> None:
         """Read the probes off all frames in another thread, then call `shown`; only the last request counts."""
-        self._number += 1
-        self._task.cancel()
         self.reading = bool(marks)
-        if not marks:
-            self._have(self._number, None, shown)
-            return
-        self._message.text = "reading all frames …"
-        self._task = self._reader.submit(read, result, tuple(marks), gauge)
-        done = partial(self._have, self._number, self._task, shown)
-        self._task.add_done_callback(lambda _: self._document.add_next_tick_callback(done))
+        if marks:
+            self._message.text = "reading all frames …"
+            self._reader.ask(partial(read, result, tuple(marks), gauge), partial(self._have, shown))
+        else:
+            self._reader.drop()
+            self._have(shown, lambda: None)
 
-    def _have(self, number: int, task: Future[Histories | None] | None, shown: Callable[[], None]) -> None:
-        if number != self._number:
-            return
+    def _have(self, shown: Callable[[], None], read: Callable[[], Histories | None]) -> None:
         self.reading = False
-        before = _names(self.histories)
+        before = set() if self.histories is None else {_probe(each.name) for each in self.histories.quantities}
         try:
-            self.histories = None if task is None else task.result()
+            self.histories = read()
             remarks = () if self.histories is None else self.histories.remarks
             self._message.text = "<br>".join(map(html.escape, remarks)) or self._hint
         except Exception as error:  # a probe outside the region and the like: reported where the probes are
@@ -261,7 +262,8 @@ class CurvePanel:
         found = {} if self.histories is None else groups(self.histories)
         self._select.options = list(found)
         # the chosen quantity stays unless a new probe does not have it
-        wanted = [name for name, own in found.items() if {_probe(one.name) for one in own} - before] or list(found)
+        new = [name for name, curves in found.items() if any(_probe(curve.name) not in before for curve in curves)]
+        wanted = new or list(found)
         current = self._select.value or self._chosen
         self._select.value = current if current in wanted or not wanted else wanted[0]
         self.draw()
@@ -270,18 +272,18 @@ class CurvePanel:
     def draw(self) -> None:
         """Draw the chosen curve of all probes."""
         if self.histories is None:
-            self._bands.data, self._lines.data = _columns([], "xs ys colour"), _columns([], "xs ys colour name")
+            self._bands.data, self._lines.data = columns(_BANDS), columns(_LINES)
             self.plot.legend.visible = False
             self.plot.xaxis.axis_label = self.plot.yaxis.axis_label = None
             return
-        own = groups(self.histories).get(self._select.value, [])
+        quantities = groups(self.histories).get(self._select.value, [])
         x, axis = time_axis(self.histories.times, self.histories.frames)
         bands, lines = [], []
-        for quantity in own:
+        for quantity in quantities:
             colour = self.colours.get(_probe(quantity.name), OKABE_ITO["grey"])
             bands += [(xs, ys, colour) for xs, ys in zip(*band(x, quantity), strict=True)]
             lines.append((x, quantity.values, colour, quantity.name.replace("_", " ")))
-        self._bands.data, self._lines.data = _columns(bands, "xs ys colour"), _columns(lines, "xs ys colour name")
+        self._bands.data, self._lines.data = columns(_BANDS, bands), columns(_LINES, lines)
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = axis, self._select.value
         self.plot.legend.visible = True
 
@@ -298,34 +300,3 @@ class CurvePanel:
     @property
     def _times(self) -> FloatArray:
         return np.zeros(0) if self.histories is None else time_axis(self.histories.times, self.histories.frames)[0]
-
-
-def _names(histories: Histories | None) -> set[str]:
-    """Return the names of the probes that were read."""
-    return set() if histories is None else {_probe(quantity.name) for quantity in histories.quantities}
-
-
-def _columns(rows: Sequence[Sequence[Any]], names: str) -> dict[str, list[Any]]:
-    return {name: [row[place] for row in rows] for place, name in enumerate(names.split())}
-
-
-def _plot() -> tuple[Any, bk.ColumnDataSource, bk.ColumnDataSource]:
-    wheel, hover = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False)
-    plot = figure(
-        sizing_mode="stretch_both",
-        min_border=4,
-        tools=[bk.PanTool(), wheel, bk.BoxZoomTool(), bk.ResetTool(), hover],
-        title="Curves",
-        toolbar_location="above",
-    )
-    plot.toolbar.logo, plot.toolbar.active_scroll = None, wheel
-    small(plot)
-    lines = bk.ColumnDataSource(_columns([], "xs ys colour name"), name="lines")
-    bands = bk.ColumnDataSource(_columns([], "xs ys colour"), name="bands")
-    plot.patches("xs", "ys", source=bands, fill_color="colour", fill_alpha=0.25, line_alpha=0)
-    drawn = plot.multi_line("xs", "ys", source=lines, line_color="colour", line_width=1.5, legend_field="name")
-    plot.x_range.renderers = plot.y_range.renderers = [drawn]  # the values rule, not the widest band
-    hover.renderers, hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
-    plot.legend.visible, plot.legend.label_text_font_size, plot.legend.ncols = False, "11px", 2
-    plot.add_layout(plot.legend[0], "below")
-    return plot, lines, bands

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +19,12 @@ from rgbmidic.errors import ConfigurationError
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_section, read_toml
 from rgbmidic.view.address import Mark
-from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.canvas import Canvas, columns
 
 __all__ = ["HOLES", "OUTLINES", "Draft", "RegionDrawing", "arranged", "marks_of", "region_of", "rings"]
 
-_FILES = (
-    ("calibration", "file"),
-    ("region", "mask"),
-    ("weights", "geometry"),
-    ("weights", "height_map"),
-    ("weights", "images"),
-)
-"""Keys that name files, beside the frames."""
+_FILES = ("frames.path", "calibration.file", "region.mask", "weights.geometry", "weights.height_map", "weights.images")
+"""Keys that name files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,8 +85,6 @@ class Draft:
     @property
     def frames(self) -> FrameSettings:
         """The settings of the frames; errors as `TestSettings.from_mapping`."""
-        if "path" not in self.section("frames"):
-            raise ConfigurationError("frames.path is missing")
         return read_section(FrameSettings, "frames", self.section("frames"), self.file.parent)
 
     @property
@@ -99,11 +92,6 @@ class Draft:
         """The settings of the region; None where there is none yet."""
         content = self.section("region")
         return read_section(RegionSettings, "region", content, self.file.parent) if content else None
-
-    @property
-    def settings(self) -> TestSettings:
-        """The settings of the test; errors as `TestSettings.from_mapping`."""
-        return TestSettings.from_mapping(self.document, self.file.parent)
 
     def changed(self, sections: Mapping[str, Mapping[str, Any]]) -> Self:
         """Return the draft with other values of some keys; comments and order stay.
@@ -162,8 +150,8 @@ class Draft:
         file = self.file.parent / file
         if file.suffix.lower() != ".toml":
             raise ConfigurationError(f"{file} must end in .toml")
-        given = [self.section(section).get(key, []) for section, key in (("frames", "path"), *_FILES)]
-        named = [text for one in given for text in ([one] if isinstance(one, str) else one)]
+        stated = [self.section(section).get(key, []) for section, _, key in (name.partition(".") for name in _FILES)]
+        named = [text for value in stated for text in ([value] if isinstance(value, str) else value)]
         if file.parent != self.file.parent and any(not Path(text).is_absolute() for text in named):
             raise ConfigurationError(
                 f"{file} must stay in {self.file.parent}: what it names is relative to that folder"
@@ -180,7 +168,7 @@ class Draft:
         ResultError
             The file cannot be written.
         """
-        _ = self.settings
+        TestSettings.from_mapping(self.document, self.file.parent)
         write_complete(self.file, lambda file: file.write(self.text.encode("utf-8")))
 
 
@@ -199,24 +187,23 @@ def arranged(marks: Sequence[Mark], new: str) -> tuple[Mark, ...]:
     if new not in OUTLINES:
         return tuple(marks)
     kept = [mark for mark in marks if mark.kind == new or mark.kind not in OUTLINES]
-    own = [mark for mark in kept if mark.kind == new]
-    if new != "polygon" and len(own) > OUTLINES[new]:  # a third place begins another one
-        kept = [mark for mark in kept if mark.kind != new or mark is own[-1]]
+    of_kind = [mark for mark in kept if mark.kind == new]
+    if new != "polygon" and len(of_kind) > OUTLINES[new]:  # a third place begins another one
+        kept = [mark for mark in kept if mark.kind != new or mark is of_kind[-1]]
     return tuple(kept)
 
 
 def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
     """Return the keys of ``[region]`` for an outline and its holes; None where no outline is complete."""
     outline = next((kind for kind in OUTLINES if any(mark.kind == kind for mark in marks)), "")
-    own = [(mark.x, mark.y) for mark in marks if mark.kind == outline]
-    if not outline or len(own) < OUTLINES[outline]:
+    if not outline or sum(mark.kind == outline for mark in marks) < OUTLINES[outline]:
         return None
-    holes = _holes(marks)
+    corners, holes = _corners(outline, marks), _holes(marks)
     if outline == "rectangle":
-        (x0, y0), (x1, y1) = own
-        shape: dict[str, Any] = {"rectangle": _rounded([min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)])}
+        low, high = map(min, zip(*corners, strict=True)), map(max, zip(*corners, strict=True))
+        shape: dict[str, Any] = {"rectangle": [*low, *high]}
     else:
-        shape = {"polygon": [_rounded(p) for p in (own if outline == "polygon" else _circle(*own))]}
+        shape = {"polygon": corners}
     return {**shape, **({"holes": holes} if holes else {})}
 
 
@@ -225,10 +212,8 @@ def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:
     region = region_of(marks) or {}
     if "rectangle" in region:
         x0, y0, x1, y1 = region["rectangle"]
-        outline = [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]
-    else:
-        outline = region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES]
-    return outline, _holes(marks)
+        return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]], _holes(marks)
+    return region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES], _holes(marks)
 
 
 def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
@@ -244,31 +229,25 @@ def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
 
 def _holes(marks: Sequence[Mark]) -> list[Ring]:
     """Return the corners of the complete holes."""
-    names = dict.fromkeys(mark.kind for mark in marks if mark.kind not in OUTLINES)
-    found = []
-    for name in names:
-        kind, own = name.rpartition(" ")[0], [(mark.x, mark.y) for mark in marks if mark.kind == name]
-        if len(own) >= HOLES[kind]:
-            corners = own if kind == "hole" else _circle(*own[:2])
-            found.append([_rounded(corner) for corner in corners])
-    return found
+    names = [mark.kind for mark in marks if mark.kind not in OUTLINES]
+    complete = [name for name in dict.fromkeys(names) if names.count(name) >= HOLES[name.rpartition(" ")[0]]]
+    return [_corners(name, marks) for name in complete]
 
 
-def _circle(centre: tuple[float, float], on: tuple[float, float]) -> list[tuple[float, float]]:
-    radius = np.hypot(on[0] - centre[0], on[1] - centre[1])
-    angles = np.arange(_ROUND) * 2 * np.pi / _ROUND
-    return [(centre[0] + radius * np.cos(a), centre[1] + radius * np.sin(a)) for a in angles.tolist()]
-
-
-def _rounded(numbers: Sequence[float]) -> list[float]:
-    """Round to a tenth of a pixel, below the precision of a pointer."""
-    return [round(float(number), 1) for number in numbers]
+def _corners(name: str, marks: Sequence[Mark]) -> Ring:
+    """Return the corners that the marks of an outline or a hole make, to a tenth of a pixel: a pointer's precision."""
+    places = [(mark.x, mark.y) for mark in marks if mark.kind == name]
+    if name.startswith(("circle", "round hole")):
+        (x, y), on = places[:2]
+        radius, angles = math.dist((x, y), on), np.arange(_ROUND) * 2 * np.pi / _ROUND
+        places = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
+    return [[round(float(x), 1), round(float(y), 1)] for x, y in places]
 
 
 _SOON = 60
 """Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
 _KEPT = 100
-"""Steps that can be undone. Chosen; each holds some hundred bytes."""
+"""Steps that can be undone: more than a hand takes back one by one, at some hundred bytes each."""
 
 
 class RegionDrawing:
@@ -291,7 +270,7 @@ class RegionDrawing:
     ) -> None:
         self._document, self._canvas, self._changed = document, canvas, changed
         self._history, self._hole, self._moved, self._coming = [marks], 1, False, False
-        self._rings = ColumnDataSource({"xs": [], "ys": [], "colour": []}, name="rings")
+        self._rings = ColumnDataSource(columns("xs ys colour"), name="rings")
         canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
         canvas.marks.on_change("data", lambda attr, old, new: self._marked())
 

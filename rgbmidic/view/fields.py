@@ -5,9 +5,10 @@ from __future__ import annotations
 import html
 import logging
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,10 +25,12 @@ from rgbmidic.typing import FloatArray
 from rgbmidic.view.picture import Picture, element_at, grey_picture
 
 __all__ = [
+    "Background",
     "Field",
     "Fields",
     "Pictures",
     "Values",
+    "every",
     "frame_text",
     "guarded",
     "pointer_text",
@@ -36,13 +39,15 @@ __all__ = [
     "watched",
 ]
 
+T = TypeVar("T")
+
 logger = logging.getLogger(__name__)
 
 Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
 
 _MOVED = ("u", "v", "u_std", "v_std")
 _SPREAD = 24
-"""Frames, evenly spread, whose values set the colour range of a whole test. Chosen: they are read within a second."""
+"""Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second."""
 _ORDER = ("u", "v", "magnitude", "exx", "eyy", "exy", "e1", "e2", "direction", "equivalent")
 """Fields that stand first."""
 _KINDS: dict[str, Kind] = {
@@ -182,8 +187,8 @@ class Fields:
             As `Result.frame`.
         """
         more = {"fraction": ("light_fraction", "node_status")}.get(self.all[name].kind, ())
-        own = (name,) if name in QUANTITIES and name not in _MOVED and not self.physical.is_strain(name) else ()
-        read = next(self.result.table.each([*_MOVED, *own, *more], [frame]))
+        stored = (name,) if name in QUANTITIES and name not in _MOVED and not self.physical.is_strain(name) else ()
+        read = next(self.result.table.each([*_MOVED, *stored, *more], [frame]))
         u, v, u_std, v_std = (np.asarray(read[part], dtype=np.float64) for part in _MOVED)
         moved = self.result.nodes + np.stack([u, v], axis=1)
         nothing = np.full(len(u), np.nan)
@@ -210,14 +215,14 @@ class Fields:
         """Return the colour range over the whole test, from frames evenly spread over those that are measured."""
         there = np.flatnonzero(self.result.finished).tolist()
         ends = [robust_range(self.read(name, frame)) for frame in (spread(there, _SPREAD) if there else ())]
-        known = [pair for pair in ends if pair is not None]
-        return (min(low for low, _ in known), max(high for _, high in known)) if known else (0.0, 1.0)
+        measured = [pair for pair in ends if pair is not None]
+        return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
 
 
 def robust_range(read: Values) -> tuple[float, float] | None:
     """Return the colour range of one frame without doubtful nodes and outliers; None where nothing is measured."""
-    known = ordinary_values(read.values, read.std)
-    return colour_range(known) if known.size else None
+    ordinary = ordinary_values(read.values, read.std)
+    return colour_range(ordinary) if ordinary.size else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -235,11 +240,11 @@ class Pictures:
     @cached_property
     def reference(self) -> Picture:
         """Mean of the lights' reference images, grey where none was kept."""
-        kept, (left, top) = self.result.reference, self.result.reference_origin
+        images, (left, top) = self.result.reference, self.result.reference_origin
         columns, rows = np.ceil(self.result.nodes.max(axis=0) + 1).astype(int)
         picture = np.full(self.result.frame_shape or (rows, columns), 60, dtype=np.uint8)
-        if kept is not None:
-            picture[top : top + kept.shape[1], left : left + kept.shape[2]] = kept.mean(axis=0)
+        if images is not None:
+            picture[top : top + images.shape[1], left : left + images.shape[2]] = images.mean(axis=0)
         return picture
 
     def frame(self, place: int) -> tuple[Picture, str]:
@@ -280,6 +285,37 @@ def watched(document: Document) -> bool:
     """Return whether a browser shows the page: one that was left exists for a while, and shall do nothing more."""
     session = document.session_context.session if document.session_context else None
     return session is None or session.connection_count > 0
+
+
+def every(milliseconds: int, document: Document, act: Callable[[], None], complain: Callable[[str], None]) -> None:
+    """Call `act`, as `guarded`, again and again while a browser shows the page."""
+    document.add_periodic_callback(lambda: guarded(act, complain) if watched(document) else None, milliseconds)
+
+
+class Background:
+    """Work for a page in another thread, one task after the other, of which only the last that was asked for counts.
+
+    Parameters
+    ----------
+    document
+        Document of the page.
+    """
+
+    def __init__(self, document: Document) -> None:
+        self._document, self._thread, self._task = document, ThreadPoolExecutor(1), Future[Any]()
+        document.on_session_destroyed(lambda context: self._thread.shutdown(wait=False, cancel_futures=True))
+
+    def drop(self) -> None:
+        """Forget the task that was asked for."""
+        self._task.cancel()
+        self._task = Future()
+
+    def ask(self, work: Callable[[], T], take: Callable[[Callable[[], T]], None]) -> None:
+        """Start a task; `take` gets the function that returns its result or raises its error, in the page's thread."""
+        self.drop()
+        task = self._task = self._thread.submit(work)
+        taken = lambda: take(task.result) if task is self._task else None  # noqa: E731
+        task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
 
 
 def frame_text(result: Result, place: int, field: Field, values: Values, remark: str) -> str:

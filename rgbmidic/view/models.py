@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.resources import files
 from typing import Any
 
 import bokeh.models as bk
@@ -15,57 +16,23 @@ from bokeh.model import DataModel
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import Mark, probe_marks
-from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.canvas import Canvas, columns
 from rgbmidic.view.picture import element_at
 
-__all__ = ["TOOL", "Controls", "MarkLayer", "ResultControls", "SharedState"]
+__all__ = ["Controls", "MarkLayer", "ResultControls", "SharedState", "page_file", "script"]
 
-_DARK = """
-:host { color: #e6e9ec; }
-.bk-input, .bk-btn { background-color: #24292f !important; color: #e6e9ec !important; }
-.bk-input, .bk-btn { border-color: #4b545e !important; }
-.bk-btn.bk-active { background-color: #2f6fb0 !important; }
-:host, .bk-input, .bk-btn { font-size: 13px; }
-.bk-btn { padding: 5px 5px; }
-.noUi-target { background: #24292f; border-color: #4b545e; box-shadow: none; }
-"""
-_LIGHT = ":host { color: #1b1f24; } :host, .bk-input, .bk-btn { font-size: 13px; } .bk-btn { padding: 5px 5px; }"
 _SHORT = 150
-"""Smallest number of ms between two frames that are played, 6 to 7 a second. Chosen: the eye can follow them."""
+"""Smallest number of ms between two frames that are played: 6 to 7 a second, which the eye can follow."""
 
-PUMP = """
-if (state.asked !== state.shown) return;           // one frame on its way at a time
-if (slider.value !== state.shown) { state.asked = slider.value; return; }
-if (!play.active) return;
-const wait = Math.max(0, (window.rgbmidic_next || 0) - performance.now());
-setTimeout(() => {
-  if (!play.active || slider.value !== state.shown) return;
-  window.rgbmidic_next = performance.now() + %d;
-  slider.value = slider.value + step.value > slider.end ? slider.start : slider.value + step.value;
-}, wait);
-"""
-TOOL = "tools[cb_obj.active].active = true"
-SHOWN = """
-now.setv({location: state.shown}, {sync: false});
-history.replaceState(null, "", "?frame=" + state.shown + (state.query && "&" + state.query));
-"""
-_KEEP = """
-const keep = (blob, name) => {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = name;
-  link.click();
-  URL.revokeObjectURL(link.href);
-};
-"""
-KEEP_CSV = f"""{_KEEP}
-if (!state.csv) return;
-keep(new Blob([state.csv], {{type: "text/csv"}}), "history.csv");
-state.csv = "";
-"""
-KEEP_PNG = f"""{_KEEP}
-Bokeh.index.get_one(plot).export("png").to_blob().then((blob) => keep(blob, "history.png"));
-"""
+
+def page_file(name: str) -> str:
+    """Text of a file of the page that lies beside this module."""
+    return files("rgbmidic.view").joinpath(name).read_text(encoding="utf-8")
+
+
+def script(name: str, **parts: Any) -> bk.CustomJS:
+    """Call a function of page.js in the browser with parts of the page, and plain values, by their names."""
+    return bk.CustomJS(args=parts, code=f"rgbmidic.{name}({{{', '.join(parts)}}})")
 
 
 class SharedState(DataModel):  # type: ignore[misc]  # see pyproject.toml
@@ -98,14 +65,14 @@ class Controls:
     """
 
     def __init__(self, last: int, frame: int, *, dark: bool) -> None:
-        self.small: dict[str, Any] = {"stylesheets": [bk.InlineStyleSheet(css=_DARK if dark else _LIGHT)]}
+        styles = ("widgets.css", "dark.css") if dark else ("widgets.css",)
+        self.small: dict[str, Any] = {"stylesheets": [bk.InlineStyleSheet(css=page_file(name)) for name in styles]}
         self.wide = wide = {**self.small, "sizing_mode": "stretch_width"}
         other, most = "light" if dark else "dark", max(last, 1)
-        turn = f"const u = new URL(location.href); u.searchParams.set('theme', '{other}'); location.replace(u.href)"
         self.head, self.description = bk.Div(**wide), bk.Div(name="description", **wide)
         self.message = bk.Div(name="message", **wide)
         self.theme = bk.Button(label=f"{other.capitalize()} page", **wide)
-        self.theme.js_on_click(bk.CustomJS(code=turn))
+        self.theme.js_on_click(script("turn", theme=other))
         self.frame = bk.Slider(
             title="Frame", name="frame", start=0, end=most, step=1, value=frame, disabled=last < 1, **wide
         )
@@ -115,8 +82,7 @@ class Controls:
 
     def ask(self, state: SharedState) -> None:
         """Let the slider ask for frames, and play them."""
-        parts = {"state": state, "slider": self.frame, "play": self.play, "step": self.step}
-        asks = bk.CustomJS(args=parts, code=PUMP % _SHORT)
+        asks = script("pump", state=state, slider=self.frame, play=self.play, step=self.step, wait=_SHORT)
         self.frame.js_on_change("value", asks)
         self.play.js_on_change("active", asks)
         state.js_on_change("shown", asks)
@@ -145,15 +111,15 @@ class ResultControls(Controls):
     def wire(self, state: SharedState, tools: Sequence[Any], now: bk.Span, curves: Any) -> None:
         """Let the browser itself act; `now` marks the frame that is shown, `curves` is a plot."""
         self.ask(state)
-        shown = bk.CustomJS(args={"state": state, "now": now}, code=SHOWN)
-        state.js_on_change("shown", shown)
-        state.js_on_change("query", shown)
-        state.js_on_change("csv", bk.CustomJS(args={"state": state}, code=KEEP_CSV))
-        self.png.js_on_click(bk.CustomJS(args={"plot": curves}, code=KEEP_PNG))
-        self.mode.js_on_change("active", bk.CustomJS(args={"tools": list(tools)}, code=TOOL))
+        for name in ("shown", "query"):
+            state.js_on_change(name, script("shown", state=state, now=now))
+        state.js_on_change("csv", script("keepCsv", state=state))
+        self.png.js_on_click(script("keepPng", plot=curves))
+        self.mode.js_on_change("active", script("choose", group=self.mode, tools=list(tools), other=None))
 
 
 _COLOURS = tuple(OKABE_ITO.values())
+_PROBE = "xs ys colour x y text"
 _LETTERS = {
     "x_offset": 8,
     "y_offset": -4,
@@ -183,7 +149,7 @@ class MarkLayer:
     def __init__(self, canvas: Canvas, elements: npt.NDArray[np.int32]) -> None:
         self.colours: dict[str, str] = {}
         self._canvas, self._elements, self._shown = canvas, elements, dict[Mark, Mark]()
-        self._joined = bk.ColumnDataSource({name: [] for name in ("xs", "ys", "colour", "x", "y", "text")})
+        self._joined = bk.ColumnDataSource(columns(_PROBE))
         canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
         canvas.plot.text("x", "y", "text", source=self._joined, text_color="colour", **_LETTERS)
 
@@ -197,14 +163,10 @@ class MarkLayer:
         self._canvas.place(at)
         probes = probe_marks(at)
         self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
-        self._joined.data = {
-            "xs": [[mark.x for mark in own] for own in probes.values()],
-            "ys": [[mark.y for mark in own] for own in probes.values()],
-            "colour": list(self.colours.values()),
-            "x": [own[0].x for own in probes.values()],
-            "y": [own[0].y for own in probes.values()],
-            "text": [name.replace("_", " ") for name in probes],
-        }
+        lines = [([mark.x for mark in ends], [mark.y for mark in ends]) for ends in probes.values()]
+        texts = [(xs[0], ys[0], name.replace("_", " ")) for name, (xs, ys) in zip(probes, lines, strict=True)]
+        parts = zip(lines, self.colours.values(), texts, strict=True)
+        self._joined.data = columns(_PROBE, [(*line, colour, *text) for line, colour, text in parts])
 
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
@@ -23,15 +22,15 @@ from rgbmidic.view.fields import (
     Fields,
     Pictures,
     Values,
+    every,
     frame_text,
     guarded,
     pointer_text,
     robust_range,
     warning,
-    watched,
 )
 from rgbmidic.view.models import MarkLayer, ResultControls, SharedState
-from rgbmidic.view.picture import AROUND, paint, palette, palette_name
+from rgbmidic.view.picture import AROUND, Overlay, paint, palette, palette_name
 
 __all__ = ["ResultPage"]
 
@@ -63,7 +62,7 @@ class ResultPage:
         self.fields, self.pictures, self.progress = Fields.of(result), Pictures(result=result), progress
         self.values: Values | None = None
         self._pointer: tuple[float, float] | None = None
-        self._key = ("", -1, -1)
+        self._read = lru_cache(1)(lambda name, frame, changes: self.fields.read(name, frame))
         self._test_range = lru_cache(8)(lambda name, changes: self.fields.range_of_test(name))
         self._changes = self._size = 0
         self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
@@ -88,30 +87,29 @@ class ResultPage:
         return {"head": p.head, "under": p.under, "side": side, "player": p.player, **drawn}
 
     def _begin(self) -> None:
-        """Set the controls to the view."""
+        """Set the controls to the view, and let them change it."""
         p, view = self.parts, self.view
         p.field.options = [(name, field.label) for name, field in self.fields.all.items()]
-        p.field.value, p.opacity.value, p.range.value = view.field, view.opacity, view.range
         p.over.active = OVER.index(view.over)
-        p.low.value, p.high.value, p.symmetric.active = view.low, view.high, view.symmetric
-        p.directions.active = view.directions
+        p.low.value, p.high.value = view.low, view.high
         p.message.text, p.head.text = _HELP, self._title()
-
-    def _listen(self) -> None:
-        p = self.parts
+        for model, key, entry in (
+            (p.field, "value", "field"), (p.opacity, "value", "opacity"), (p.range, "value", "range"),
+            (p.symmetric, "active", "symmetric"), (p.directions, "active", "directions"),
+        ):  # fmt: skip
+            model.update(**{key: getattr(view, entry)})
+            model.on_change(key, lambda attr, old, new, entry=entry: self.show(**{entry: new}))
         for model, key, change in (
             (self.state, "asked", lambda frame: {"frame": min(frame, len(self.result) - 1)}),
-            (p.field, "value", lambda name: {"field": name}),
-            (p.range, "value", lambda name: {"range": name}),
-            (p.opacity, "value", lambda value: {"opacity": value}),
-            (p.symmetric, "active", lambda active: {"symmetric": active}),
-            (p.directions, "active", lambda active: {"directions": active}),
             (p.over, "active", lambda place: {"over": OVER[place]}),
             (p.curve, "value", lambda name: {"curve": name}),
             (p.low, "value", lambda low: self._by_hand()),
             (p.high, "value", lambda high: self._by_hand()),
         ):
             model.on_change(key, lambda attr, old, new, change=change: self.show(**change(new)))
+
+    def _listen(self) -> None:
+        p = self.parts
         self.canvas.marks.on_change("data", lambda attr, old, new: self._marked())
         p.clear.on_click(lambda: self.canvas.place([]))
         p.csv.on_click(self._save)
@@ -125,14 +123,9 @@ class ResultPage:
         self.show()
         if self.view.marks:
             self._read_curves()
-        advance = partial(self._while_watched, lambda: self.progress.advance(self.result))
-        self.document.add_periodic_callback(advance, _TICK)
+        every(_TICK, self.document, lambda: self.progress.advance(self.result), self.complain)
         for act in (self._grow, self._draw_progress):
-            self.document.add_periodic_callback(partial(self._while_watched, act), _IDLE)
-
-    def _while_watched(self, act: Callable[[], None]) -> None:
-        if watched(self.document):
-            guarded(act, self.complain)
+            every(_IDLE, self.document, act, self.complain)
 
     def complain(self, text: str) -> None:
         """Report an error; the page goes on."""
@@ -154,7 +147,7 @@ class ResultPage:
 
     def _blank(self, text: str) -> None:
         """Show an error and nothing of the view that cannot be drawn, nor of the one before it."""
-        self.values, self._key = None, ("", -1, -1)
+        self.values = None
         self.canvas.clear()
         self.directions.hide()
         self._read_out()
@@ -164,16 +157,22 @@ class ResultPage:
 
     def _draw(self) -> None:
         view, field = self.view, self.fields.all[self.view.field]
-        values = self.values = self._read()
+        values = self.values = self._read(view.field, view.frame, self._changes)
         picture, remark = self.pictures.frame(view.frame) if view.over == "deformed" else (self.pictures.reference, "")
-        ends, colours = self._ends(values), palette(palette_name(field.kind, symmetric=self._symmetric))
         if view.range == "hand" and (self.parts.low.value, self.parts.high.value) != (view.low, view.high):
             remark = f"The colours go from {view.low:g} to {view.high:g}: the lowest number must be below the highest."
-        nodes, window, around = self._nodes(values), self.canvas.window, AROUND[self.dark]
-        over = (nodes, self.result.elements, values.values)
-        options: dict[str, Any] = {"opacity": view.opacity, "stepped": field.stepped, "around": around}
-        self.canvas.show(paint(window, picture, over, ends, colours, **options))
-        self.canvas.colour(ends, colours, field.label)
+        nodes, colours = self._nodes(values), palette(palette_name(field.kind, symmetric=self._symmetric))
+        over = Overlay(
+            nodes=nodes,
+            elements=self.result.elements,
+            values=values.values,
+            ends=self._ends(values),
+            colours=colours,
+            opacity=view.opacity,
+            stepped=field.stepped,
+        )
+        self.canvas.show(paint(self.canvas.window, picture, over, AROUND[self.dark]))
+        self.canvas.colour(over.ends, colours, field.label)
         self.parts.low.visible = self.parts.high.visible = view.range == "hand"
         self.parts.symmetric.visible = field.signed and view.range != "hand"
         self.parts.description.text = frame_text(self.result, view.frame, field, values, remark)
@@ -190,14 +189,6 @@ class ResultPage:
         """Draw another part of the image."""
         wanted = self.canvas.wanted
         self.show(window=() if wanted == Canvas.around(self.result.nodes) else wanted)
-
-    def _read(self) -> Values:
-        """Read the field in the frame, unless it was read and has not been measured since."""
-        key = (self.view.field, self.view.frame, self._changes)
-        if self.values is None or key != self._key:
-            read, self._key = self.fields.read(self.view.field, self.view.frame), key
-            return read
-        return self.values
 
     @property
     def _symmetric(self) -> bool:

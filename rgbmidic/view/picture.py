@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -14,7 +13,18 @@ from rgbmidic._kernels.interpolation import paint_field
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.typing import AnyArray, FloatArray
 
-__all__ = ["AROUND", "Picture", "Window", "element_at", "grey_picture", "paint", "palette", "palette_name", "stretched"]
+__all__ = [
+    "AROUND",
+    "Overlay",
+    "Picture",
+    "Window",
+    "element_at",
+    "grey_picture",
+    "paint",
+    "palette",
+    "palette_name",
+    "stretched",
+]
 
 Picture = npt.NDArray[np.uint8]
 """A grey picture (H, W)."""
@@ -82,27 +92,18 @@ class Window:
         return (points[:, 0] - self.left) / across - 0.5, (points[:, 1] - self.top) / down - 0.5
 
 
-def paint(
-    window: Window,
-    picture: AnyArray,
-    field: tuple[FloatArray, npt.NDArray[np.int32], FloatArray] | None,
-    ends: tuple[float, float],
-    colours: Sequence[str],
-    *,
-    opacity: float,
-    stepped: bool = False,
-    around: int = 40,
-) -> npt.NDArray[np.uint32]:
-    """Paint a field over a grey picture as the window shows it.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Overlay:
+    """A nodal field as it is painted over an image.
 
-    Parameters
+    Attributes
     ----------
-    window
-        Part of the image and size of the screen.
-    picture : ndarray, shape (H, W), uint8
-        The image.
-    field
-        Places (N, 2) of the nodes in px, elements (E, 3), values (N,); None: the picture alone.
+    nodes : ndarray, shape (N, 2)
+        Places of the nodes in px.
+    elements : ndarray, shape (E, 3)
+        Nodes of the triangles.
+    values : ndarray, shape (N,)
+        Values at the nodes; triangles with a NaN are not painted.
     ends
         Values of the first and the last colour.
     colours
@@ -111,6 +112,28 @@ def paint(
         Opacity of the field, from 0 to 1.
     stepped
         Whether values between those of two nodes mean nothing.
+    """
+
+    nodes: FloatArray
+    elements: npt.NDArray[np.int32]
+    values: FloatArray
+    ends: tuple[float, float]
+    colours: tuple[str, ...]
+    opacity: float = 1.0
+    stepped: bool = False
+
+
+def paint(window: Window, picture: AnyArray, over: Overlay | None = None, around: int = 40) -> npt.NDArray[np.uint32]:
+    """Paint a grey picture, and a field over it, as the window shows them.
+
+    Parameters
+    ----------
+    window
+        Part of the image and size of the screen.
+    picture : ndarray, shape (H, W), uint8
+        The image.
+    over
+        The field; None: the picture alone.
     around
         Grey level outside the image.
 
@@ -120,12 +143,12 @@ def paint(
         Red, green, blue, 255, the lowest byte first; the first row is the top.
     """
     grey = _resampled(window, picture, around)
+    if over is None:
+        return grey * np.uint32(0x010101) | np.uint32(0xFF000000)
     out = np.empty(grey.shape, dtype=np.uint32)
-    nodes, elements, values = field or (np.zeros((1, 2)), np.zeros((0, 3), dtype=np.int32), np.zeros(1))
-    x, y = window.place(nodes)
-    grey_part = round(256 * (1 - opacity))
-    packed = _packed(tuple(colours), grey_part)
-    paint_field(out, grey, x, y, elements, values, *map(float, ends), packed, grey_part, stepped)
+    (x, y), grey_part = window.place(over.nodes), round(256 * (1 - over.opacity))
+    packed = _packed(over.colours, grey_part)
+    paint_field(out, grey, x, y, over.elements, over.values, *map(float, over.ends), packed, grey_part, over.stepped)
     return out
 
 
@@ -179,8 +202,8 @@ def grey_picture(frame: Mosaic | ChannelFrame) -> Picture:
 
 def stretched(image: AnyArray) -> Picture:
     """Stretch an image (H, W) between its 1 % and 99 % quantiles, of every fourth pixel, to 0 to 255; NaN is 0."""
-    known = image[::4, ::4][np.isfinite(image[::4, ::4])]
-    low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 1.0)
+    finite = image[::4, ::4][np.isfinite(image[::4, ::4])]
+    low, high = np.percentile(finite, [1, 99]) if finite.size else (0.0, 1.0)
     return np.asarray(np.clip(255 * (np.nan_to_num(image) - low) / max(high - low, 1e-6), 0, 255), dtype=np.uint8)
 
 

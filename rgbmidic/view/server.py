@@ -10,7 +10,6 @@ import secrets
 import webbrowser
 from collections.abc import Callable, Mapping
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,7 @@ from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.view.address import ViewState
 from rgbmidic.view.curves import Progress
 from rgbmidic.view.fields import Fields
+from rgbmidic.view.models import page_file
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup_panel import Run
 
@@ -41,7 +41,7 @@ __all__ = ["serve", "start"]
 
 _HOST = "127.0.0.1"
 _FORGOTTEN = 15_000
-"""Ms after which the data of a closed page are freed. Chosen: a page that is loaded anew takes less."""
+"""Ms after which the data of a closed page are freed: a page that is loaded anew takes less."""
 _BREATH = 0.05
 """Seconds for other pages after each page that is freed: an answer takes as long."""
 _THEMES = {"dark": "dark_minimal"}
@@ -190,10 +190,7 @@ def _place(document: Document, roots: Mapping[str, Model], title: str, theme: st
     if theme in _THEMES:
         document.theme = _THEMES[theme]
     document.title = title
-    page, style, script = (
-        files("rgbmidic.view").joinpath(name).read_text(encoding="utf-8")
-        for name in ("page.html", "page.css", "keys.js")
-    )
+    page, style, script = map(page_file, ("page.html", "page.css", "page.js"))
     document.template = get_env().from_string(page)
     document.template_variables.update(
         theme=theme if theme in ("light", "dark") else "", areas=list(roots), style=style, script=script

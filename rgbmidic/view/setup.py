@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.layouts import column
-from bokeh.models import ColumnDataSource, CustomJS
+from bokeh.models import ColumnDataSource
 
 from rgbmidic.lab.inspection import Inspection
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -22,10 +21,10 @@ from rgbmidic.report.style import colour_range
 from rgbmidic.settings import RegionSettings, read_section
 from rgbmidic.view.canvas import Canvas, Tiles
 from rgbmidic.view.draft import HOLES, OUTLINES, Draft, RegionDrawing, marks_of
-from rgbmidic.view.fields import guarded, warning, watched
-from rgbmidic.view.models import TOOL, SharedState
-from rgbmidic.view.picture import AROUND, paint, palette
-from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, inspected, pictures, side_by_side
+from rgbmidic.view.fields import Background, every, guarded, warning
+from rgbmidic.view.models import SharedState, script
+from rgbmidic.view.picture import AROUND, Overlay, paint, palette
+from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, pictures, side_by_side
 
 __all__ = ["SetupPage"]
 
@@ -35,7 +34,6 @@ _TICK = 500
 """Ms between two reports of the run."""
 _EXPECTED = "expected uncertainty"
 _GLARE = np.uint32(0xFF2030FF)
-_OTHER = f"if (cb_obj.active === null) return; {TOOL}; other.active = null"
 _HELP = (
     "1. Choose a shape and click on the frame: Rectangle (two opposite corners), Polygon, Circle (centre, then "
     "a place on it); holes likewise. Marks can be dragged; Backspace removes a chosen one.<br>2. Choose the element "
@@ -63,17 +61,15 @@ class SetupPage:
         self.source = DraftFrames.of(draft)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
-        self._inspected = self._number = 0
+        self._inspected = 0
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.state = SharedState(name="state", asked=reference, shown=reference)
         self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
-        self.tiles, self._reader = Tiles(), ThreadPoolExecutor(1)
+        self.tiles, self._reader = Tiles(), Background(document)
         rows, columns = self.source.shape
         self.canvas = Canvas(document, (*OUTLINES, *HOLES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
-        self._edges = ColumnDataSource({"xs": [], "ys": []})
-        self.canvas.plot.multi_line(
-            "xs", "ys", source=self._edges, line_color="#ffd166", line_width=0.7, line_alpha=0.7
-        )
+        self._edges, thin = ColumnDataSource({"xs": [], "ys": []}), {"line_width": 0.7, "line_alpha": 0.7}
+        self.canvas.plot.multi_line("xs", "ys", source=self._edges, line_color="#ffd166", **thin)
         marks = () if draft.region is None else marks_of(draft.region)
         self.drawing = RegionDrawing(document, self.canvas, marks, self._remesh)
         self._listen()
@@ -97,19 +93,21 @@ class SetupPage:
         ):  # fmt: skip
             button.on_click(partial(self._guarded, act))
         p.ask(self.state)
-        p.mode.js_on_change("active", CustomJS(args={"tools": tools[:4], "other": p.hole}, code=_OTHER))
-        p.hole.js_on_change("active", CustomJS(args={"tools": tools[4:], "other": p.mode}, code=_OTHER))
+        p.mode.js_on_change("active", script("choose", group=p.mode, tools=tools[:4], other=p.hole))
+        p.hole.js_on_change("active", script("choose", group=p.hole, tools=tools[4:], other=p.mode))
         self.document.on_event(DocumentReady, lambda event: self._ready())
-        self.document.add_periodic_callback(lambda: self._tick() if watched(self.document) else None, _TICK)
-        self.document.on_session_destroyed(lambda context: self._reader.shutdown(wait=False, cancel_futures=True))
+        every(_TICK, self.document, self._tick, self._complain)
 
     def _ready(self) -> None:
         self.canvas.resize()
         self.show()
         self.drawing.draw()
 
+    def _complain(self, text: str) -> None:
+        self.parts.message.text = warning(text)
+
     def _guarded(self, act: Callable[[], None]) -> None:
-        guarded(act, lambda text: self.parts.message.update(text=warning(text)))
+        guarded(act, self._complain)
 
     def show(self) -> None:
         """Draw the picture."""
@@ -123,25 +121,29 @@ class SetupPage:
         raw, full = self.source.raw(index)
         chosen = self.parts.picture.value
         picture = self.pictures.get(chosen, raw)
-        field, ends = None, (0.0, 1.0)
-        if chosen == _EXPECTED and self.inspection is not None:
-            ends = colour_range(self.inspection.std[np.isfinite(self.inspection.std)])
-            field = (self.inspection.nodes, self.inspection.elements, self.inspection.std)
-        colours, window = palette("plasma"), self.canvas.window
-        image = paint(window, picture, field, ends, colours, opacity=0.8, around=AROUND[self.dark])
+        over, ends, colours, window = None, (0.0, 1.0), palette("plasma"), self.canvas.window
+        if chosen == _EXPECTED and (found := self.inspection) is not None:
+            ends = colour_range(found.prediction.std[np.isfinite(found.prediction.std)])
+            mesh: dict[str, Any] = {
+                "nodes": found.mesh.nodes,
+                "elements": found.mesh.elements,
+                "values": found.prediction.std,
+            }
+            over = Overlay(**mesh, ends=ends, colours=colours, opacity=0.8)
+        image = paint(window, picture, over, AROUND[self.dark])
         if self.parts.glare.active:
-            over = paint(window, full.astype(np.uint8) * 255, None, ends, colours, opacity=0, around=0)
-            image = np.where((over & 0xFF) > 64, _GLARE, image)
+            saturated = paint(window, full.astype(np.uint8) * 255, around=0)
+            image = np.where((saturated & 0xFF) > 64, _GLARE, image)
         self.canvas.show(image)
-        title = f"{chosen} (px)" if field else chosen
+        title = f"{chosen} (px)" if over else chosen
         if chosen != RAW and index != self._inspected:  # what was inspected stays while other frames are looked at
             title += f", of frame {self._inspected}: {self.source.series.name(self._inspected)}"
         self.canvas.colour(ends, colours, title)
-        self.canvas.bar.visible = field is not None
+        self.canvas.bar.visible = over is not None
 
     def _remesh(self) -> None:
         """Draw the mesh of the region; drop the inspection, of another region, element size or calibration."""
-        self._number += 1
+        self._reader.drop()
         if self.inspection is not None:
             self.inspection, self.pictures = None, {}
             self.tiles.plot.visible = False
@@ -171,19 +173,16 @@ class SetupPage:
             return
         self.parts.message.text = "inspecting …"
         index, size = int(self.parts.frame.value), float(self.parts.size.value)
-        task = self._reader.submit(lambda: inspected(self.source, index, self._region(content), size))
-        have = partial(self._guarded, partial(self._have, task, index, self._number))
-        task.add_done_callback(lambda _: self.document.add_next_tick_callback(have))
+        work = partial(self.source.inspected, index, self._region(content), size)
+        self._reader.ask(work, lambda found: self._guarded(partial(self._have, found, index)))
 
-    def _have(self, task: Future[Inspection], index: int, number: int) -> None:
-        if number != self._number:
-            return
-        found, self._inspected = task.result(), index
+    def _have(self, inspected: Callable[[], Inspection], index: int) -> None:
+        found, self._inspected = inspected(), index
         self.inspection = found
         self.pictures = pictures(found, self.source.shape)
         self.tiles.show(side_by_side(found, self.pictures, self.source.raw(index)[0]))
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
-        known = found.std[np.isfinite(found.std)]
+        known = found.prediction.std[np.isfinite(found.prediction.std)]
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
@@ -230,8 +229,5 @@ class SetupPage:
 
     def _tick(self) -> None:
         if self.runs:
-            run = self.runs[-1]
-            link = (
-                '<br><a id="result" href="result">look at the result as it grows</a>' if run.result is not None else ""
-            )
-            self.parts.ran.text = html.escape(run.summary()) + link
+            run, link = self.runs[-1], '<br><a id="result" href="result">look at the result as it grows</a>'
+            self.parts.ran.text = html.escape(run.summary()) + (link if run.result is not None else "")

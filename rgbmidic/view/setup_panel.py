@@ -9,7 +9,7 @@ import tempfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Self
+from typing import IO, Any, Self
 
 import bokeh.models as bk
 import numpy as np
@@ -27,7 +27,7 @@ from rgbmidic.view.draft import Draft
 from rgbmidic.view.models import Controls
 from rgbmidic.view.picture import Picture, grey_picture, stretched
 
-__all__ = ["RAW", "DraftFrames", "Run", "SetupControls", "inspected", "pictures", "side_by_side"]
+__all__ = ["RAW", "DraftFrames", "Run", "SetupControls", "pictures", "side_by_side"]
 
 RAW = "raw frame"
 
@@ -84,12 +84,10 @@ class DraftFrames:
         full = frame.values >= frame.white_level
         return grey_picture(frame), np.asarray(full if full.ndim == 2 else full.any(axis=0))
 
-
-def inspected(source: DraftFrames, index: int, region: Region, element_size: float) -> Inspection:
-    """Inspect a frame before the test, as `inspect_frame` does."""
-    calibration = source.calibration
-    name, frame = source.series.name(index), source.series.read(index)
-    return inspect_frame(frame, calibration=calibration, region=region, element_size=element_size, name=name)
+    def inspected(self, index: int, region: Region, element_size: float) -> Inspection:
+        """Inspect a frame before the test, as `inspect_frame` does."""
+        options: dict[str, Any] = {"region": region, "element_size": element_size, "name": self.series.name(index)}
+        return inspect_frame(self.series.read(index), calibration=self.calibration, **options)
 
 
 def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, Picture]:

@@ -1,6 +1,7 @@
 """How much each light counts at each pixel."""
 
-from rgbmidic.weights.light_weights import LightWeights, MaskWeights, prepare_weights
+from rgbmidic.weights.light_weights import LightWeights, MaskWeights, precision_method, prepare_weights
+from rgbmidic.weights.statistics import Statistics
 from rgbmidic.weights.threshold import (
     DisturbedZone,
     SetUpThreshold,
@@ -15,8 +16,10 @@ __all__ = [
     "LightWeights",
     "MaskWeights",
     "SetUpThreshold",
+    "Statistics",
     "blurred",
     "disturbed_zone",
+    "precision_method",
     "prepare_weights",
     "set_up_threshold",
     "threshold_weights",

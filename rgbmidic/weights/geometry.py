@@ -120,13 +120,12 @@ class GeometryWeights:
 
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
         """Weights (k, H, W) of frame `index` compared with the first reference frame."""
-        return np.asarray(images.valid * self._predicted(self._state(index), images))
-
-    def _predicted(self, state: State, images: IlluminationImages) -> FloatImage:
+        state = self._state(index)
         if self.limit_deg is not None:
-            return self._binary(state, images)
+            return np.asarray(images.valid * self._binary(state, images))
         before, after = self._zones(self._state(self.reference_frames[0]), state), self._zones(state, state)
-        return self._at_pixels(self.instrument.weights(before, after, known=bool(self.states)), images)
+        weights = self.instrument.weights(before, after, known=bool(self.states))
+        return np.asarray(images.valid * self._at_pixels(weights, images))
 
     def _binary(self, state: State, images: IlluminationImages) -> FloatImage:
         assert self.limit_deg is not None

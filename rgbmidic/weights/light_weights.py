@@ -7,24 +7,25 @@ pixel has moved to; the solve brings the latter back.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.correlation import PrecisionMethod
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.frames import read_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatImage
-from rgbmidic.weights.geometry import GeometryWeights
+from rgbmidic.weights.statistics import Statistics, ValidPixels
 from rgbmidic.weights.threshold import ThresholdWeights, automatic_weights
 
-__all__ = ["LightWeights", "MaskWeights", "ValidPixels", "prepare_weights"]
+__all__ = ["LightWeights", "MaskWeights", "precision_method", "prepare_weights"]
 
 
 class LightWeights(Protocol):
@@ -33,7 +34,8 @@ class LightWeights(Protocol):
     It may also have
 
     - ``notes``: numbers that were found out about the weights, by name, for the provenance;
-    - ``describe()``: a text that says what they are; another text is another test, which `resume` refuses.
+    - ``describe()``: a text that says what they are; another text is another test, which `resume` refuses;
+    - ``precision(residual)``: a factor on them, learnt from the residual (`rgbmidic.correlation.PrecisionMethod`).
     """
 
     def reference(self, images: IlluminationImages) -> FloatImage:
@@ -43,24 +45,6 @@ class LightWeights(Protocol):
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
         """Weights of the images of frame `index`."""
         ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ValidPixels:
-    """Every valid pixel counts fully: for weights by statistics, which come from the residual in the solve, and none.
-
-    A `LightWeights`.
-    """
-
-    notes: ClassVar[Mapping[str, float]] = {}
-
-    def reference(self, images: IlluminationImages) -> FloatImage:
-        """1 where an image is valid."""
-        return images.valid.astype(np.float32)
-
-    def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
-        """1 where an image is valid."""
-        return images.valid.astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,6 +139,13 @@ def _size(image: FloatImage) -> str:
     return f"{image.shape[-1]} x {image.shape[-2]}"
 
 
+def precision_method(weights: Any, method: str) -> PrecisionMethod | None:
+    """What learns from the residual: the `weights`, or the statistics where `method` is that; None if nothing does."""
+    if hasattr(weights, "precision"):
+        return weights  # type: ignore[no-any-return]
+    return Statistics() if method == "statistics" else None
+
+
 def prepare_weights(
     settings: TestSettings,
     reference: IlluminationImages,
@@ -191,6 +182,8 @@ def prepare_weights(
     """
     weights = settings.weights
     if weights.method == "geometry":
+        from rgbmidic.weights.geometry import GeometryWeights  # the scene, which no other method needs
+
         return GeometryWeights.prepare(settings, lights=reference.names, shape=shape or reference.shape, frames=frames)
     if weights.method == "images":
         masks = MaskWeights.read(weights.images)
@@ -202,7 +195,7 @@ def prepare_weights(
             )
         return masks
     if weights.method != "threshold":
-        return ValidPixels()
+        return Statistics() if weights.method == "statistics" else ValidPixels()
     if weights.threshold == "auto":
         return automatic_weights(settings, reference, region, frames=frames, images_of=images_of)
     return ThresholdWeights(threshold=weights.threshold, blur=weights.blur)

@@ -24,12 +24,12 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from rgbmidic.correlation import Status, correlate
+from rgbmidic.correlation import Deformed, Reference, Start, Status, track
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.fields import at_pixels, high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.settings import ELEMENT_SIZE, TestSettings
+from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
 
 __all__ = [
@@ -178,7 +178,11 @@ def disturbed_zone(high_passed: FloatArray, centre: tuple[float, float]) -> Dist
     distance = np.hypot(columns - centre[0], rows - centre[1])
     if not rows.size or distance.max() < 3 * RING:
         raise InputError(f"the measured field does not reach {3 * RING:g} px from the reflection at {centre}")
-    radii, profile = _ring_profile(distance, high_passed[rows, columns])
+    ring = (distance / RING).astype(int)
+    count = np.bincount(ring)
+    full = count >= RING**2  # rings that hold enough pixels to tell
+    radii = np.bincount(ring, weights=distance)[full] / count[full]
+    profile = np.sqrt(np.bincount(ring, weights=high_passed[rows, columns] ** 2)[full] / count[full])
     unaffected = float(np.median(profile[radii > _FAR * distance.max()]))
     near = max(1, int((radii < _NEAR * distance.max()).sum()))
     peak = int(profile[:near].argmax())
@@ -216,6 +220,8 @@ def set_up_threshold(
     InputError
         The displacement is nowhere disturbed: the set-up needs no weights, or the motion is too small to show it.
     """
+    from scipy.ndimage import map_coordinates
+
     image = blurred(images, blur)[light].astype(np.float64) / images.full_scale
     smooth = np.where(np.isfinite(high_passed), blurred(images, 2 * blur)[light], -np.inf)
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
@@ -225,17 +231,11 @@ def set_up_threshold(
             f"no disturbed zone around {zone.centre}: P is {zone.contrast * zone.unaffected:.2g} px there and "
             f"{zone.unaffected:.2g} px away from it, less than {DISTURBED:g} times as much"
         )
-    level = _mean_on_circle(image, zone)
+    # the mean over the part of the zone's perimeter that lies inside the image
+    angle = np.linspace(0, 2 * np.pi, max(16, int(2 * np.pi * zone.radius)), endpoint=False)
+    place = [zone.centre[1] + zone.radius * np.sin(angle), zone.centre[0] + zone.radius * np.cos(angle)]
+    level = float(np.nanmean(map_coordinates(image, place, order=1, mode="constant", cval=np.nan)))
     return SetUpThreshold(zone=zone, contour=level, value=level - MARGIN)
-
-
-def _ring_profile(distance: FloatArray, ripple: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean radius and root mean square of the rings that hold enough pixels to tell."""
-    index = (distance / RING).astype(int)
-    count = np.bincount(index)
-    full = count >= RING**2
-    radii = np.bincount(index, weights=distance)[full] / count[full]
-    return radii, np.sqrt(np.bincount(index, weights=ripple**2)[full] / count[full])
 
 
 def _first_crossing(radii: FloatArray, profile: FloatArray, limit: float, peak: int) -> float:
@@ -248,15 +248,6 @@ def _first_crossing(radii: FloatArray, profile: FloatArray, limit: float, peak: 
             share = (here - limit) / (here - following)
             return float(radii[inner] + share * (radii[inner + 1] - radii[inner]))
     return float(radii[-1])
-
-
-def _mean_on_circle(image: FloatArray, zone: DisturbedZone) -> float:
-    """Mean of an image over the part of the zone's perimeter that lies inside it."""
-    from scipy.ndimage import map_coordinates
-
-    angle = np.linspace(0, 2 * np.pi, max(16, int(2 * np.pi * zone.radius)), endpoint=False)
-    place = [zone.centre[1] + zone.radius * np.sin(angle), zone.centre[0] + zone.radius * np.cos(angle)]
-    return float(np.nanmean(map_coordinates(image, place, order=1, mode="constant", cval=np.nan)))
 
 
 FALLBACK = 2 / 3
@@ -348,17 +339,12 @@ def _displacement(
     prefilter: str,
 ) -> list[tuple[str, FloatImage]]:
     """Displacement u and v (H, W) of one light alone, without weights; the smaller shows a disturbance best."""
-    solution = correlate(
-        reference.values[light],
-        deformed.values[light],
-        region=region,
-        element_size=element_size,
-        prefilter=prefilter,
-        statistics=False,
-    )
+    mesh = Tri3Mesh.from_region(region, element_size)
+    before = Reference.prepare(reference.values[light : light + 1], region, mesh=mesh, prefilter=prefilter)
+    after = Deformed.prepare(deformed.values[light : light + 1], prefilter=prefilter)
+    solution = track(before, after, Start(displacement=None), SolverSettings(), None)
     if solution.status is Status.FAILED:
         logger.info("%s alone, without weights: %s", reference.names[light], solution.reason)
         return []
-    mesh = Tri3Mesh(nodes=solution.nodes, elements=solution.elements)
     fields = at_pixels(mesh, solution.displacement, reference.shape)
     return list(zip("uv", fields, strict=True))

@@ -210,7 +210,7 @@ def test_a_damaged_frame_is_told_and_the_page_goes_on(driver, tmp_path):
     made = make_result(tmp_path / "result", frames=3)
     file = next((made.path / "solution").glob("*.frames"))
     content = bytearray(file.read_bytes())
-    content[int(made.table.start[1]) + 3] ^= 255
+    content[int(made.table.places["start"][1]) + 3] ^= 255
     file.write_bytes(content)
     with serving(made.path) as told:
         page = Page(driver, told)

@@ -29,7 +29,7 @@ def from_captures(scene):
         light.name: [record(target, camera, lights, seed=100 * i + k, on=(light.name,)) for k in range(4)]
         for i, light in enumerate(lights)
     }
-    dark = dark_frames(camera, count=4, seed=9)
+    dark = dark_frames(scene, count=4, seed=9)
     crosstalk = estimate_crosstalk(
         {name: [block_means(frame) for frame in frames] for name, frames in singles.items()},
         [block_means(frame) for frame in dark],

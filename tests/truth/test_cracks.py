@@ -13,6 +13,7 @@ from rgbmidic import NodeStatus, Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference, Start, fill, track
 from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.settings import SolverSettings
+from rgbmidic.weights import Statistics
 
 SHAPE = (240, 320)
 REGION = (10, 10, 309, 229)
@@ -124,7 +125,7 @@ def followed(frames):
     start, solutions = Start(displacement=None), []
     for number, image in enumerate(frames):
         deformed = Deformed.prepare(as_light_stack(noisy(image, 2 + number), ""), prefilter="binomial")
-        solutions.append(track(reference, deformed, start, SolverSettings()))
+        solutions.append(track(reference, deformed, start, SolverSettings(), Statistics()))
         start = start.after(reference.mesh, solutions[-1].displacement, solutions[-1].measured)
     return solutions
 

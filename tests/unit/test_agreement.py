@@ -1,4 +1,4 @@
-"""What is said twice must agree: the table of docs/test-file.md, row by row and pair by pair."""
+"""What is stated twice must agree: the table of docs/test-file.md, row by row and pair by pair."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from rgbmidic_calibration import cli as calibrate
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "test-file.md"
 LIGHTS = ("red", "green", "blue")
-TABLE = PAGE.read_text(encoding="utf-8").partition("## What is said twice")[2]
+TABLE = PAGE.read_text(encoding="utf-8").partition("## What is stated twice")[2]
 ROWS = {row[1]: row[2].split("; ") for row in re.finditer(r"^\| ([\w ]+) \| ([^|]+) \| error", TABLE, re.M)}
 """Who states what, by the table."""
 CAMERA = {

@@ -326,7 +326,7 @@ def test_export_of_a_damaged_result(command: Run, tmp_path: Path, caplog: pytest
     result = make_result(tmp_path / "out", frames=3)
     file = result.path / "solution" / "000000.frames"
     content = bytearray(file.read_bytes())
-    content[int(result.table.start[1] + result.table.length[1] // 2)] ^= 16
+    content[int(result.table.places["start"][1] + result.table.places["length"][1] // 2)] ^= 16
     file.write_bytes(content)
     status, _, error = command("export", result.path, "--out", tmp_path / "a.npz")
     assert status == 2

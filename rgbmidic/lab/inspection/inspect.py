@@ -15,36 +15,24 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME, ReflectionAwareDemosaicer
 from rgbmidic.illumination.frame_check import check_state
-from rgbmidic.illumination.images import DARK, REFLECTING, IlluminationImages, local_mean
+from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.illumination.unmixing import align, unmix
-from rgbmidic.lab.inspection.prediction import SeparationErrors, predict
-from rgbmidic.lab.inspection.results import BLIND, ChannelSummary, Inspection, LightSummary, Spread
+from rgbmidic.lab.inspection.prediction import CONTRAST_WIDTH, LocalContrast, Prediction, SeparationErrors, predict
+from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture, surroundings
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatImage
 
-__all__ = [
-    "SampleSummary",
-    "contrast_window",
-    "green_difference",
-    "hidden",
-    "inspect_files",
-    "inspect_frame",
-    "level_and_contrast",
-    "light_summaries",
-    "state_frames",
-]
+__all__ = ["inspect_files", "inspect_frame", "state_frames"]
 
 Frame = Mosaic | ChannelFrame
 Linear = Sequence[LinearMosaic | LinearChannels]
 Progress = Callable[[int, int, str], None]
-CONTRAST_WIDTH = (10.0, 40.0)
-"""Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
 
 
 def inspect_files(
@@ -54,9 +42,7 @@ def inspect_files(
     calibration: Path | str | None = None,
     frame: FrameSettings | None = None,
     region: Sequence[float] | None = None,
-    element_size: float | None = None,
-    accept: Sequence[str] | None = None,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> Inspection:
     """Inspect one frame on disk, or the frames of one state of lights fired in succession.
 
@@ -70,12 +56,10 @@ def inspect_files(
         Calibration file; instead of the test's.
     frame
         What the file does not state (its `path` is not used); instead of the test's.
-    region, element_size
-        (x0, y0, x1, y1) and side of the elements in px; instead of the test's, else the whole frame and 25.
-    accept
-        As in `inspect_frame`; instead of the test's.
-    progress
-        As in `inspect_frame`.
+    region
+        (x0, y0, x1, y1) in px; instead of the test's, else the whole frame.
+    **options
+        As in `inspect_frame`; those that are stated and not None replace the test's.
 
     Raises
     ------
@@ -92,18 +76,13 @@ def inspect_files(
     place = Region.from_rectangle(region, shape) if region is not None else None
     if place is None and test is not None:
         place = read_region(test.region, shape)
+    how: dict[str, Any] = {"name": " + ".join(legible(path.name) for path in paths)}
+    if test is not None:
+        how |= {"element_size": test.element_size, "accept": test.accept}
+        how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
+    how |= {key: value for key, value in options.items() if value is not None}
     try:
-        return inspect_frame(
-            frames,
-            calibration=known,
-            region=place,
-            element_size=element_size or (test.element_size if test else ELEMENT_SIZE),
-            demosaic=test.illumination.demosaic if test else "auto",
-            prefilter=test.solver.prefilter if test else "binomial",
-            name=" + ".join(legible(path.name) for path in paths),
-            accept=accept if accept is not None else (test.accept if test else ()),
-            progress=progress,
-        )
+        return inspect_frame(frames, calibration=known, region=place, **how)
     except InputError as error:
         raise FrameError(f"{' + '.join(map(str, paths))}: {error}") from None
 
@@ -168,56 +147,47 @@ def inspect_frame(
     contradictions = check_state(frames, known, region.mask, name, accept=accept)
     mesh, window = Tri3Mesh.from_region(region, element_size), surroundings(region)
     part = window.part_of(Window.whole(shape))
-    region = region.part(*part)
+    region, known = region.part(*part), known.cropped(window.origin, window.shape)
     cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
     linear = [linearise(shot, known.noise) for shot in cut]
-    channels = channels_of(linear)
     report(0, 3, "exposure, speckle and noise")
+    channels = channels_of(linear)
     samples = SampleSummary.of(channels, region.mask, known.noise, linear[0].full_scale)
-    crosstalk = known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
-    crosstalk = crosstalk.cropped(window.origin, window.shape)
     report(1, 3, "lights, and the errors of their separation")
-    names = known.registration.lights if known.registration else ()
-    separated, errors = _separated(linear, crosstalk, demosaic, samples.noise, names, np.random.default_rng(seed))
-    images = align(replace(separated, origin=window.origin, registration=known.registration))
+    separated, errors = _separated(linear, known, demosaic, samples.noise, np.random.default_rng(seed))
+    images = align(replace(separated, registration=known.registration))
     report(2, 3, "uncertainty to expect")
-    level, contrast = level_and_contrast(images, contrast_window(samples.channels))
-    index = _reflection_index(separated, contrast)
-    prediction = predict(
-        replace(mesh, nodes=mesh.nodes - window.origin),
-        region,
-        contrast=contrast,
-        level=level,
-        errors=errors,
-        texture=separated.texture or samples.texture,
-        prefilter=prefilter,
-    )
+    shown = LocalContrast.of(images, [channel.speckle_px for channel in samples.channels])
+    index = separated.reflection_index()
+    if index is None and len(images.names) > 1:  # the contrast that a light lacks to the best one
+        best = np.maximum(shown.contrast.max(axis=0), 1e-6)
+        index = np.asarray(1 - shown.contrast / best, dtype=np.float32)
+    texture, local = separated.texture or samples.texture, replace(mesh, nodes=mesh.nodes - window.origin)
+    prediction = predict(local, region, shown, errors, texture=texture, prefilter=prefilter)
     report(3, 3, "done")
-    single = not isinstance(linear[0], LinearMosaic) and len(linear[0].values) == 1
+    first = linear[0]
+    single = not isinstance(first, LinearMosaic) and len(first.values) == 1
     return Inspection(
         name=name,
-        kind="bayer" if isinstance(linear[0], LinearMosaic) else "monochrome" if single else "rgb",
+        kind="bayer" if isinstance(first, LinearMosaic) else "monochrome" if single else "rgb",
         channels=samples.channels,
-        lights=light_summaries(images, contrast, index, prediction.alone, region.mask),
+        lights=_light_summaries(images, shown.contrast, index, prediction, region.mask),
         frame_shape=shape,
         origin=window.origin,
         images=images,
         reflection_index=index,
         saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
         region=region.mask,
-        hidden=hidden(contrast, region.mask),
+        hidden=shown.hidden(region.mask),
         texture=separated.texture,
         noise=samples.noise,
         noise_known=known.noise is not None,
         contradictions=contradictions,
         crosstalk_known=single or known.crosstalk is not None,
         element_size=element_size,
-        nodes=mesh.nodes,
-        elements=mesh.elements,
-        std=prediction.std,
-        noise_std=prediction.noise,
-        sampling_std=prediction.mosaic,
-        greens=green_difference(linear[0]) if isinstance(linear[0], LinearMosaic) else 0.0,
+        mesh=mesh,
+        prediction=prediction,
+        greens=_green_difference(first) if isinstance(first, LinearMosaic) else 0.0,
     )
 
 
@@ -240,20 +210,13 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
 
 
 def _separated(
-    linear: Linear,
-    crosstalk: Crosstalk,
-    method: str,
-    noise: NoiseModel,
-    names: Sequence[str],
-    random: np.random.Generator,
+    linear: Linear, known: Calibration, method: str, noise: NoiseModel, random: np.random.Generator
 ) -> tuple[IlluminationImages, SeparationErrors]:
     """Separate a state as the test would, and draw the errors of that.
 
     Reflection index and speckle of a mosaic are those of the default method.
-
-    `names` are those of lights in succession, where they are known.
     """
-    first = linear[0]
+    first, crosstalk = linear[0], known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
     if isinstance(first, LinearMosaic):
         model = ReflectionAwareDemosaicer(crosstalk=crosstalk).reconstruct(first)
         images = reconstructed_lights(model, crosstalk)
@@ -262,20 +225,13 @@ def _separated(
             images = replace(other, reflection=images.reflection, texture=images.texture)
         return images, SeparationErrors.of_mosaic(first, model, crosstalk, method, noise, random)
     full = [frame for frame in linear if isinstance(frame, LinearChannels)]
+    names = known.registration.lights if known.registration else ()
 
     def lights(frames: Sequence[LinearChannels]) -> IlluminationImages:
         single = len(frames[0].values) == 1
         return IlluminationImages.in_succession(frames, names) if single else unmix(frames[0], crosstalk)
 
     return lights(full), SeparationErrors.of_channels(full, lights, noise, random)
-
-
-def _reflection_index(images: IlluminationImages, contrast: FloatImage) -> FloatImage | None:
-    """Reflection index of the separation, else the relative contrast that a light lacks to the best one."""
-    index = images.reflection_index()
-    if index is not None or len(contrast) == 1:
-        return index
-    return np.asarray(1 - contrast / np.maximum(contrast.max(axis=0), 1e-6), dtype=np.float32)
 
 
 def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
@@ -293,7 +249,7 @@ def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     return rows, columns
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class SampleSummary:
     """Figures of the samples of the channels, the camera noise, and the autocorrelation of the speckle."""
 
@@ -346,49 +302,17 @@ class SampleSummary:
             level = float(values.mean())
             low, high = np.quantile(values, [0.05, 0.95]).tolist()
             std = estimates[number] if estimates else float(noise.variance(np.array(level * full_scale))) ** 0.5
-            summaries.append(
-                ChannelSummary(
-                    name=channel.name,
-                    mean=level,
-                    low=low,
-                    high=high,
-                    saturated=saturated[number] / values.size,
-                    speckle_px=float("nan") if texture is None else texture.diameter,
-                    noise_dn=std,
-                )
-            )
+            clipped, size = saturated[number] / values.size, float("nan") if texture is None else texture.diameter
+            summaries.append(ChannelSummary(channel.name, level, low, high, clipped, size, std))
         sharpest = sorted((texture for texture in textures if texture), key=lambda texture: texture.diameter)
-        return cls(channels=tuple(summaries), noise=noise, texture=sharpest[len(sharpest) // 2] if sharpest else None)
+        return cls(tuple(summaries), noise, sharpest[len(sharpest) // 2] if sharpest else None)
 
 
-def contrast_window(channels: tuple[ChannelSummary, ...]) -> float:
-    """Return the standard deviation (px) of a window that holds many speckles."""
-    sizes = [channel.speckle_px for channel in channels if np.isfinite(channel.speckle_px)]
-    return float(np.clip(2.5 * np.median(sizes) if sizes else 0.0, *CONTRAST_WIDTH))
-
-
-def level_and_contrast(images: IlluminationImages, window: float) -> tuple[FloatImage, FloatImage]:
-    """Local mean of each light (k, H, W), and its local standard deviation over it, 0 where it is dark or unknown."""
-    level, contrast = np.zeros((2, *images.values.shape), dtype=np.float32)
-    for image, mean, relative in zip(images.values, level, contrast, strict=True):
-        mean[:] = np.nan_to_num(local_mean(image, window))
-        lit = np.isfinite(image) & (mean > DARK * images.full_scale)
-        square = local_mean(image**2, window)
-        relative[lit] = np.sqrt(np.maximum(square[lit] - mean[lit] ** 2, 0)) / mean[lit]
-    return level, contrast
-
-
-def hidden(contrast: FloatImage, inside: BoolArray) -> BoolArray:
-    """Where (H, W) no light has half the contrast that is usual in the region."""
-    best = contrast.max(axis=0)
-    return np.asarray(best < BLIND * np.quantile(best[inside], 0.9))
-
-
-def light_summaries(
+def _light_summaries(
     images: IlluminationImages,
     contrast: FloatImage,
     index: FloatImage | None,
-    alone: Sequence[FloatArray],
+    prediction: Prediction,
     inside: BoolArray,
 ) -> tuple[LightSummary, ...]:
     """Figures of each light in the region, from its contrast, its reflection index and its uncertainty alone."""
@@ -404,13 +328,13 @@ def light_summaries(
                 reflecting=None if index is None else float((index[j][inside] > REFLECTING).mean()),
                 valid=float(valid.mean()),
                 negative=float((mean < -0.002 * images.full_scale).mean()),
-                alone=Spread.of(alone[j]),
+                alone=Spread.of(prediction.alone[j]),
             )
         )
     return tuple(summaries)
 
 
-def green_difference(mosaic: LinearMosaic) -> float:
+def _green_difference(mosaic: LinearMosaic) -> float:
     """Difference of the means of the two greens of a mosaic over their mean."""
     green = sampled_channels(mosaic.cfa, mosaic.values.shape) == 1
     first, second = (float(mosaic.values[row::2][green[row::2]].mean()) for row in (0, 1))

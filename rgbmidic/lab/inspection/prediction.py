@@ -23,7 +23,7 @@ from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.colour_factors import BLOCK, LEAST, MEAN_BLOCK, enlarged
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import SPARKLE_VARIANCE, Reconstruction
-from rgbmidic.illumination.images import IlluminationImages, local_mean
+from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
@@ -33,7 +33,7 @@ from rgbmidic.scene.forecast import expected_std, light_pull
 from rgbmidic.scene.speckle import SpeckleSpectrum, separated_phases
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Prediction", "SeparationErrors", "gaussian_field", "predict"]
+__all__ = ["CONTRAST_WIDTH", "LocalContrast", "Prediction", "SeparationErrors", "gaussian_field", "predict"]
 
 
 _GRID, _REACH = 64, 16
@@ -120,6 +120,46 @@ class SeparationErrors:
         return cls(noise=np.nan_to_num(noisy - quiet), mosaic=np.empty((0, *quiet.shape), dtype=np.float32))
 
 
+CONTRAST_WIDTH = (10.0, 40.0)
+"""Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
+BLIND = 0.5
+"""Fraction of the usual contrast that no light reaches where the specimen cannot be seen; chosen."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalContrast:
+    """Local statistics of the lights.
+
+    Attributes
+    ----------
+    level : ndarray, shape (k, H, W), float32
+        Local mean, DN.
+    contrast : ndarray, shape (k, H, W), float32
+        Local standard deviation in units of that mean, 0 where the light is dark or unknown.
+    """
+
+    level: FloatImage
+    contrast: FloatImage
+
+    @classmethod
+    def of(cls, images: IlluminationImages, speckles: Sequence[float]) -> LocalContrast:
+        """Statistics in windows that hold many speckles, of which the sizes (px) are known or NaN."""
+        sizes = [size for size in speckles if np.isfinite(size)]
+        window = float(np.clip(2.5 * np.median(sizes) if sizes else 0.0, *CONTRAST_WIDTH))
+        level, contrast = np.zeros((2, *images.values.shape), dtype=np.float32)
+        for image, mean, relative in zip(images.values, level, contrast, strict=True):
+            mean[:] = np.nan_to_num(local_mean(image, window))
+            lit = np.isfinite(image) & (mean > DARK * images.full_scale)
+            square = local_mean(image**2, window)
+            relative[lit] = np.sqrt(np.maximum(square[lit] - mean[lit] ** 2, 0)) / mean[lit]
+        return cls(level=level, contrast=contrast)
+
+    def hidden(self, inside: BoolArray) -> BoolArray:
+        """Where (H, W) no light has half the contrast that is usual in the region."""
+        best = self.contrast.max(axis=0)
+        return np.asarray(best < BLIND * np.quantile(best[inside], 0.9))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
     """Standard uncertainty of u, and of v, at the nodes (N,), px; NaN where a node is not measured.
@@ -143,10 +183,9 @@ class Prediction:
 def predict(
     mesh: Tri3Mesh,
     region: Region,
-    *,
-    contrast: FloatImage,
-    level: FloatImage,
+    lights: LocalContrast,
     errors: SeparationErrors,
+    *,
     texture: TextureModel | None,
     prefilter: str,
 ) -> Prediction:
@@ -156,9 +195,8 @@ def predict(
     ----------
     mesh, region
         Mesh of the measurement and its region, in px of the images.
-    contrast, level : ndarray, shape (k, H, W)
-        Local standard deviation of each light in units of its local mean, 0 where the light is not known; and that
-        mean, DN.
+    lights
+        Their local means and contrasts.
     errors
         Of one state, DN; those of the other state are as large and independent.
     texture
@@ -170,6 +208,7 @@ def predict(
     -------
     Prediction
     """
+    level, contrast = lights.level, lights.contrast
     if texture is None:
         unknown = np.full(len(mesh.nodes), np.nan)
         return Prediction(std=unknown, noise=unknown, mosaic=unknown, alone=(unknown,) * len(contrast))
@@ -231,12 +270,12 @@ def _drawn_channels(model: Reconstruction, shape: tuple[int, ...], random: np.ra
     sparkle = TextureModel(weights=(1.0,), widths=(float(np.sqrt(2 * SPARKLE_VARIANCE)),))
     channels = np.repeat(gaussian_field(texture, shape, random)[None], 3, axis=0)
     # by the median around: variances are cut off at zero, so that a mean would be too large
-    typical = median_filter(factors.private - LEAST, size=(1, TYPICAL, TYPICAL), mode="reflect")
+    typical = median_filter(factors.specific - LEAST, size=(1, TYPICAL, TYPICAL), mode="reflect")
     deviation = np.sqrt(enlarged(np.maximum(typical, 0), BLOCK, shape))
     for channel in range(3):
         if deviation[channel].any():
             coarse, fine = (gaussian_field(kind, shape, random) for kind in (texture, sparkle))
-            specific = np.sqrt(texture.private) * coarse + np.sqrt(1 - texture.private) * fine
+            specific = np.sqrt(texture.specific) * coarse + np.sqrt(1 - texture.specific) * fine
             channels[channel] += deviation[channel] * specific
     mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
     return np.asarray(mean + enlarged(_settled(factors.slope, BLOCK), BLOCK, shape) * channels, dtype=np.float32)

@@ -11,24 +11,16 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import check_folder, number_or_none, write_document
+from rgbmidic.lab import check_folder, number_or_none, write_findings
 from rgbmidic.lab.inspection import Inspection, Spread
-from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, save_figure
+from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "FILES",
-    "channel_rows",
-    "inspection_document",
-    "inspection_figure",
-    "light_rows",
-    "uncertainty_rows",
-    "write_inspection",
-]
+__all__ = ["FILES", "channel_rows", "inspection_document", "light_rows", "uncertainty_rows", "write_inspection"]
 
 FILES = ("inspection.json", "inspection.png")
 """What `write_inspection` writes."""
@@ -46,8 +38,7 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
         An inspection is already there, or the folder cannot be written.
     """
     check_folder(out, FILES, overwrite=overwrite)
-    write_document(inspection_document(inspection), out / "inspection.json")
-    save_figure(inspection_figure(inspection), out / "inspection.png")
+    write_findings(out, "inspection", inspection_document(inspection), _inspection_figure(inspection))
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
@@ -71,12 +62,10 @@ def light_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
 
 def uncertainty_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
     """Headings and rows: all lights together, its parts, each light alone."""
-    parts = {"all lights": Spread.of(inspection.std)}
+    expected = inspection.prediction
+    parts = {"all lights": Spread.of(expected.std)}
     if inspection.kind == "bayer":
-        parts |= {
-            "  from noise": Spread.of(inspection.noise_std),
-            "  from the mosaic": Spread.of(inspection.sampling_std),
-        }
+        parts |= {"  from noise": Spread.of(expected.noise), "  from the mosaic": Spread.of(expected.mosaic)}
     if len(inspection.lights) > 1:
         parts |= {f"{light.name} alone": light.alone for light in inspection.lights}
     rows = [[name, _text(spread.median, 4), _text(spread.q95, 4)] for name, spread in parts.items()]
@@ -100,19 +89,18 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "crosstalk_known": inspection.crosstalk_known,
         "noise_known": inspection.noise_known,
         "speckle_px": number_or_none(inspection.speckle_px),
-        "texture": None
-        if texture is None
-        else {
+        "texture": texture
+        and {
             "diameter_px": number_or_none(texture.diameter),
             "agreement_of_colours": texture.correlation,
-            "channel_specific_fraction": texture.private,
+            "channel_specific_fraction": texture.specific,
         },
         "reflects_from_index": REFLECTING,
         "channels": [_plain(channel) for channel in inspection.channels],
-        "lights": [_plain(light) | {"alone_std_px": _spread(light.alone)} for light in inspection.lights],
-        "std_px": _spread(Spread.of(inspection.std)),
-        "std_from_noise_px": _spread(Spread.of(inspection.noise_std)),
-        "std_from_mosaic_px": _spread(Spread.of(inspection.sampling_std)),
+        "lights": [_plain(light) | {"alone_std_px": _plain(light.alone)} for light in inspection.lights],
+        "std_px": _plain(Spread.of(inspection.prediction.std)),
+        "std_from_noise_px": _plain(Spread.of(inspection.prediction.noise)),
+        "std_from_mosaic_px": _plain(Spread.of(inspection.prediction.mosaic)),
         "nodes_not_measured": inspection.unmeasured,
         "warnings": [{"code": finding.code, "text": finding.text} for finding in inspection.findings],
     }
@@ -123,11 +111,7 @@ def _plain(summary: Any) -> dict[str, Any]:
     return {name: number_or_none(value) if isinstance(value, float) else value for name, value in values.items()}
 
 
-def _spread(spread: Spread) -> dict[str, float | None]:
-    return {"median": number_or_none(spread.median), "q95": number_or_none(spread.q95)}
-
-
-def inspection_figure(inspection: Inspection) -> Figure:
+def _inspection_figure(inspection: Inspection) -> Figure:
     """One page: lights, reflection index with its colour bar, then troubles, summary and predicted uncertainty."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -140,11 +124,17 @@ def inspection_figure(inspection: Inspection) -> Figure:
         figure = Figure(figsize=(8.6, min(rows * (panel * height / width + 0.45) + 0.6, 11.5)))
         figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.06)
         grid = figure.add_gridspec(rows, columns + 1, width_ratios=[*[1.0] * columns, 0.05])
-        for light in range(lights):
-            _draw_light(figure.add_subplot(grid[0, light]), inspection, light)
+        for column, (light, image) in enumerate(zip(inspection.lights, inspection.images.values, strict=True)):
+            known = _reduced(image)[np.isfinite(_reduced(image))]
+            low, high = np.percentile(known, [1, 99]) if known.size else (0, 1)
+            look = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-6), "interpolation": "auto"}
+            title = f"light {literal(light.name)}" if lights > 1 else "image"
+            _draw_image(figure.add_subplot(grid[0, column]), inspection, image, title, **look)
         if inspection.reflection_index is not None:
-            for light in range(lights):
-                shown = _draw_index(figure.add_subplot(grid[1, light]), inspection, light)
+            look = {"cmap": "inferno", "vmin": 0, "vmax": 1, "interpolation": "auto"}
+            for column, (light, index) in enumerate(zip(inspection.lights, inspection.reflection_index, strict=True)):
+                title = f"{literal(light.name)} reflects on {light.reflecting:.0%}"
+                shown = _draw_image(figure.add_subplot(grid[1, column]), inspection, index, title, **look)
             figure.colorbar(shown, cax=figure.add_subplot(grid[1, -1]), label="reflection index")
         _draw_trouble(figure.add_subplot(grid[-1, 0]), inspection)
         _draw_std(figure, figure.add_subplot(grid[-1, columns - 1]), figure.add_subplot(grid[-1, -1]), inspection)
@@ -154,25 +144,12 @@ def inspection_figure(inspection: Inspection) -> Figure:
     return figure
 
 
-def _draw_light(axis: Axes, inspection: Inspection, light: int) -> None:
-    image, name = _reduced(inspection.images.values[light]), inspection.lights[light].name
-    known = image[np.isfinite(image)]
-    low, high = np.percentile(known, [1, 99]) if known.size else (0, 1)
-    axis.set_facecolor("#e8590c")  # what is unknown
-    axis.imshow(
-        image, extent=_extent(inspection), cmap="gray", vmin=low, vmax=max(high, low + 1e-6), interpolation="auto"
-    )
-    axis.set_title(f"light {literal(name)}" if len(inspection.lights) > 1 else "image")
-    _frame_axis(axis, inspection, first=light == 0)
-
-
-def _draw_index(axis: Axes, inspection: Inspection, light: int) -> Any:
-    assert inspection.reflection_index is not None
-    summary = inspection.lights[light]
-    index = _reduced(inspection.reflection_index[light])
-    picture = axis.imshow(index, extent=_extent(inspection), cmap="inferno", vmin=0, vmax=1, interpolation="auto")
-    axis.set_title(f"{literal(summary.name)} reflects on {summary.reflecting:.0%}")
-    _frame_axis(axis, inspection, first=light == 0)
+def _draw_image(axis: Axes, inspection: Inspection, image: AnyArray, title: str, **look: Any) -> Any:
+    """An image of the part that is looked at, with the outline of the region; colour for what is unknown."""
+    axis.set_facecolor("#e8590c")
+    picture = axis.imshow(_reduced(image), extent=_extent(inspection), **look)
+    axis.set_title(title)
+    _frame_axis(axis, inspection)
     return picture
 
 
@@ -202,23 +179,24 @@ def _draw_trouble(axis: Axes, inspection: Inspection) -> None:
     axis.imshow(picture, extent=_extent(inspection), interpolation="nearest")
     axis.set_title("samples in the region")
     axis.legend(handles=handles, loc="upper left", fontsize=8, handletextpad=0.2, **_BOX)
-    _frame_axis(axis, inspection, first=True)
+    _frame_axis(axis, inspection)
 
 
 def _draw_std(figure: Figure, axis: Axes, bar: Axes, inspection: Inspection) -> None:
     """Predicted uncertainty of u and v, linear inside each element."""
     from matplotlib.tri import Triangulation
 
-    std, known = inspection.std, np.isfinite(inspection.std)
+    std, mesh = inspection.prediction.std, inspection.mesh
+    known = np.isfinite(std)
     axis.set_title("predicted uncertainty")
     axis.set_facecolor("0.85")
-    _frame_axis(axis, inspection, first=False)
+    _frame_axis(axis, inspection)
     if not known.any():
         axis.text(0.5, 0.5, "nothing can be measured", transform=axis.transAxes, ha="center", va="center")
         bar.axis("off")
         return
-    blank = ~known[inspection.elements].all(axis=1)
-    grid = Triangulation(inspection.nodes[:, 0], inspection.nodes[:, 1], triangles=inspection.elements, mask=blank)
+    blank = ~known[mesh.elements].all(axis=1)
+    grid = Triangulation(mesh.nodes[:, 0], mesh.nodes[:, 1], triangles=mesh.elements, mask=blank)
     low, high = colour_range(std[known])
     picture = axis.tripcolor(grid, np.nan_to_num(std), shading="gouraud", cmap="viridis", vmin=low, vmax=high)
     extend = "max" if std[known].max() > high else "neither"
@@ -227,7 +205,7 @@ def _draw_std(figure: Figure, axis: Axes, bar: Axes, inspection: Inspection) -> 
 
 def _write_summary(axis: Axes, inspection: Inspection) -> None:
     axis.axis("off")
-    spread = Spread.of(inspection.std)
+    spread = Spread.of(inspection.prediction.std)
     lines = [
         "uncertainty of u and v:",
         f"  median {_text(spread.median, 4)} px",
@@ -262,10 +240,10 @@ def _extent(inspection: Inspection) -> tuple[float, float, float, float]:
     return (x - 0.5, x + width - 0.5, y + height - 0.5, y - 0.5)
 
 
-def _frame_axis(axis: Axes, inspection: Inspection, *, first: bool) -> None:
+def _frame_axis(axis: Axes, inspection: Inspection) -> None:
     """Pixel axes, and the outline of the region where it is not the whole frame."""
     left, right, bottom, top = _extent(inspection)
     if not inspection.region.all():
         places = np.arange(left + 0.5, right), np.arange(top + 0.5, bottom)
         axis.contour(*places, inspection.region, [0.5], colors=["#f2c037"], linewidths=0.8)
-    finish_picture(axis, (left, right), (top, bottom), first=first)
+    finish_picture(axis, (left, right), (top, bottom), first=axis.get_subplotspec().is_first_col())  # type: ignore[union-attr]

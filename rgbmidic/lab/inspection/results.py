@@ -6,19 +6,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.illumination.frame_check import Mismatch
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
+from rgbmidic.lab.inspection.prediction import Prediction
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["TOO_FINE", "ChannelSummary", "Finding", "Inspection", "LightSummary", "Spread", "findings"]
 
 
-BLIND = 0.5
-"""Fraction of the usual contrast that no light reaches where the specimen cannot be seen; chosen."""
 TOO_FINE = 0.75
 """Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs/inspect.md)."""
 COARSE = 3.0
@@ -44,7 +43,7 @@ class Spread:
         return cls(median=float(np.median(measured)), q95=float(np.quantile(measured, 0.95)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ChannelSummary:
     """The samples of one camera channel in the region.
 
@@ -102,7 +101,7 @@ class LightSummary:
     alone: Spread
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Finding:
     """A warning.
 
@@ -152,14 +151,10 @@ class Inspection:
         Contradictions of the frame to the calibration: doubtful, or accepted.
     element_size : float
         px.
-    nodes : ndarray, shape (N, 2), float64
-        Of the mesh, (x, y) in px of the frame.
-    elements : ndarray, shape (E, 3), int32
-    std : ndarray, shape (N,), float64
-        Predicted standard uncertainty of u, and of v, px, all lights together, camera noise and separation; NaN where
-        no light sees enough.
-    noise_std, sampling_std : ndarray, shape (N,), float64
-        The parts of it from camera noise, and from samples that the mosaic lacks.
+    mesh : Tri3Mesh
+        Of the region, in px of the frame.
+    prediction : Prediction
+        Standard uncertainty to expect at its nodes, px.
     greens : float
         Difference of the means of the two greens of a mosaic over their mean; 0 for other cameras.
     """
@@ -181,17 +176,14 @@ class Inspection:
     crosstalk_known: bool
     contradictions: tuple[Mismatch, ...]
     element_size: float
-    nodes: FloatArray
-    elements: npt.NDArray[np.int32]
-    std: FloatArray
-    noise_std: FloatArray
-    sampling_std: FloatArray
+    mesh: Tri3Mesh
+    prediction: Prediction
     greens: float
 
     @property
     def unmeasured(self) -> float:
         """Fraction of the nodes that cannot be measured."""
-        return float(np.isnan(self.std).mean())
+        return float(np.isnan(self.prediction.std).mean())
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -210,34 +202,42 @@ def findings(inspection: Inspection) -> Iterator[Finding]:
     yield from _of_set_up(inspection)
     yield from _of_exposure(inspection)
     yield from _of_speckle(inspection)
-    yield from _of_field(inspection)
+    hidden, several = float(inspection.hidden[inspection.region].mean()), len(inspection.lights) > 1
+    if hidden > HIDDEN:
+        what, why = ("no light shows", "all lights reflect or saturate there") if several else _ONE_LIGHT
+        yield Finding("hidden", f"{what} the texture on {hidden:.1%} of the region: {why}, or there is no paint")
+    if inspection.unmeasured > 0:
+        yield Finding("not measured", f"{inspection.unmeasured:.1%} of the nodes will not be measured")
+
+
+_ONE_LIGHT = "the light does not show", "it reflects or saturates there"
 
 
 def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
     for found in inspection.contradictions:
-        yield Finding(code=f"not calibrated: {found.check}", text=found.text)
+        yield Finding(f"not calibrated: {found.check}", found.text)
     if inspection.greens > GREENS:
+        difference = f"{inspection.greens:.0%}"
         yield Finding(
-            code="pattern",
-            text=f"the two greens of the pattern differ by {inspection.greens:.0%}: check cfa, they are one colour",
+            "pattern", f"the two greens of the pattern differ by {difference}: check cfa, they are one colour"
         )
     if not inspection.crosstalk_known:
         yield Finding(
-            code="crosstalk unknown",
-            text="no crosstalk calibration: the camera's channels stand for the lights, and a reflection of one light "
+            "crosstalk unknown",
+            "no crosstalk calibration: the camera's channels stand for the lights, and a reflection of one light "
             "shows in the others too; rgbmidic-calibrate crosstalk",
         )
     if not inspection.noise_known:
         yield Finding(
-            code="noise unknown",
-            text="no noise calibration: noise and the uncertainty from it are estimated from the frame, up to a few "
+            "noise unknown",
+            "no noise calibration: noise and the uncertainty from it are estimated from the frame, up to a few "
             "times too high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
         )
     for light in inspection.lights:
         if light.negative > NEGATIVE:
             yield Finding(
-                code="negative light",
-                text=f"light {light.name} is negative on {light.negative:.0%} of the region: crosstalk, pattern or "
+                "negative light",
+                f"light {light.name} is negative on {light.negative:.0%} of the region: crosstalk, pattern or "
                 "black level are not those of this frame",
             )
 
@@ -246,55 +246,38 @@ def _of_exposure(inspection: Inspection) -> Iterator[Finding]:
     for channel in inspection.channels:
         if channel.saturated > SATURATED:
             yield Finding(
-                code="saturated",
-                text=f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be "
+                "saturated",
+                f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be "
                 "measured; less exposure, or another place of the lamp",
             )
         if channel.high < DARK:
             yield Finding(
-                code="dark",
-                text=f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full "
+                "dark",
+                f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full "
                 "scale; more light or exposure",
             )
 
 
 def _of_speckle(inspection: Inspection) -> Iterator[Finding]:
     texture, size = inspection.texture, inspection.speckle_px
-    if texture is not None and (texture.private > 0.5 or texture.correlation < COLOURED):
+    if texture is not None and (texture.specific > 0.5 or texture.correlation < COLOURED):
         yield Finding(
-            code="coloured",
-            text=f"the colours do not show one texture (agreement {texture.correlation:.2f}): a coloured specimen, or "
+            "coloured",
+            f"the colours do not show one texture (agreement {texture.correlation:.2f}): a coloured specimen, or "
             "speckle far too fine; each colour has only its own lattice, so speckles need 6 px and more",
         )
     elif texture is not None and texture.correlation < TOO_FINE:
         yield Finding(
-            code="fine speckle",
-            text=f"the speckle is too fine for the colour lattice: neighbouring colours agree to "
+            "fine speckle",
+            f"the speckle is too fine for the colour lattice: neighbouring colours agree to "
             f"{texture.correlation:.2f}, {TOO_FINE} is needed (speckles of about 2.0 px); displacements will be pulled "
             "towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
         )
     if np.isnan(size):
-        yield Finding(code="no texture", text="no speckle is seen: its autocorrelation has no width")
+        yield Finding("no texture", "no speckle is seen: its autocorrelation has no width")
     elif inspection.element_size < COARSE * size:
         yield Finding(
-            code="coarse speckle",
-            text=f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px: at least "
+            "coarse speckle",
+            f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px: at least "
             f"{COARSE:g} per side, so element_size = {np.ceil(COARSE * size):.0f} or finer speckle",
         )
-
-
-def _of_field(inspection: Inspection) -> Iterator[Finding]:
-    hidden = float(inspection.hidden[inspection.region].mean())
-    if hidden > HIDDEN:
-        what = "no light shows" if len(inspection.lights) > 1 else "the light does not show"
-        yield Finding(
-            code="hidden",
-            text=f"{what} the texture on {hidden:.1%} of the region: "
-            + (
-                "all lights reflect or saturate there, or there is no paint"
-                if len(inspection.lights) > 1
-                else "it reflects or saturates there, or there is no paint"
-            ),
-        )
-    if inspection.unmeasured > 0:
-        yield Finding(code="not measured", text=f"{inspection.unmeasured:.1%} of the nodes will not be measured")

@@ -53,21 +53,17 @@ class Channel:
 def channels_of(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
     """Return the channels of a frame, or of the frames of lights fired in succession."""
     channels: list[Channel] = []
-    for frame in frames:
+    for number, frame in enumerate(frames, start=1):
         if isinstance(frame, LinearMosaic):
             site = sampled_channels(frame.cfa, frame.values.shape)
             for colour, name in enumerate("RGB"):
-                own = site == colour
-                values = np.where(own, frame.values, np.float32(np.nan))
-                channels.append(Channel(name=name, values=values, saturated=frame.saturated & own, step=2))
+                values = np.where(site == colour, frame.values, np.float32(np.nan))
+                saturated = frame.saturated & (site == colour)
+                channels.append(Channel(name=name, values=values, saturated=saturated, step=2))
             continue
-        names = "RGB" if len(frame.values) == 3 else "M"
+        names = ("R", "G", "B") if len(frame.values) == 3 else (f"M{number}" if len(frames) > 1 else "M",)
         for name, values, valid in zip(names, frame.values, frame.valid, strict=True):
             channels.append(Channel(name=name, values=values, saturated=~valid, step=1))
-    if len(frames) > 1:
-        return [
-            Channel(name=f"M{i + 1}", values=c.values, saturated=c.saturated, step=1) for i, c in enumerate(channels)
-        ]
     return channels
 
 

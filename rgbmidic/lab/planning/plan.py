@@ -73,18 +73,17 @@ class Proposal:
 def propose_colours(plan: Plan) -> Proposal:
     """Return the present lamp directions with the colours exchanged for the best."""
     compared = _Compared.of(plan, _directions(plan.scene))
-    own = tuple(range(len(plan.scene.lights)))
-    return compared.proposal(plan, min(permutations(own), key=compared.cost), affordable=1.0)
+    orders = permutations(range(len(plan.scene.lights)))
+    return compared.proposal(plan, min(orders, key=compared.cost), affordable=1.0)
 
 
 def propose_lamps(plan: Plan) -> Proposal:
     """Return the best directions of a grid over azimuth and inclination, with the best colour for each."""
     present = _directions(plan.scene)
     compared = _Compared.of(plan, np.concatenate([present, _grid()]))
-    own = tuple(range(len(present)))
-    starts = sorted(permutations(own), key=compared.cost)[:2]
-    starts += [compared.greedy(order) for order in list(permutations(own))[:6]]
-    return compared.proposal(plan, min((compared.descend(start) for start in starts), key=compared.cost), _AFFORDABLE)
+    orders = list(permutations(range(len(present))))
+    guesses = sorted(orders, key=compared.cost)[:2] + [compared.greedy(order) for order in orders[:6]]
+    return compared.proposal(plan, min(map(compared.descend, guesses), key=compared.cost), _AFFORDABLE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,15 +168,15 @@ def _zones(scene: Scene, candidates: tuple[Light, ...], light: int, material: Fl
     camera = replace(scene.camera, crosstalk=None, sensitivities=None)
     alone = replace(scene, lights=(scene.lights[light],), camera=camera)
     zones = predict_zones(alone, state, material=material, lights=candidates)
-    own = scene.camera.response(scene.lights).max(axis=0)[light]
-    return replace(zones, irradiance=zones.irradiance * own)
+    response = scene.camera.response(scene.lights).max(axis=0)[light]
+    return replace(zones, irradiance=zones.irradiance * response)
 
 
 def _clear(instrument: Instrument, light: int, before: Zones, after: Zones, brightness: FloatArray) -> FloatArray:
     """Inverse variance (directions, points) of the pull of a light, times the fourth power of its diffuse fraction."""
     variance = instrument.light_variance(light, before, after, brightness)
     with np.errstate(invalid="ignore"):
-        clear = (1 - np.fmax(before.share, after.share)) ** _DIFFUSE_POWER / variance
+        clear = (1 - np.fmax(before.fraction, after.fraction)) ** _DIFFUSE_POWER / variance
     full = instrument.scene.camera.full_scale
     for zones in (before, after):
         with np.errstate(invalid="ignore"):
@@ -288,7 +287,7 @@ class Plan:
         reference, outlooks = _predict(scene, self.instrument, self.x, self.y, [o.state for o in self.outlooks])
         return replace(self, scene=scene, reference=reference, outlooks=outlooks)
 
-    def share(self, mask: BoolArray) -> float:
+    def fraction(self, mask: BoolArray) -> float:
         """Fraction of the field on which a mask (h, w) holds."""
         return float(mask[self.inside].mean())
 
@@ -354,14 +353,14 @@ def _predict(
         zones = predict_zones(scene, state, material=material)
         displacement = truth(scene, state, None, (x, y))
         with np.errstate(invalid="ignore"):
-            reflects = np.fmax(reference.share, zones.share) > REFLECTS
+            reflects = np.fmax(reference.fraction, zones.fraction) > REFLECTS
         outlooks.append(
             Outlook(
                 state=state,
                 zones=zones,
                 displacement=displacement,
                 reflects=reflects,
-                lit=np.isfinite(reference.share) & np.isfinite(zones.share),
+                lit=np.isfinite(reference.fraction) & np.isfinite(zones.fraction),
                 saturated=instrument.saturated(reference) | instrument.saturated(zones),
                 forecast=instrument.forecast(reference, zones, _around(trace_change(displacement), reach)),
             )

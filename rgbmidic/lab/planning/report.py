@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rgbmidic._version import __version__
-from rgbmidic.lab import check_folder, number_or_none, write_document
+from rgbmidic.lab import check_folder, number_or_none, write_findings
 from rgbmidic.lab.planning.plan import Outlook, Plan, Proposal
-from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal, save_figure
-from rgbmidic.scene.camera import Light
+from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS
 from rgbmidic.typing import FloatArray
@@ -58,27 +58,26 @@ def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwri
         A plan is already there, or the folder cannot be written.
     """
     check_folder(out, FILES, overwrite=overwrite)
-    write_document(plan_document(plan, proposals), out / "plan.json")
-    save_figure(plan_figure(plan, proposals), out / "plan.png")
+    write_findings(out, "plan", plan_document(plan, proposals), plan_figure(plan, proposals))
 
 
 def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per state: field fractions where each light reflects, all do, one or none is clean."""
-    names = [light.name for light in plan.scene.lights]
     rows = []
-    for label, one in _labelled(plan):
-        fractions = [one["reflecting"][name] for name in names]
-        fractions += [one[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
-        rows.append([label, f"{one['largest_motion_px']:.1f}", *(f"{fraction:.1%}" for fraction in fractions)])
+    for label, state in _labelled(plan):
+        fractions = [*state["reflecting"].values()]
+        fractions += [state[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
+        rows.append([label, f"{state['largest_motion_px']:.1f}", *(f"{fraction:.1%}" for fraction in fractions)])
+    names = [light.name for light in plan.scene.lights]
     return ["state", "motion, px", *names, "all", "one", "none", "clipped"], rows
 
 
 def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per state: standard uncertainty over the field in px, and its parts."""
     rows = []
-    for label, one in _labelled(plan):
-        std = one["std_px"]
-        values = [std["median"], std["q95"], one["random_px"], one["feigned_by_domes_px"]]
+    for label, state in _labelled(plan):
+        std = state["std_px"]
+        values = [std["median"], std["q95"], state["random_px"], state["feigned_by_domes_px"]]
         rows.append([label, *("-" if value is None else f"{value:.4f}" for value in values)])
     return ["state", "median", "95 %", "random", "feigned"], rows
 
@@ -96,26 +95,26 @@ UNCERTAINTY_WORDS = {
 """What the headings of `uncertainty_rows` mean."""
 
 
-def _labelled(plan: Plan) -> list[tuple[str, dict[str, Any]]]:
-    states = [_state(plan, outlook) for outlook in plan.outlooks]
-    turned = [f": {one['angle_deg']:g} deg" if one["angle_deg"] else "" for one in states]
-    return [(f"{number}{label}", one) for number, (label, one) in enumerate(zip(turned, states, strict=True), start=1)]
+def _labelled(plan: Plan) -> Iterator[tuple[str, dict[str, Any]]]:
+    for number, outlook in enumerate(plan.outlooks, start=1):
+        state = _state(plan, outlook)
+        yield f"{number}: {state['angle_deg']:g} deg" if state["angle_deg"] else str(number), state
 
 
 def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per lamp: position (mm) as SCENE.toml states it, direction, largest zone of any state."""
     rows = []
-    for index, light in enumerate(plan.scene.lights):
-        azimuth, inclination = _angles(plan.scene, light)
-        worst = max(plan.share(outlook.reflects[index]) for outlook in plan.outlooks)
-        place = ", ".join(f"{round(value)}" for value in light.position)
-        rows.append([light.name, f"[{place}]", f"{azimuth:.0f}", f"{inclination:.0f}", f"{worst:.1%}"])
+    for index, lamp in enumerate(_lamps(plan)):
+        worst = max(plan.fraction(outlook.reflects[index]) for outlook in plan.outlooks)
+        place = ", ".join(f"{round(value)}" for value in lamp["position_mm"])
+        angles = [f"{lamp[key]:.0f}" for key in ("azimuth_deg", "inclination_deg")]
+        rows.append([lamp["name"], f"[{place}]", *angles, f"{worst:.1%}"])
     return ["light", "position = (mm)", "azimuth", "inclination", "reflects on"], rows
 
 
 def summary(plan: Plan) -> str:
     """One line: the largest overlap of reflections, and the uncertainty over field and states."""
-    overlap = max(plan.share(np.asarray(outlook.reflects.sum(axis=0) > 1)) for outlook in plan.outlooks)
+    overlap = max(plan.fraction(np.asarray(outlook.reflects.sum(axis=0) > 1)) for outlook in plan.outlooks)
     std = f"{plan.std:.4f} px" if math.isfinite(plan.std) else "unbounded: somewhere no light sees"
     return f"reflections overlap on up to {overlap:.1%} of the field; u_std {std}"
 
@@ -127,7 +126,7 @@ def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
         "rgbmidic": __version__,
         "field_px": list(plan.field),
         "element_size_px": plan.instrument.element_size,
-        "reflects_from_specular_share": REFLECTS,
+        "reflects_from_specular_fraction": REFLECTS,
         **_arrangement(plan),
         "proposals": {
             name: {"gain": proposal.gain, **_arrangement(proposal.plan)} for name, proposal in proposals.items()
@@ -136,29 +135,19 @@ def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
 
 
 def _arrangement(plan: Plan) -> dict[str, Any]:
+    states = [_state(plan, outlook) for outlook in plan.outlooks]
+    return {"lights": _lamps(plan), "std_px": number_or_none(plan.std), "states": states}
+
+
+def _lamps(plan: Plan) -> list[dict[str, Any]]:
+    """The lamps; azimuth about the optical axis (0 to the right, 90 down) and inclination from it, from the body."""
     lamps = []
     for light in plan.scene.lights:
-        azimuth, inclination = _angles(plan.scene, light)
-        lamps.append(
-            {
-                "name": light.name,
-                "position_mm": list(light.position),
-                "azimuth_deg": azimuth,
-                "inclination_deg": inclination,
-                "power": light.power,
-            }
-        )
-    return {
-        "lights": lamps,
-        "std_px": number_or_none(plan.std),
-        "states": [_state(plan, outlook) for outlook in plan.outlooks],
-    }
-
-
-def _angles(scene: Scene, light: Light) -> tuple[float, float]:
-    """Azimuth about the optical axis (degrees, 0 to the right, 90 down) and inclination from it, seen from the body."""
-    x, y, z = (a - b for a, b in zip(light.position, scene.body.front, strict=True))
-    return math.degrees(math.atan2(y, x)) % 360, math.degrees(math.atan2(math.hypot(x, y), -z))
+        x, y, z = (a - b for a, b in zip(light.position, plan.scene.body.front, strict=True))
+        angles = math.degrees(math.atan2(y, x)) % 360, math.degrees(math.atan2(math.hypot(x, y), -z))
+        lamp = {"name": light.name, "position_mm": list(light.position)}
+        lamps.append({**lamp, "azimuth_deg": angles[0], "inclination_deg": angles[1], "power": light.power})
+    return lamps
 
 
 def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
@@ -171,11 +160,11 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
         "angle_deg": state.angle_deg,
         "translation_mm": list(state.translation),
         "largest_motion_px": float(np.hypot(*outlook.displacement[:, inside]).max()),
-        "reflecting": {name: plan.share(mask) for name, mask in zip(names, outlook.reflects, strict=True)},
-        "all_reflect": plan.share(np.asarray(outlook.reflects.all(axis=0))),
-        "one_light": plan.share(outlook.clean == 1),
-        "no_light": plan.share(outlook.clean == 0),
-        "saturated": plan.share(np.asarray(outlook.saturated.any(axis=0))),
+        "reflecting": {name: plan.fraction(mask) for name, mask in zip(names, outlook.reflects, strict=True)},
+        "all_reflect": plan.fraction(np.asarray(outlook.reflects.all(axis=0))),
+        "one_light": plan.fraction(outlook.clean == 1),
+        "no_light": plan.fraction(outlook.clean == 0),
+        "saturated": plan.fraction(np.asarray(outlook.saturated.any(axis=0))),
         "std_px": dict(zip(("median", "q95", "largest"), quantiles, strict=True)),
         "random_px": _rms(outlook.forecast.std[inside]),
         "feigned_by_domes_px": _rms(outlook.forecast.bias[inside]),
@@ -206,7 +195,10 @@ def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
             _draw_zones(axes[0, column], one, outlook)
             turned = f": {outlook.state.angle_deg:g}°" if outlook.state.angle_deg else ""
             axes[0, column].set_title(literal(f"{title}{turned}"))
-            shown = _draw_std(axes[1, column], one, outlook, top)
+            axes[1, column].set_facecolor("0.85")
+            look = {"cmap": "magma", "vmin": 0, "vmax": top, "interpolation": "nearest"}
+            shown = axes[1, column].imshow(np.ma.masked_invalid(outlook.std), extent=_extent(one), **look)
+            _draw_field(axes[1, column], one)
         figure.colorbar(shown, ax=list(axes[1]), label="u_std (px)", extend="max", aspect=20, pad=0.02)
         lines = [Line2D([], [], color=colour) for colour in _colours(plan.scene)]
         lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
@@ -234,25 +226,17 @@ def _draw_zones(axis: Axes, plan: Plan, outlook: Outlook) -> None:
 
     body = np.isfinite(outlook.displacement[0])
     picture = np.where(body[..., None], 0.93, 1.0) * np.ones(3)
-    largest = np.fmax(plan.reference.share, outlook.zones.share)
+    largest = np.fmax(plan.reference.fraction, outlook.zones.fraction)
     for colour, fraction in zip(_colours(plan.scene), largest, strict=True):
         cover = 0.85 * np.clip(np.nan_to_num(fraction), 0, 1)[..., None]
         picture = picture * (1 - cover) + np.array(to_rgb(colour)) * cover
     axis.imshow(picture, extent=_extent(plan), interpolation="bilinear")
     for index, colour in enumerate(_colours(plan.scene)):
         for zones, style in ((plan.reference, "--"), (outlook.zones, "-")):
-            fraction = zones.share[index]
+            fraction = zones.fraction[index]
             if np.nanmin(fraction, initial=1.0) < REFLECTS < np.nanmax(fraction, initial=0.0):
                 axis.contour(plan.x, plan.y, fraction, [REFLECTS], colors=[colour], linestyles=style, linewidths=1)
     _draw_field(axis, plan)
-
-
-def _draw_std(axis: Axes, plan: Plan, outlook: Outlook, top: float) -> Any:
-    shown = np.ma.masked_invalid(outlook.std)
-    axis.set_facecolor("0.85")
-    picture = axis.imshow(shown, extent=_extent(plan), cmap="magma", vmin=0, vmax=top, interpolation="nearest")
-    _draw_field(axis, plan)
-    return picture
 
 
 def _draw_field(axis: Axes, plan: Plan) -> None:

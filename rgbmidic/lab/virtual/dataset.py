@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,13 +23,12 @@ from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual.rendering import render
 from rgbmidic.scene.camera import Camera, Light, mosaic_samples
-from rgbmidic.scene.scene import DatasetSettings, Experiment, Plate, Scene, State, Target, read_scene
+from rgbmidic.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene
 from rgbmidic.scene.surface import Finish, Surface
 from rgbmidic.scene.zones import region_in_view, truth
 from rgbmidic.typing import FloatImage
 
 __all__ = [
-    "check_frames",
     "dark_frames",
     "flat_frames",
     "record",
@@ -37,7 +36,6 @@ __all__ = [
     "target_scene",
     "true_calibration",
     "write_dataset",
-    "write_experiment",
 ]
 
 Frame = Mosaic | ChannelFrame
@@ -78,15 +76,8 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
         The folder is not empty or cannot be written.
     """
     experiment, out = read_scene(scene_toml), Path(out)
-    test = write_experiment(experiment, out, progress)
-    shutil.copyfile(scene_toml, out / "scene.toml")
-    return test
-
-
-def write_experiment(experiment: Experiment, out: Path, progress: Progress | None = None) -> Path:
-    """Like `write_dataset`, from an experiment in memory."""
-    _check_output(experiment.scene, out)
     scene, settings = experiment.scene, experiment.output
+    _check_output(scene, out)
     states = (State(), *experiment.states)
     seeds = np.random.SeedSequence(settings.seed).spawn(5)
     frame_seeds = seeds[0].generate_state(len(states) * len(scene.lights)).reshape(len(states), -1)
@@ -108,6 +99,7 @@ def write_experiment(experiment: Experiment, out: Path, progress: Progress | Non
     y, x = np.indices(scene.camera.shape, dtype=float, sparse=True)
     region = settings.region or region_in_view(x, y, displacement, scene.camera.shape)
     test.write_text(_test_settings(scene, settings, region), encoding="utf-8")
+    shutil.copyfile(scene_toml, out / "scene.toml")
     return test
 
 
@@ -145,11 +137,14 @@ def _write_frame(folder: Path, index: int, frame: Frame, settings: DatasetSettin
 
 def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest: FloatImage, seeds: list[int]) -> None:
     count = settings.calibration_frames
-    captures = single_light_frames(scene, count=count, seed=seeds[0], target=settings.target)
-    groups = {f"light_{name}": frames for name, frames in captures.items()}
-    groups["dark"] = dark_frames(scene.camera, count=count, seed=seeds[1])
-    groups |= {f"flat_{i}": frames for i, frames in enumerate(flat_frames(scene, seed=seeds[2]), start=1)}
-    groups |= {f"check/{name}": frames for name, frames in check_frames(scene, at_rest, seed=seeds[3]).items()}
+    single = single_light_frames(scene, count=count, seed=seeds[0], target=settings.target)
+    flat, check = flat_frames(scene, seed=seeds[2]), _check_frames(scene, at_rest, seed=seeds[3])
+    groups = {
+        **{f"light_{name}": frames for name, frames in single.items()},
+        "dark": dark_frames(scene, count=count, seed=seeds[1]),
+        **{f"flat_{number}": frames for number, frames in enumerate(flat, start=1)},
+        **{f"check/{name}": frames for name, frames in check.items()},
+    }
     for folder, frames in groups.items():
         for index, frame in enumerate(frames):
             _write_frame(out / folder, index, frame, settings)
@@ -224,55 +219,40 @@ def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Targ
     generator = np.random.SeedSequence(seed)
     frames: dict[str, list[Frame]] = {light.name: [] for light in scene.lights}
     for name, taken in frames.items():
-        for step, child in enumerate(generator.spawn(count)):
-            dimmed = images * np.float32((step + 1) / count)
-            taken.append(record(dimmed, scene.camera, scene.lights, seed=int(child.generate_state(1)[0]), on=(name,)))
+        for step, child in enumerate(generator.spawn(count), start=1):
+            taken += _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
     return frames
 
 
-def dark_frames(camera: Camera, *, count: int = 3, seed: int) -> list[Frame]:
+def dark_frames(scene: Scene, *, count: int = 3, seed: int) -> list[Frame]:
     """Frames with all lights off."""
-    darkness = np.zeros((1, *camera.shape), dtype=np.float32)
-    lightless = replace(camera, crosstalk=np.ones((camera.channels, 1)))
-    off = (Light(name="off", position=(0.0, 0.0, 0.0), power=0.0),)
-    seeds = np.random.SeedSequence(seed).generate_state(count)
-    return [record(darkness, lightless, off, seed=int(s)) for s in seeds]
+    darkness = np.zeros((len(scene.lights), *scene.camera.shape), dtype=np.float32)
+    return _shots(scene, darkness, np.random.SeedSequence(seed).generate_state(count), ())
 
 
 def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]:
     """Frames of a white card under all lights together: `count` at each of the `EXPOSURES`."""
     images = render(target_scene(scene, "white"))
     brightest = float(np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images).max())
-    steps = np.random.SeedSequence(seed).spawn(len(EXPOSURES))
-    taken = []
-    for fraction, step in zip(EXPOSURES, steps, strict=True):
-        exposed = images * np.float32(fraction * scene.camera.full_scale / brightest)
-        taken.append([record(exposed, scene.camera, scene.lights, seed=int(s)) for s in step.generate_state(count)])
-    return taken
+    levels = [np.float32(fraction * scene.camera.full_scale / brightest) for fraction in EXPOSURES]
+    seeds = [step.generate_state(count) for step in np.random.SeedSequence(seed).spawn(len(levels))]
+    return [_shots(scene, images * level, taken) for level, taken in zip(levels, seeds, strict=True)]
 
 
-def check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
-    """Frames of the specimen at rest: each light alone, all together ("all"), and "dark".
-
-    Parameters
-    ----------
-    scene
-        Its lights and camera.
-    images : ndarray, shape (k, H, W)
-        Images of each light alone.
-    count
-        Frames of each kind.
-    seed
-        Of the noise.
-    """
+def _check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
+    """Frames of the specimen at rest, `images` (k, H, W): each light alone, all together ("all"), and "dark"."""
     lit = {light.name: (light.name,) for light in scene.lights} | {"all": tuple(light.name for light in scene.lights)}
-    steps = np.random.SeedSequence(seed).spawn(len(lit) + 1)
-    frames = {"dark": dark_frames(scene.camera, count=count, seed=int(steps[-1].generate_state(1)[0]))}
-    for (name, on), step in zip(lit.items(), steps, strict=False):
-        frames[name] = [
-            record(images, scene.camera, scene.lights, seed=int(s), on=on) for s in step.generate_state(count)
-        ]
+    *steps, last = np.random.SeedSequence(seed).spawn(len(lit) + 1)
+    frames = {"dark": dark_frames(scene, count=count, seed=int(last.generate_state(1)[0]))}
+    for (name, on), step in zip(lit.items(), steps, strict=True):
+        frames[name] = _shots(scene, images, step.generate_state(count), on)
     return frames
+
+
+def _shots(
+    scene: Scene, images: FloatImage, seeds: Iterable[np.uint32], on: Collection[str] | None = None
+) -> list[Frame]:
+    return [record(images, scene.camera, scene.lights, seed=int(seed), on=on) for seed in seeds]
 
 
 def record(

@@ -152,20 +152,13 @@ def _subpixel_material(scene: Scene, state: State, light: Light, first: int, row
     return np.stack(material_from_spatial(state.displacement, spatial[0], spatial[1]), axis=-1)
 
 
-def paint(
-    *,
-    droplet: float = 0.23,
-    gloss: float = 1.5,
-    seed: int = 0,
-    coverage: float = 0.45,
-    lobe_deg: float = 4.0,
-    dome: float = 0.0,
-) -> Surface:
-    """Black droplets (albedo 0.10) on white paint (0.80), wrinkles 25 um apart with 6 degrees rms slope."""
-    white = Finish(albedo=0.80, gloss=gloss, lobe_deg=lobe_deg)
-    return Surface(
-        white=white, black=replace(white, albedo=0.10), droplet=droplet, coverage=coverage, seed=seed, dome=dome
-    )
+def paint(*, gloss: float = 1.5, lobe_deg: float = 4.0, **settings: Any) -> Surface:
+    """Black droplets (albedo 0.10) on white paint (0.80), wrinkles 25 um apart with 6 degrees rms slope.
+
+    `settings` are those of `Surface`.
+    """
+    white, black = (Finish(albedo=albedo, gloss=gloss, lobe_deg=lobe_deg) for albedo in (0.80, 0.10))
+    return Surface(white=white, black=black, **settings)
 
 
 def sphere_scene(

@@ -104,8 +104,8 @@ def test_offset_is_told_from_light():
 
 
 def two_frames(stack):
-    values = np.empty(stack.shape, np.uint16)
-    for (row, column), mean in zip(stack.origins, stack.mean, strict=True):
+    values = np.empty(stack.camera.shape, np.uint16)
+    for (row, column), mean in zip(stack.camera.origins, stack.mean, strict=True):
         values[row::2, column::2] = np.rint(mean + BLACK)
     return [values]
 

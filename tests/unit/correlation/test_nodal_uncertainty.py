@@ -30,7 +30,7 @@ def test_the_unfitted_share_is_that_of_the_projection(size):
     mesh = Tri3Mesh.from_region(region, size)
     image = Texture.random(1).image(shape)[None].astype(np.float32)
     reference = Reference.prepare(image, region, mesh=mesh, prefilter="none")
-    pixels, slopes = reference.pixels, (reference.gradient_x[0], reference.gradient_y[0])
+    pixels, slopes = reference.pixels, (reference.gradient[0][0], reference.gradient[1][0])
     columns = np.zeros((pixels.rows.size, len(mesh.nodes), 2))
     for element, corners in enumerate(mesh.elements):
         own = slice(pixels.offsets[element], pixels.offsets[element + 1])
@@ -89,7 +89,7 @@ def test_the_smallest_element_beside_a_hole_is_told_by_the_common_way(monkeypatc
         columns.append(len(asked) * len(colouring.nearest))
         return functional_std(solve, covariance, colouring, asked)
 
-    monkeypatch.setattr("rgbmidic.correlation.nodes.functional_std", counted)
+    monkeypatch.setattr("rgbmidic.correlation.uncertainty.functional_std", counted)
     image = Texture.random(4, speckle=3).image((96, 96))
     first = noisy(image, 0)
     first[30:60, 35:60] = np.nan

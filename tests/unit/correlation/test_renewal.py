@@ -13,6 +13,7 @@ from rgbmidic import NodeStatus, Region, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference, ReferenceUpdate, Start, Status, track
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
+from rgbmidic.weights import Statistics
 
 SHAPE = (160, 160)
 RECTANGLE = (25, 25, 135, 135)
@@ -46,6 +47,7 @@ def chained(images, update_reference):
             deformed,
             Start(displacement=start.displacement - reference_update.displacement),
             OPTIONS,
+            Statistics(),
         )
         solutions.append(reference_update.accumulated(step, deformed))
         start = start.after(reference_update.first.mesh, solutions[-1].displacement, solutions[-1].measured)
@@ -83,8 +85,8 @@ def test_before_any_renewal_a_frame_is_measured_as_without():
         prepared(texture.image(SHAPE, Affine(shift=(1.3, 0.4)))),
     )
     start = Start(displacement=np.zeros_like(reference.mesh.nodes))
-    found = ReferenceUpdate.none(reference).track(deformed, start, OPTIONS)
-    expected = track(reference, deformed, start, OPTIONS)
+    found = ReferenceUpdate.none(reference).track(deformed, start, OPTIONS, Statistics())
+    expected = track(reference, deformed, start, OPTIONS, Statistics())
     np.testing.assert_array_equal(found.displacement, expected.displacement)
     np.testing.assert_array_equal(found.displacement_std, expected.displacement_std)
 
@@ -154,7 +156,7 @@ def pair(motion, change=0.0, noise=2.0):
         noisy(image, noise, random),
     )
     start = Start(displacement=motion.displacement(reference.mesh.nodes, SHAPE))
-    return reference, prepared(deformed), track(reference, prepared(deformed), start, OPTIONS)
+    return reference, prepared(deformed), track(reference, prepared(deformed), start, OPTIONS, Statistics())
 
 
 @pytest.mark.parametrize(
@@ -193,7 +195,9 @@ def test_a_renewal_from_stored_numbers_is_the_same_to_the_bit():
     texture = Texture.random(4)
     first = ReferenceUpdate.none(first_reference(texture.image(SHAPE)))
     image = texture.image(SHAPE, Affine(shift=(0.7, 0.2)))
-    solution = first.track(prepared(image), Start(displacement=np.zeros_like(first.displacement)), OPTIONS)
+    solution = first.track(
+        prepared(image), Start(displacement=np.zeros_like(first.displacement)), OPTIONS, Statistics()
+    )
     stored = replace(
         solution,
         **{name: getattr(solution, name).astype(np.float32) for name in ("displacement_std", "strain", "strain_std")},
@@ -204,6 +208,7 @@ def test_a_renewal_from_stored_numbers_is_the_same_to_the_bit():
                 prepared(texture.image(SHAPE, Affine(shift=(1.1, 0.2)))),
                 Start(displacement=solution.displacement),
                 OPTIONS,
+                Statistics(),
             )
         )
         for kept in (solution, stored)
@@ -225,7 +230,7 @@ def test_both_sides_of_an_open_crack_are_followed_on_a_renewed_reference():
     mesh = reference_update.first.mesh
     start = Start(displacement=np.zeros_like(mesh.nodes))
     for width in (4.0, 8.0):
-        solution = reference_update.track(prepared(opened(width)), start, OPTIONS)
+        solution = reference_update.track(prepared(opened(width)), start, OPTIONS, Statistics())
         reference_update = reference_update.updated(solution, stack(opened(width)))
         start = start.after(reference_update.first.mesh, solution.displacement, solution.measured)
     half = 8.0 * np.clip(1 - mesh.nodes[:, 0] / 110, 0, None) / 2
@@ -238,7 +243,7 @@ def test_a_frame_in_which_nothing_is_measured_is_no_reference():
     texture = Texture.random(0)
     first = ReferenceUpdate.none(first_reference(texture.image(SHAPE)))
     solution = first.track(
-        prepared(texture.image(SHAPE)), Start(displacement=np.zeros_like(first.displacement)), OPTIONS
+        prepared(texture.image(SHAPE)), Start(displacement=np.zeros_like(first.displacement)), OPTIONS, Statistics()
     )
     lost = replace(solution, node_status=np.full_like(solution.node_status, NodeStatus.DECORRELATED))
     with pytest.raises(InputError, match="no element is measured"):
@@ -256,6 +261,8 @@ def test_a_light_that_moves_for_itself_calls_for_no_reference():
     reference_update = ReferenceUpdate.none(Reference.prepare(first, region, weights, mesh=mesh))
     deformed = Deformed.prepare(then, weights)
     start = Start(displacement=np.full(mesh.nodes.shape, 0.2))
-    solution = reference_update.track(deformed, start, replace(OPTIONS, rigid="translation", prefilter="none"))
+    solution = reference_update.track(
+        deformed, start, replace(OPTIONS, rigid="translation", prefilter="none"), Statistics()
+    )
     np.testing.assert_allclose(solution.rigid[1], (2.5, 0), atol=0.01)
     assert np.nanmin(reference_update.match(deformed, solution)) > 0.99

@@ -50,7 +50,7 @@ def test_texture_is_learnt_through_crosstalk_noise_and_mosaic(albedo, mat):
     assert texture(0) == pytest.approx(1)
     for distance in (1, 2):
         assert texture(distance) == pytest.approx(autocorrelation(albedo, distance), abs=0.04)
-    assert texture.private < 0.1
+    assert texture.specific < 0.1
 
 
 def test_texture_is_the_same_with_and_without_reflection(mat, glaring):
@@ -68,7 +68,7 @@ def test_fine_speckle_is_learnt_and_filled_in_without_a_step(diameter):
     texture = separate(mosaic, scenes.CROSSTALK).texture
     for distance in (1, 2):
         assert texture(distance) == pytest.approx(autocorrelation(field, distance), abs=0.05)
-    assert texture.private < 0.2
+    assert texture.specific < 0.2
     ours, usual = (scenes.error(scenes.separated(mosaic, name), lights) for name in ("reflection-aware", "malvar"))
     assert (ours < 0.6 * usual).all()
 
@@ -103,12 +103,12 @@ def test_slopes_follow_the_lights(mat):
     slopes = np.median(factors.slope, axis=(1, 2))
     expected = scenes.A @ np.array([1500, 2000, 1100])
     np.testing.assert_allclose(slopes / slopes[1], expected / expected[1], rtol=0.01)
-    assert np.median(factors.private) < 0.004
+    assert np.median(factors.specific) < 0.004
 
 
 def test_a_reflection_is_private_to_its_channel(mat, glaring):
     _, factors = learnt(glaring)
-    red, green, blue = np.median(factors.private, axis=(1, 2))
+    red, green, blue = np.median(factors.specific, axis=(1, 2))
     channels = np.tensordot(scenes.A, glaring - mat, axes=1)
     albedo_std = mat.std(axis=(1, 2))
     expected = channels.var(axis=(1, 2)) / (scenes.A @ albedo_std) ** 2
@@ -119,7 +119,7 @@ def test_a_reflection_is_private_to_its_channel(mat, glaring):
 def test_camera_noise_is_not_taken_for_a_reflection(mat):
     dim = mat / 10
     _, factors = learnt(dim)
-    assert np.median(factors.private) < 0.01
+    assert np.median(factors.specific) < 0.01
     assert np.median(factors.noise) > 0.005
 
 
@@ -135,7 +135,7 @@ def test_filters_sum_to_one_and_follow_the_trust():
 
 
 def test_filters_of_nothing_in_common_use_the_own_colour_alone():
-    texture = TextureModel(**{**vars_of(TextureModel.of_speckle(4.0)), "private": 1.0})
+    texture = TextureModel(**{**vars_of(TextureModel.of_speckle(4.0)), "specific": 1.0})
     table = prediction_filters(np.full((3, 1, 1), 2000.0), (1e-4,) * 3, texture, "RGGB")
     site = site_channels((5, 5), "RGGB").ravel()
     for channel in range(3):
@@ -144,7 +144,7 @@ def test_filters_of_nothing_in_common_use_the_own_colour_alone():
 
 
 def vars_of(model):
-    return {name: getattr(model, name) for name in ("weights", "widths", "offset", "private", "correlation")}
+    return {name: getattr(model, name) for name in ("weights", "widths", "offset", "specific", "correlation")}
 
 
 @pytest.mark.parametrize("cfa", BAYER_PATTERNS)
@@ -176,7 +176,7 @@ def test_a_coloured_specimen_is_no_worse_than_colour_by_colour():
     lights = 1500 * np.stack([scenes.speckle(SHAPE, seed=seed) for seed in (1, 2, 3)])
     mosaic = scenes.mosaic_of(lights)
     texture = separate(mosaic, scenes.CROSSTALK).texture
-    assert texture.private == 1
+    assert texture.specific == 1
     assert texture.correlation < 0.5
     ours, alone = (
         scenes.error(scenes.separated(mosaic, name), lights) for name in ("reflection-aware", "colour by colour")

@@ -34,7 +34,7 @@ class Counted:
         self.ranges = []
 
     @staticmethod
-    def py_func(start, stop, other, items): ...
+    def __wrapped__(start, stop, other, items): ...
 
     __name__ = "counted"
 
@@ -49,10 +49,24 @@ class Counted:
 def test_every_item_is_done_once_in_whole_grains(count, grain, number):
     set_threads(number)
     kernel, items = Counted(), np.zeros((2, count))
-    over_ranges("items", axis=1, grain=grain)(kernel)(None, items)
+    over_ranges("items", axis=1, grain=grain, least=0)(kernel)(None, items)
     assert (items == 1).all()
     assert len(kernel.ranges) == max(1, min(number, -(-count // grain)))
     assert all(start % grain == 0 for start, _ in kernel.ranges)
+
+
+@pytest.mark.parametrize(("other", "parts"), [(np.zeros(99), 1), (np.zeros(100), 2), (None, 1)])
+def test_one_thread_does_alone_what_is_small(other, parts):
+    set_threads(2)
+    kernel = Counted()
+    over_ranges("items", axis=1, least=100)(kernel)(other, np.zeros((2, 8)))
+    assert len(kernel.ranges) == parts
+
+
+def test_numba_is_imported_with_the_first_call_of_a_kernel():
+    code = "import sys, rgbmidic.pipeline, rgbmidic._kernels.render; print({'numba', 'llvmlite'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
 
 
 def test_a_failure_in_any_thread_is_told():
@@ -63,7 +77,7 @@ def test_a_failure_in_any_thread_is_told():
 
     set_threads(3)
     with pytest.raises(ValueError, match="the last one"):
-        over_ranges("items")(Failing())(None, np.zeros(9))
+        over_ranges("items", least=0)(Failing())(None, np.zeros(9))
 
 
 def test_many_threads_may_call_at_once():

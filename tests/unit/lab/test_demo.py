@@ -13,13 +13,15 @@ _REST = """
 import importlib, pkgutil, sys
 from pathlib import Path
 import rgbmidic._kernels
+from rgbmidic._kernels.threads import Kernel
 from rgbmidic.lab import demo
 
 def kernels():
     names = [one.name for one in pkgutil.iter_modules(rgbmidic._kernels.__path__)]
     modules = [importlib.import_module(f"rgbmidic._kernels.{name}") for name in names]
-    found = [getattr(value, "__wrapped__", value) for module in modules for value in vars(module).values()]
-    return {(one.py_func.__name__, form) for one in found if hasattr(one, "py_func") for form in one.signatures}
+    values = [value for module in modules for value in vars(module).values()]
+    found = [one for value in values for one in (value, getattr(value, "__wrapped__", None)) if type(one) is Kernel]
+    return {(one.__name__, form) for one in found for form in one.dispatcher.signatures}
 
 for part in demo._SMALL_MEASUREMENTS.values():
     part()

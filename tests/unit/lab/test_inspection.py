@@ -16,7 +16,6 @@ from small_tests import REGION, colour_test, grey_frame
 import rgbmidic
 from rgbmidic import cli
 from rgbmidic.command import execute
-from rgbmidic.correlation import correlate
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
@@ -31,6 +30,7 @@ from rgbmidic.lab.inspection.prediction import gaussian_field
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline import correlate
 from rgbmidic.scene.forecast import expected_std, node_constant
 
 Run = Callable[..., tuple[int, str, str]]
@@ -176,11 +176,11 @@ def test_predicted_uncertainty_is_the_scatter_of_repeated_frames(glare, size):
         inner = ((solution.nodes > 20) & (solution.nodes < SHAPE[0] - 21)).all(axis=1)
         errors.append((solution.displacement - motion)[inner])
     observed = np.sqrt(np.nanmean((np.array(errors) - np.nanmean(errors, axis=1, keepdims=True)) ** 2))
-    inner = ((seen.nodes > 20) & (seen.nodes < SHAPE[0] - 21)).all(axis=1)
-    predicted = np.sqrt(np.nanmean(seen.std[inner] ** 2))
+    inner = ((seen.mesh.nodes > 20) & (seen.mesh.nodes < SHAPE[0] - 21)).all(axis=1)
+    predicted = np.sqrt(np.nanmean(seen.prediction.std[inner] ** 2))
     assert 0.75 < predicted / observed < 1.25
-    assert 0 < np.nanmedian(seen.noise_std) <= 1.1 * np.nanmedian(seen.std)
-    assert min(light.alone.median for light in seen.lights) > np.nanmedian(seen.std)
+    assert 0 < np.nanmedian(seen.prediction.noise) <= 1.1 * np.nanmedian(seen.prediction.std)
+    assert min(light.alone.median for light in seen.lights) > np.nanmedian(seen.prediction.std)
 
 
 def _moved_lights(glare):
@@ -208,9 +208,9 @@ def test_more_noise_and_smaller_elements_mean_more_uncertainty():
     frame = raw(mat_lights(), noise=loud)
     noisy = inspect_frame(frame, calibration=replace(CALIBRATION, noise=loud))
     ratio = np.sqrt(loud.variance(700.0) / NOISE.variance(700.0))
-    assert np.nanmedian(noisy.noise_std) / np.nanmedian(mat().noise_std) == pytest.approx(ratio, rel=0.2)
+    assert np.nanmedian(noisy.prediction.noise) / np.nanmedian(mat().prediction.noise) == pytest.approx(ratio, rel=0.2)
     small = inspect_frame(raw(mat_lights()), calibration=CALIBRATION, element_size=16)
-    assert 1.2 < np.nanmedian(small.std) / np.nanmedian(mat().std) < 2.0
+    assert 1.2 < np.nanmedian(small.prediction.std) / np.nanmedian(mat().prediction.std) < 2.0
 
 
 def test_only_the_region_and_its_surroundings_are_looked_at_where_they_are():
@@ -233,8 +233,8 @@ def test_only_the_region_and_its_surroundings_are_looked_at_where_they_are():
     assert part.origin == (154, 134)
     assert part.images.shape == (300 + 97 - 134, 330 + 97 - 154)
     assert part.frame_shape == shape
-    assert part.nodes.min(axis=0) == pytest.approx((251, 231))
-    assert part.nodes.max(axis=0) == pytest.approx((330, 300))
+    assert part.mesh.nodes.min(axis=0) == pytest.approx((251, 231))
+    assert part.mesh.nodes.max(axis=0) == pytest.approx((330, 300))
     assert [done for done, _, _ in steps] == [0, 1, 2, 3]
     whole = inspect_frame(raw(lights), calibration=calibration)
     inside = np.s_[:, 231:301, 251:331]
@@ -246,7 +246,7 @@ def test_only_the_region_and_its_surroundings_are_looked_at_where_they_are():
 
 def test_the_same_frame_gives_the_same_figures():
     again = inspect_frame(raw(mat_lights()), calibration=CALIBRATION)
-    np.testing.assert_array_equal(again.std, mat().std)
+    np.testing.assert_array_equal(again.prediction.std, mat().prediction.std)
     assert inspection_document(again) == inspection_document(mat())
 
 
@@ -314,7 +314,7 @@ def test_monochrome_frames_have_neither_lattice_nor_reflection_index():
     images = [linearise(one).values for one in repeats]
     solution = correlate(*images, initial=(0, 0), normalise=10.0)
     observed = np.sqrt(np.nanmean(solution.displacement**2))
-    assert np.sqrt(np.nanmean(seen.std**2)) / observed == pytest.approx(1, abs=0.35)
+    assert np.sqrt(np.nanmean(seen.prediction.std**2)) / observed == pytest.approx(1, abs=0.35)
 
 
 def test_lights_in_succession_and_three_channels():
@@ -329,7 +329,7 @@ def test_lights_in_succession_and_three_channels():
     seen = inspect_frame(colour, calibration=CALIBRATION)
     assert (seen.kind, seen.texture) == ("rgb", None)
     assert seen.lights[1].reflecting > 0.9
-    assert np.nanmax(seen.sampling_std) == 0
+    assert np.nanmax(seen.prediction.mosaic) == 0
 
 
 def test_frames_that_cannot_be_inspected():
@@ -365,7 +365,7 @@ def test_files_are_written_and_nothing_is_overwritten(tmp_path):
     out = tmp_path / "out"
     write_inspection(mat(), out)
     document = json.loads((out / "inspection.json").read_text())
-    assert document["std_px"]["median"] == pytest.approx(np.nanmedian(mat().std))
+    assert document["std_px"]["median"] == pytest.approx(np.nanmedian(mat().prediction.std))
     assert [one["name"] for one in document["channels"]] == ["R", "G", "B"]
     assert document["warnings"] == []
     assert (out / "inspection.png").stat().st_size > 20_000

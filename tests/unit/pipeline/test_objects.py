@@ -47,10 +47,33 @@ def test_a_numpy_stack_gives_the_bits_of_its_files(tmp_path):
     from_files = measure(files, tmp_path / "files")
     from_stack = measure(settings(), tmp_path / "stack", source=FRAMES)
     series = measure(settings(), tmp_path / "series", source=open_series(files.frames))
-    for other in (from_stack, series):
+    own = Series(open_series(files.frames))
+    for other in (from_stack, series, measure(settings(), tmp_path / "own", source=own)):
         np.testing.assert_array_equal(other.u, from_files.u)
         np.testing.assert_array_equal(other.u_std, from_files.u_std)
     assert error(from_stack) < 0.05
+    assert own.windows
+    assert all(window is not None for window in own.windows)
+
+
+class Series:
+    """A series of one's own, which can all that the package's can: it is asked for the part of a frame it needs."""
+
+    def __init__(self, series):
+        self.series, self.windows = series, []
+
+    def __len__(self):
+        return len(self.series)
+
+    def __getitem__(self, index):
+        return self.read(index)
+
+    def __getattr__(self, name):
+        return getattr(self.series, name)
+
+    def read(self, index, window=None):
+        self.windows.append(window)
+        return self.series.read(index, window)
 
 
 @dataclass

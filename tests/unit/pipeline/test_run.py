@@ -351,10 +351,10 @@ def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
     assert "is finished and whole: nothing is left to be measured" in caplog.text
     assert ((out / "provenance.json").read_bytes(), measured) == (kept, [])
     content = bytearray(file.read_bytes())
-    content[int(whole.table.start[12] + whole.table.length[12] // 2)] ^= (
+    content[int(whole.table.places["start"][12] + whole.table.places["length"][12] // 2)] ^= (
         4  # in the record of one frame, in the header of another
     )
-    content[int(whole.table.start[25]) - 20] ^= 4
+    content[int(whole.table.places["start"][25]) - 20] ^= 4
     file.write_bytes(content)
     with pytest.raises(
         ResultError, match=r"damaged \(000000\.frames\): of 36 frames are lost 25 \(f025\.tif\); .*--res"

@@ -70,7 +70,8 @@ def settings(**sections: Any) -> TestSettings:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No pictures: drawing them takes nearly all of the time."""
     monkeypatch.setattr(document, "embedded", lambda _: "data:image/png;base64,")
-    for module in (document, document.figures):
+    monkeypatch.setattr(document.figures.MapDrawer, "_draw", lambda *_: None)
+    for module in (document, document.figures, style):
         for name in [name for name in vars(module) if name.endswith("_figure")]:
             monkeypatch.setattr(module, name, lambda *_, **__: None)
 

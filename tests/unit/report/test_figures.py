@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from matplotlib.text import Text
@@ -81,6 +82,22 @@ def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_pa
     assert rows[seen.any(axis=1)].tolist() == [24.5, 26.5]
 
 
+def test_axes_that_are_drawn_once_look_as_if_drawn_for_each_map(tmp_path: Path) -> None:
+    result = make_result(tmp_path / "out", frames=3, reference=np.stack([IMAGE] * 3))
+    maps = figures.MapDrawer(result, 60)
+    before = _pixels(maps.of_kind(1, "displacement"))
+    frozen, anew = _pixels(maps.of_kind(2, "displacement")), _pixels(figures.map_figure(result, 2, "displacement"))
+    changed = (np.abs(before - anew) > 30).mean()
+    assert (np.abs(frozen - anew) > 30).mean() < 0.01 < 0.1 < changed
+    assert maps.of_kind(2, "uncertainty") is maps.of_kind(1, "displacement")
+
+
+def _pixels(figure: Any) -> AnyArray:
+    file = io.BytesIO()
+    figure.savefig(file, dpi=60)
+    return cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_COLOR).astype(float)
+
+
 @pytest.mark.parametrize("kind", figures.MAPS)
 def test_every_map_shows_its_quantities_around_the_mesh(tmp_path: Path, kind: str) -> None:
     names = figures.MAPS[kind]
@@ -136,7 +153,8 @@ def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gallery, "save_figure", lambda _, path: path.touch())
 
 
-def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:
+def test_all_figures_can_be_written_by_two_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gallery, "_FEW", 5)
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
     told_once = {"convergence", "residual", "brightness"}
     with_pictures = {*EVERY_FRAME, "masks", "reflections"}
@@ -329,6 +347,6 @@ def test_impossible_frame_and_file(tmp_path: Path) -> None:
 
 
 def test_matplotlib_is_imported_only_for_a_figure() -> None:
-    code = "import sys, rgbmidic.report, rgbmidic.results; print({'matplotlib'} & set(sys.modules))"
+    code = "import sys, rgbmidic.report, rgbmidic.results; print({'matplotlib', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -85,7 +85,7 @@ def test_pairs_of_frame_and_node_are_read_point_by_point(result: Result) -> None
 def test_only_the_frames_asked_for_are_read(result: Result) -> None:
     data = result.to_xarray()
     file = result.path / "solution" / "000000.frames"
-    start, size = int(result.table.start[2]), int(result.table.length[2])
+    start, size = int(result.table.places["start"][2]), int(result.table.places["length"][2])
     content = bytearray(file.read_bytes())
     content[start : start + size] = bytes(size)
     file.write_bytes(content)

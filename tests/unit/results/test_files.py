@@ -125,8 +125,8 @@ def test_a_damaged_header_or_record_loses_its_frame_only(tmp_path: Path, caplog:
     whole = Result.open(write_result(tmp_path / "out"))
     file, table = whole.path / "solution" / "000000.frames", whole.table
     content = bytearray(file.read_bytes())
-    content[int(table.start[1]) - 3] ^= 1
-    content[int(table.start[2] + table.length[2]) - 1] ^= 128
+    content[int(table.places["start"][1]) - 3] ^= 1
+    content[int(table.places["start"][2] + table.places["length"][2]) - 1] ^= 128
     file.write_bytes(content)
     with pytest.raises(
         ResultError, match=r"\(000000\.frames\): of 6 frames are lost 1 \(frame 1\); .*--resume.*partial"
@@ -139,7 +139,7 @@ def test_a_damaged_header_or_record_loses_its_frame_only(tmp_path: Path, caplog:
     assert np.isnan(rest.u[1:3]).all()
     np.testing.assert_array_equal(rest.u[[0, 3, 4, 5]], whole.u[[0, 3, 4, 5]])
     assert rest.refresh().finished.tolist() == rest.finished.tolist()
-    content[int(table.start[1]) - 3] ^= 1  # then only the record is damaged, which shows when it is read
+    content[int(table.places["start"][1]) - 3] ^= 1  # then only the record is damaged, which shows when it is read
     file.write_bytes(content)
     with pytest.raises(ResultError, match=r"000000\.frames is damaged in frame 2: .*--resume"):
         list(Result.open(whole.path).each("reflection_thumbnail"))
@@ -151,12 +151,13 @@ def test_a_forged_head_is_told(copy: Path, name: str, size: int) -> None:
     """Sizes that no record has, their checksums right: no memory is taken for what is not there."""
     table = Result.open(copy).table
     file = table.files[0]
-    content, first = bytearray(file.read_bytes()), int(table.start[0])
-    place = table.layout.open[name]
-    for number in place.shape:
+    content, first = bytearray(file.read_bytes()), int(table.places["start"][0])
+    shape = table.layout.places[name].shape
+    assert isinstance(shape, slice)
+    for number in range(shape.start, shape.stop):
         content[first + 4 * number : first + 4 * number + 4] = size.to_bytes(4, "little")
     file.write_bytes(content)
-    table.head[0] = zlib.crc32(content[first : first + table.layout.head])
+    table.places["head"][0] = zlib.crc32(content[first : first + table.layout.head])
     tracemalloc.start()
     try:
         with pytest.raises(ResultError, match="damaged in frame 0"):

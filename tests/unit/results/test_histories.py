@@ -207,8 +207,8 @@ CHANNELS = "time_ms;force_kN;room\n-1;-0,5;20\n3,002;1,5;\n20;10;22\n"
 
 def test_channels_are_brought_to_the_frames_and_make_a_stress(result: Result, tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text(CHANNELS, encoding="utf-8-sig")
-    channels = Channels.read(tmp_path / "c.csv")
-    found = read(result, gauges=((20, 15, 90, 60),), channels=channels, offset=1e-3, area=20.0)
+    channels = Channels.read(tmp_path / "c.csv", offset=1e-3)
+    found = read(result, gauges=((20, 15, 90, 60),), channels=channels, area=20.0)
     np.testing.assert_allclose(found["force_kN"].values[3], 1.5)
     np.testing.assert_allclose(found["stress_MPa"].values[3], 75)
     assert found.stress_strain == ("gauge_1_strain", "stress")

@@ -170,7 +170,7 @@ def test_a_full_disk_is_told_and_the_frames_before_are_kept(tmp_path: Path) -> N
         assert told == [f"{file} cannot be written: File too large"]
         result = Result.open(tmp_path / "out", partial=True)
         assert 0 < result.finished.sum() == index < 40
-        assert file.stat().st_size == result.table.length.sum() + 40 * index
+        assert file.stat().st_size == result.table.places["length"].sum() + 40 * index
         for later in range(index, 40):  # when there is room again
             store.write_frame(later, random_record(1))
         store.finish()

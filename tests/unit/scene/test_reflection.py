@@ -51,7 +51,7 @@ def test_a_measured_lobe_is_met_again():
 
 
 def test_the_share_is_that_of_the_peak_in_the_mirror_direction_and_falls_to_nothing():
-    share = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(0.1), lamp_at(60.0)]).share(PAINT)[:, 0]
+    share = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(0.1), lamp_at(60.0)]).fraction(PAINT)[:, 0]
     assert share[0] == pytest.approx(0.7 / 1.2, rel=1e-3)
     assert share[1] < 1e-4
 
@@ -61,7 +61,7 @@ def test_what_faces_away_is_not_seen():
     assert np.isnan(behind.deviation_deg[0]).all()
     assert np.isfinite(behind.deviation_deg[1]).all()
     turned = reflection(POINT[:, None], -NORMAL[:, None], [lamp_at(20.0)])
-    assert np.isnan(turned.share(PAINT)).all()
+    assert np.isnan(turned.fraction(PAINT)).all()
     np.testing.assert_array_equal(angle_weights(turned.deviation_deg), 0)
 
 

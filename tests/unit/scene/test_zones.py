@@ -54,7 +54,7 @@ def rendered_share(scene: Scene, state: State) -> np.ndarray:
 )
 def test_the_predicted_zone_is_the_rendered_one(body, state):
     scene = coarse_scene(body)
-    predicted, rendered = predict_zones(scene, state).share, rendered_share(scene, state)
+    predicted, rendered = predict_zones(scene, state).fraction, rendered_share(scene, state)
     inner = np.s_[:, 10:-10, 10:-10]
     predicted, rendered = predicted[inner], rendered[inner]
     assert np.sqrt(np.mean((predicted - rendered) ** 2)) < SHARE
@@ -100,14 +100,14 @@ def test_points_of_the_body_keep_their_light_on_a_mat_paint_and_their_zone_moves
 def test_a_paint_measured_by_goniometry_takes_the_place_of_the_scene_s():
     scene = sphere_scene(size=64)
     mat = Reflectance(diffuse=0.5, specular=0.0, width_deg=5.0)
-    share = predict_zones(scene, reflectance=mat).share
+    share = predict_zones(scene, reflectance=mat).fraction
     assert np.nanmax(share) == 0
 
 
 def test_lamps_may_be_moved_without_a_new_scene():
     scene = sphere_scene(size=64)
     moved = tuple(replace(light, position=scene.mirror_position(500.0)) for light in scene.lights)
-    share = predict_zones(scene, lights=moved).share
+    share = predict_zones(scene, lights=moved).fraction
     np.testing.assert_allclose(share[0], share[2])
     assert share[:, 32, 32].min() > 0.5
 

@@ -25,7 +25,7 @@ from rgbmidic.view.address import KINDS, Mark, ViewState
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.fields import Fields, Values, frame_text, pointer_text, robust_range, watched
 from rgbmidic.view.page import ResultPage
-from rgbmidic.view.picture import Window, element_at, paint, palette, palette_name
+from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, palette_name
 
 NAMES = ("u", "v", "e1")
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
@@ -134,13 +134,14 @@ def test_a_node_is_painted_where_its_pixel_of_the_image_is(zoom):
     image = np.zeros((64, 64), dtype=np.uint8)
     image[20:24, 40:44] = 255  # centre (41.5, 21.5)
     window = Window(left=-0.5, top=-0.5, right=63.5, bottom=63.5, width=int(64 * zoom), height=int(64 * zoom))
-    shown = paint(window, image, None, (0, 1), palette("viridis"), opacity=1) & 0xFF
+    shown = paint(window, image) & 0xFF
     rows, columns = np.nonzero(shown > 120)
     x, y = window.place(np.array([[41.5, 21.5]]))
     assert (columns.mean(), rows.mean()) == pytest.approx((x[0], y[0]), abs=0.51)
     nodes = np.array([[38.0, 18.0], [45.0, 18.0], [41.5, 28.5]])
-    field = (nodes, np.array([[0, 1, 2]], dtype=np.int32), np.ones(3))
-    painted = paint(window, np.zeros_like(image), field, (0, 1), ("#000000", "#ff0000"), opacity=1) & 0xFF
+    elements, colours = np.array([[0, 1, 2]], dtype=np.int32), ("#000000", "#ff0000")
+    over = Overlay(nodes=nodes, elements=elements, values=np.ones(3), ends=(0, 1), colours=colours)
+    painted = paint(window, np.zeros_like(image), over) & 0xFF
     rows, columns = np.nonzero(painted)
     x, y = window.place(nodes.mean(axis=0)[None])
     assert (columns.mean(), rows.mean()) == pytest.approx((x[0], y[0]), abs=0.6)
@@ -323,7 +324,7 @@ def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
     page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=50, y=40))
     file = next((made.path / "solution").glob("*.frames"))
     content = bytearray(file.read_bytes())
-    content[int(made.table.start[1]) + 3] ^= 255
+    content[int(made.table.places["start"][1]) + 3] ^= 255
     file.write_bytes(content)
     page.state.asked = 1
     assert "damaged in frame 1" in page.parts.description.text

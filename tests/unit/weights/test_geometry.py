@@ -61,7 +61,7 @@ def test_soft_weights_are_low_where_a_light_reflects_and_the_motion_changes_it(p
     np.testing.assert_array_equal(found.reference(IMAGES), 1)
     scene = read_scene(tmp_path / "scene.toml").scene
     seen = material_points(scene, State(angle_deg=6.0))
-    before, after = (predict_zones(scene, State(angle_deg=angle), material=seen).share for angle in (0.0, 6.0))
+    before, after = (predict_zones(scene, State(angle_deg=angle), material=seen).fraction for angle in (0.0, 6.0))
     for light in (0, 1):
         changed, calm = abs(after - before)[light] > 0.2, np.maximum(after, before)[light] < 0.02
         assert changed.mean() > 0.05
@@ -118,7 +118,7 @@ def test_lights_are_found_by_name_and_before_a_monochrome_camera_by_order(prepar
 def test_without_states_every_frame_is_the_body_at_rest_and_the_reflections_count_as_changed(prepare):
     found = prepare(SCENE, frames=17)
     np.testing.assert_array_equal(found.deformed(IMAGES, 3), found.deformed(IMAGES, 16))
-    share = predict_zones(found.scene).share
+    share = predict_zones(found.scene).fraction
     weights = found.deformed(IMAGES, 3)
     assert weights[0][share[0] > 0.3].mean() < 0.7 * weights[0][share[0] < 0.05].mean()
 

@@ -40,14 +40,14 @@ def with_lamps(scene: Scene, *directions: tuple[float, float]) -> Scene:
 
 
 def overlap(made: Plan) -> float:
-    return max(made.share(outlook.reflects.sum(axis=0) > 1) for outlook in made.outlooks)
+    return max(made.fraction(outlook.reflects.sum(axis=0) > 1) for outlook in made.outlooks)
 
 
 def test_zones_are_those_of_both_states_at_the_points_of_the_reference():
     scene = coarse(sphere_scene())
     made = plan(scene, turned(2.0), turned(6.0))
     assert made.inside.mean() > 0.5
-    shares = [predict_zones(scene).share, None]
+    shares = [predict_zones(scene).fraction, None]
     rows, columns = (np.round(a[made.inside]).astype(int) for a in (made.y, made.x))
     near = abs(shares[0][:, rows, columns] - REFLECTS) > 0.02
     at_rest = shares[0][:, rows, columns] > REFLECTS
@@ -86,7 +86,7 @@ def test_lights_that_all_reflect_in_one_place_leave_none():
     apart = with_lamps(scene, (0.0, 50.0), (120.0, 50.0), (240.0, 50.0))
     heaped, spread = plan(heap, turned(3.0)), plan(apart, turned(3.0))
     outlook = heaped.outlooks[0]
-    assert heaped.share(outlook.reflects.all(axis=0)) > 0.02
+    assert heaped.fraction(outlook.reflects.all(axis=0)) > 0.02
     np.testing.assert_array_equal(outlook.clean == 0, outlook.reflects.all(axis=0))
     assert overlap(spread) < 0.01
     assert spread.outlooks[0].std[spread.inside].max() < outlook.std[heaped.inside].max()
@@ -121,13 +121,13 @@ def test_lamps_of_a_cylinder_go_to_its_ends():
     proposal = propose_lamps(plan(scene, turned(3.0)))
     for light in proposal.lights:
         assert abs(light.position[1]) > 2 * abs(light.position[0])
-    assert max(proposal.plan.share(mask) for mask in proposal.plan.outlooks[0].reflects) < 0.01
+    assert max(proposal.plan.fraction(mask) for mask in proposal.plan.outlooks[0].reflects) < 0.01
 
 
 def test_green_gets_the_light_that_reflects_least_before_a_bayer_camera():
     scene = with_lamps(coarse(sphere_scene()), (180.0, 60.0), (0.0, 22.0), (270.0, 25.0))
     made = plan(scene, turned(4.0))
-    reflecting = [made.share(mask) for mask in made.outlooks[0].reflects]
+    reflecting = [made.fraction(mask) for mask in made.outlooks[0].reflects]
     assert int(np.argmin(reflecting)) == 0  # red has the best place
     proposal = propose_colours(made)
     places = {light.name: np.array(light.position) for light in scene.lights}

@@ -43,7 +43,7 @@ def test_the_rows_hold_what_the_plan_holds(made):
     headings, rows = zone_rows(plan)
     assert [len(row) for row in rows] == [len(headings)] * 2
     assert rows[1][0] == "2: 4 deg"
-    assert rows[1][2:5] == [f"{plan.share(mask):.1%}" for mask in plan.outlooks[1].reflects]
+    assert rows[1][2:5] == [f"{plan.fraction(mask):.1%}" for mask in plan.outlooks[1].reflects]
     headings, rows = uncertainty_rows(plan)
     assert float(rows[0][1]) == pytest.approx(np.median(plan.outlooks[0].std[plan.inside]), abs=1e-4)
     headings, rows = lamp_rows(plan)
@@ -58,7 +58,7 @@ def test_the_document_is_plain_json_and_says_the_same(made):
     state = document["states"][1]
     assert state["angle_deg"] == 4
     assert 0 < state["std_px"]["median"] <= state["std_px"]["q95"] <= state["std_px"]["largest"]
-    assert state["reflecting"]["green"] == plan.share(plan.outlooks[1].reflects[1])
+    assert state["reflecting"]["green"] == plan.fraction(plan.outlooks[1].reflects[1])
     moved = document["proposals"]["lamps moved"]
     assert moved["lights"][0]["position_mm"] == list(proposals["lamps moved"].lights[0].position)
 
@@ -72,7 +72,7 @@ def test_the_picture_shows_zones_and_uncertainty_where_they_are(made):
         assert axis.get_xlim() == (-0.5, 159.5)
         assert axis.get_ylim() == (119.5, -0.5)
     # where red reflects, the picture of the first state is red
-    picture, share = zones[0].images[0].get_array(), plan.reference.share
+    picture, share = zones[0].images[0].get_array(), plan.reference.fraction
     red = (share[0] > 0.5) & (share[1:].max(axis=0) < 0.05)
     assert red.any()
     assert (picture[red][:, 0] > 1.3 * picture[red][:, 2]).all()

@@ -129,7 +129,7 @@ def test_calibration_captures_show_one_light_each():
         means = [full[0::2, 0::2].mean(), full[0::2, 1::2].mean(), full[1::2, 1::2].mean()]
         ratio = np.array(means) / max(means)
         assert ratio == pytest.approx(CROSSTALK[:, index], abs=0.03)
-    dark = dark_frames(scene.camera, count=4, seed=2)
+    dark = dark_frames(scene, count=4, seed=2)
     assert np.mean([frame.values for frame in dark]) == pytest.approx(64, abs=0.2)
     assert np.std([frame.values for frame in dark]) == pytest.approx(np.hypot(3, 12**-0.5), rel=0.03)
 

@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.correlation import Deformed, PrecisionMethod, Reference, Solution, Start, fill, solve, track
 from rgbmidic.correlation.images import as_light_stack
-from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.solution import Solution, fill
-from rgbmidic.correlation.solve import solve
-from rgbmidic.correlation.start import Start, track
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names
 from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.weights import Statistics
 
 __all__ = ["as_weights", "correlate", "initial_displacement", "solver_settings"]
 
@@ -34,7 +32,7 @@ def correlate(
     initial: npt.ArrayLike | None = None,
     deformed_weights: npt.ArrayLike | None = None,
     normalise: float | None = None,
-    statistics: bool = True,
+    statistics: bool | PrecisionMethod = True,
     **options: Any,
 ) -> Solution:
     """Measure the displacement between two states seen under k lights (k = 1: plain DIC).
@@ -58,7 +56,8 @@ def correlate(
     normalise
         Standard deviation in px of the local mean by which every image is divided first; None leaves grey levels.
     statistics
-        Weight every light by the inverse variance of its own residual around each pixel, robustly.
+        Weight the lights by what the residual around each pixel shows (`rgbmidic.weights.Statistics`), by a method of
+        one's own, or, if False, by `weights` alone.
     **options
         Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, fill,
         tolerance, max_iterations.
@@ -88,11 +87,12 @@ def correlate(
         f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
     first = Reference.prepare(f, region, as_weights(weights, f.shape, "weights"), mesh=mesh, prefilter=solver.prefilter)
     second = Deformed.prepare(g, as_weights(deformed_weights, f.shape, "deformed_weights"), prefilter=solver.prefilter)
+    method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
     start = initial_displacement(initial, len(mesh.nodes))
     if start is None:
-        solution = track(first, second, Start(displacement=None), solver, statistics=statistics)
+        solution = track(first, second, Start(displacement=None), solver, method)
     else:
-        solution = solve(first, second, start, solver, statistics=statistics)
+        solution = solve(first, second, start, solver, method)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 
@@ -137,7 +137,7 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
     values = np.asarray(weights)
     if values.shape not in (shape, shape[1:]) or values.dtype.kind not in "buif":
         raise InputError(f"{name} must have shape {shape[1:]} or {shape}; given is {values.dtype} {values.shape}")
-    if not np.isfinite(values).all() or values.min() < 0:
+    if not (values.min() >= 0 and values.max() < np.inf):  # NaN spreads to both
         raise InputError(f"{name} must be finite and not negative")
     return np.ascontiguousarray(np.broadcast_to(values, shape), dtype=np.float32)
 

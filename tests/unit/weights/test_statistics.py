@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from rgbmidic import Tri3Mesh, correlate
+from rgbmidic import Tri3Mesh, correlate, measure_sequence
+from rgbmidic.correlation import Precision
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh import Region
+from rgbmidic.weights import MaskWeights, Statistics
 
 SIDE = 160
 REGION = (15, 15, SIDE - 16, SIDE - 16)
@@ -23,6 +25,50 @@ def white(seed, sigma):
 
 def measured(first, second):
     return correlate(np.stack(first), np.stack(second), region=REGION, initial=(0, 0), prefilter="binomial")
+
+
+class OneLight:
+    """A method of one's own: the second light counts nothing."""
+
+    def precision(self, residual):
+        factor = np.ones_like(residual.weights)
+        factor[1] = 0
+        return Precision(factor=factor, bend=np.ones_like(factor[0]))
+
+
+class Nothing:
+    """A method that learns nothing."""
+
+    def precision(self, residual):
+        return None
+
+
+class MasksOfOneLight(OneLight, MaskWeights):
+    """The same beside masks."""
+
+
+def three_noisy_lights():
+    a = speckle(1)
+    return [[a + white(3 * state + light, 20) for light in range(3)] for state in range(2)]
+
+
+def test_a_method_of_ones_own_takes_the_place_of_the_statistics():
+    options = {"region": REGION, "initial": (0, 0), "prefilter": "binomial"}
+    states = [np.stack(state) for state in three_noisy_lights()]
+    found = correlate(*states, statistics=OneLight(), **options)
+    np.testing.assert_allclose(found.weight_fraction, [0.5, 0, 0.5])
+    nothing, plain = (correlate(*states, statistics=choice, **options) for choice in (Nothing(), False))
+    np.testing.assert_allclose(nothing.displacement, plain.displacement, atol=1e-4)
+    default, named = (correlate(*states, statistics=choice, **options) for choice in (True, Statistics()))
+    np.testing.assert_array_equal(default.displacement, named.displacement)
+
+
+@pytest.mark.parametrize("statistics", [True, False])
+def test_weights_that_learn_are_asked_for_their_precision(statistics):
+    states = [np.stack(state) for state in three_noisy_lights()]
+    weights = MasksOfOneLight(np.ones((3, SIDE, SIDE)))
+    _, last = measure_sequence(states, region=REGION, statistics=statistics, weights=weights)
+    np.testing.assert_allclose(last.weight_fraction, [0.5, 0, 0.5])
 
 
 def test_two_copies_of_a_light_count_nearly_as_one():
@@ -63,13 +109,13 @@ def test_the_gradient_of_one_light_is_its_own(prepared):
     reference = prepared(speckle(1))
     rows, columns = reference.pixels.rows, reference.pixels.columns
     slope = (np.roll(reference.images[0], -1, axis=1) - np.roll(reference.images[0], 1, axis=1)) / 2
-    assert np.corrcoef(reference.gradient_x[0], slope[rows, columns])[0, 1] > 0.99
-    assert reference.gradient_x[0].std() == pytest.approx(slope.std(), rel=0.15)
+    assert np.corrcoef(reference.gradient[0][0], slope[rows, columns])[0, 1] > 0.99
+    assert reference.gradient[0][0].std() == pytest.approx(slope.std(), rel=0.15)
 
 
 def test_lights_share_a_gradient_in_proportion_to_their_contrast(prepared):
     a = speckle(1)
-    x = prepared(a + white(1, 5), 500 + 0.5 * a + white(2, 5), a + white(3, 5)).gradient_x
+    x = prepared(a + white(1, 5), 500 + 0.5 * a + white(2, 5), a + white(3, 5)).gradient[0]
     assert np.corrcoef(x[0], x[1])[0, 1] > 0.99
     assert x[1].std() / x[0].std() == pytest.approx(0.5, rel=0.1)
 
@@ -83,7 +129,7 @@ def test_what_a_light_alone_shows_is_not_in_the_gradient_it_is_matched_with(prep
     a, alone = speckle(1), [speckle(seed) - 1000 for seed in (5, 6, 7)]
     reference = prepared(*(a + 0.4 * one for one in alone))
     for light, one in enumerate(alone):
-        gradient = reference.gradient_x[light]
+        gradient = reference.gradient[0][light]
         assert np.corrcoef(gradient, slope_along_x(reference, a))[0, 1] > 0.9
         assert abs(np.corrcoef(gradient, slope_along_x(reference, one))[0, 1]) < 0.08
         beyond = reference.channel_specific[0, light]
@@ -94,14 +140,14 @@ def test_of_two_lights_each_keeps_its_own_gradient_in_the_mean(prepared):
     """The other may be the one that reflects: alone it would leave nothing to match with."""
     a = speckle(1)
     reference = prepared(a + white(1, 5), a + white(2, 150))
-    assert np.corrcoef(reference.gradient_x[0], slope_along_x(reference, a + white(1, 5)))[0, 1] > 0.6
-    assert np.corrcoef(reference.gradient_x[0], reference.gradient_x[1])[0, 1] > 0.99
+    assert np.corrcoef(reference.gradient[0][0], slope_along_x(reference, a + white(1, 5)))[0, 1] > 0.6
+    assert np.corrcoef(reference.gradient[0][0], reference.gradient[0][1])[0, 1] > 0.99
 
 
 def test_lights_that_share_no_texture_keep_their_own(prepared):
     reference = prepared(*(speckle(seed) for seed in (1, 2, 3)))
     for light, image in enumerate(reference.images):
-        assert np.corrcoef(reference.gradient_x[light], slope_along_x(reference, image))[0, 1] > 0.5
+        assert np.corrcoef(reference.gradient[0][light], slope_along_x(reference, image))[0, 1] > 0.5
 
 
 def test_where_one_light_alone_is_known_it_keeps_its_own_gradient(prepared):
@@ -112,7 +158,7 @@ def test_where_one_light_alone_is_known_it_keeps_its_own_gradient(prepared):
     reference = prepared(a + white(1, 5), *others)
     left = reference.pixels.columns < 50
     slope = slope_along_x(reference, a)[left]
-    assert np.corrcoef(reference.gradient_x[0][left], slope)[0, 1] > 0.95
+    assert np.corrcoef(reference.gradient[0][0][left], slope)[0, 1] > 0.95
 
 
 def test_the_uncertainty_holds_what_a_light_alone_still_pulls():

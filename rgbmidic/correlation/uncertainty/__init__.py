@@ -1,1 +1,0 @@
-"""Standard uncertainty of nodal quantities: the scores' covariance from the residual, carried through the equations."""

@@ -1,0 +1,74 @@
+// What the browser does by itself; the functions are called by `models.script` with parts of the page.
+const rgbmidic = {
+  next: 0,
+
+  // Ask for the frame of the slider, one at a time; while frames are played, for the next one at least `wait` ms later.
+  pump({state, slider, play, step, wait}) {
+    if (state.asked !== state.shown) return;
+    if (slider.value !== state.shown) { state.asked = slider.value; return; }
+    if (!play.active) return;
+    setTimeout(() => {
+      if (!play.active || slider.value !== state.shown) return;
+      rgbmidic.next = performance.now() + wait;
+      slider.value = slider.value + step.value > slider.end ? slider.start : slider.value + step.value;
+    }, Math.max(0, rgbmidic.next - performance.now()));
+  },
+
+  // Mark the frame that is shown in the time line, and keep the view in the address.
+  shown({state, now}) {
+    now.setv({location: state.shown}, {sync: false});
+    history.replaceState(null, "", "?frame=" + state.shown + (state.query && "&" + state.query));
+  },
+
+  // Take the tool of the button that was pressed; of two groups of buttons one is pressed.
+  choose({group, tools, other}) {
+    if (group.active === null) return;
+    tools[group.active].active = true;
+    if (other) other.active = null;
+  },
+
+  turn({theme}) {
+    const address = new URL(location.href);
+    address.searchParams.set("theme", theme);
+    location.replace(address.href);
+  },
+
+  keep(blob, name) {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(blob);
+    link.download = name;
+    link.click();
+    URL.revokeObjectURL(link.href);
+  },
+
+  keepCsv({state}) {
+    if (!state.csv) return;
+    rgbmidic.keep(new Blob([state.csv], {type: "text/csv"}), "history.csv");
+    state.csv = "";
+  },
+
+  keepPng({plot}) {
+    Bokeh.index.get_one(plot).export("png").to_blob().then((blob) => rgbmidic.keep(blob, "history.png"));
+  },
+};
+window.rgbmidic = rgbmidic;
+
+// Keys: a frame back and forth, first and last, play; the page is asked for one frame at a time (`pump`).
+document.addEventListener("keydown", (event) => {
+  const target = event.composedPath()[0];
+  const writing = target.tagName === "SELECT" || (target.tagName === "INPUT" && target.type !== "range");
+  const page = Bokeh.documents[0];
+  if (writing || event.ctrlKey || event.altKey || event.metaKey || !page) return;
+  const slider = page.get_model_by_name("frame"), play = page.get_model_by_name("play");
+  const step = page.get_model_by_name("step").value || 1;
+  const to = {
+    ArrowRight: slider.value + step, ArrowLeft: slider.value - step,
+    PageDown: slider.value + 10 * step, PageUp: slider.value - 10 * step,
+    Home: slider.start, End: slider.end,
+  }[event.key];
+  if (to !== undefined) slider.value = Math.min(Math.max(to, slider.start), slider.end);
+  else if (event.key === " ") play.active = !play.active;
+  else return;
+  event.preventDefault();
+  event.stopPropagation();
+}, true);
