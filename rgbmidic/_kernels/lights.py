@@ -124,40 +124,34 @@ def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, prod
     they are fewer than `fewest`, that of all that have. `products` (4, P) receives own times mean, mean times mean, own
     times own and 1, all 0 where the light has no weight.
     """
-    count, others = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
-    total = np.empty(BLOCK, dtype=np.float32)
-    for first in range(start, stop, BLOCK):
-        chunk = slice(first, min(first + BLOCK, stop))
-        along, square, power, seen = products[0, chunk], products[1, chunk], products[2, chunk], products[3, chunk]
-        products[:, chunk] = 0
-        for i in range(np.uint64(seen.size)):
+    count, less, total = np.empty((3, BLOCK), dtype=np.float32)
+    own, lights = np.uint64(light), np.uint64(len(weights))
+    for block in range(start, stop, BLOCK):
+        first, number = np.uint64(block), np.uint64(min(BLOCK, stop - block))
+        for i in range(number):
             count[i] = _ZERO
-        for j in range(len(weights)):
-            weight = weights[j, chunk]
-            for i in range(np.uint64(seen.size)):
-                count[i] += _ONE if weight[i] > _ZERO else _ZERO
-        weight = weights[light, chunk]
-        for i in range(np.uint64(seen.size)):
-            seen[i] = _ONE if weight[i] > _ZERO else _ZERO
-        for i in range(np.uint64(seen.size)):
-            others[i] = _ONE if count[i] - seen[i] >= fewest else _ZERO
-        for axis in range(2):
-            own, result = gradient[axis, light, chunk], mean[axis, chunk]
-            for i in range(np.uint64(seen.size)):
+        for j in range(lights):
+            for i in range(number):
+                count[i] += _ONE if weights[j, first + i] > _ZERO else _ZERO
+        for i in range(number):
+            seen = _ONE if weights[own, first + i] > _ZERO else _ZERO
+            less[i] = seen if count[i] - seen >= fewest else _ZERO
+            products[3, first + i] = seen
+        for axis in range(np.uint64(2)):
+            for i in range(number):
                 total[i] = _ZERO
-            for j in range(len(weights)):
-                weight, slope = weights[j, chunk], gradient[axis, j, chunk]
-                for i in range(np.uint64(seen.size)):
-                    total[i] += slope[i] if weight[i] > _ZERO else _ZERO
-            for i in range(np.uint64(seen.size)):
-                less = others[i] * seen[i]
-                result[i] = (total[i] - less * own[i]) / max(count[i] - less, _ONE)
-            for i in range(np.uint64(seen.size)):
-                along[i] += seen[i] * own[i] * result[i]
-            for i in range(np.uint64(seen.size)):
-                square[i] += seen[i] * result[i] * result[i]
-            for i in range(np.uint64(seen.size)):
-                power[i] += seen[i] * own[i] * own[i]
+            for j in range(lights):
+                for i in range(number):
+                    total[i] += gradient[axis, j, first + i] if weights[j, first + i] > _ZERO else _ZERO
+            for i in range(number):
+                slope = gradient[axis, own, first + i]
+                mean[axis, first + i] = (total[i] - less[i] * slope) / max(count[i] - less[i], _ONE)
+        for i in range(number):
+            seen, x, y = products[3, first + i], gradient[0, own, first + i], gradient[1, own, first + i]
+            u, v = mean[0, first + i], mean[1, first + i]
+            products[0, first + i] = seen * (x * u + y * v)
+            products[1, first + i] = seen * (u * u + v * v)
+            products[2, first + i] = seen * (x * x + y * y)
 
 
 @over_ranges("fraction", axis=1, grain=BLOCK)
