@@ -27,21 +27,13 @@ SHAPE, REGION = (200, 240), (15, 15, 222, 182)
 CONSTANTS = {
     "equations": ("_SMOOTHNESS", "_ROUNDING", "_LONGEST_STEP", "_PATIENCE"),
     "assembly": ("_ANCHOR",),
-    "precision": (
-        "_LEAST_RATIO",
-        "_LEAST_FRACTION",
-        "_EVEN",
-        "_SCORE_RANGE",
-        "_PRIOR",
-        "_FREEDOM",
-        "_LEAST_BEND",
-        "_WORSE",
-    ),
+    "uncertainty": ("_LEAST_RATIO", "_LEAST_FRACTION", "_EVEN", "_SCORE_RANGE", "_PRIOR"),
     "images": ("_RANGE",),
-    "residual": ("_SMOOTHNESS", "_LEAST_GAIN"),
-    "nodes": ("_WANDERING", "_MISFIT", "_ONE_SIDED", "_NOISY"),
+    "residual": ("_SMOOTHNESS", "_LEAST_GAIN", "_LEAST_BEND"),
+    "nodes": ("_WORSE", "_WANDERING", "_MISFIT", "_ONE_SIDED", "_NOISY"),
     "solve": ("_STARTED", "_SETTLED", "_LOOKED_AT"),
     "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT", "_FITTED", "_TURNS"),
+    "statistics": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING"),
 }
 TENFOLD = ("_SMOOTHNESS", "_ROUNDING", "_ANCHOR")
 """Constants of `equations` and `assembly` of which only the order of magnitude counts."""
@@ -84,7 +76,8 @@ def main() -> None:
     """Print a line for every constant and factor."""
     usual = scenes()
     for name, constants in CONSTANTS.items():
-        module = importlib.import_module(f"rgbmidic.correlation.{name}")
+        room = "weights" if name == "statistics" else "correlation"
+        module = importlib.import_module(f"rgbmidic.{room}.{name}")
         for constant in constants:
             value = getattr(module, constant)
             for factor in (0.1, 10) if name in ("equations", "assembly") and constant in TENFOLD else (0.5, 2):

@@ -10,6 +10,7 @@ from rgbmidic._kernels.interpolation import PAD
 __all__ = [
     "bspline_coefficients",
     "curvature_deviation",
+    "element_block_products",
     "element_hessian",
     "element_moments",
     "element_right_side",
@@ -113,6 +114,19 @@ def element_hessian(gradient, weight, pixels):
         for a in range(3):
             for b in range(3):
                 out[e, a, b] += float(weight[i]) * phi[a] * phi[b] * np.array([gx * gx, gx * gy, gy * gy])
+    return out
+
+
+def element_block_products(gradient, weight, pixels, sign, side, apart):
+    """Sums (apart apart, E, 3, 3) of s w (gx gx, gx gy, gy gy) phi_a over the blocks of each place."""
+    out = np.zeros((apart * apart, len(pixels.offsets) - 1, 3, 3))
+    top, left, _, _ = pixels.bounds
+    for e, i in owned(pixels):
+        row, column = (int(pixels.rows[i]) - top) // side, (int(pixels.columns[i]) - left) // side
+        gx, gy, phi = float(gradient[0][i]), float(gradient[1][i]), shape_functions(pixels, e, i)
+        for a in range(3):
+            product = float(sign[row, column]) * float(weight[i]) * phi[a] * np.array([gx * gx, gx * gy, gy * gy])
+            out[row % apart * apart + column % apart, e, a] += product
     return out
 
 

@@ -15,6 +15,7 @@ from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
 __all__ = [
     "BLOCK",
+    "element_block_products",
     "element_hessian",
     "element_right_side",
     "element_squares",
@@ -245,6 +246,46 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
             for b in range(a):
                 for c in range(3):
                     out[e, a, b, c] = out[e, b, a, c]
+
+
+@over_ranges("out", axis=1)
+@compiled(fastmath=_FAST)
+def element_block_products(
+    start, stop, gradient_x, gradient_y, weight, runs, run_offsets, origin, barycentric, sign, side, apart, out,
+):  # fmt: skip
+    """Project one light's ``s w D`` on the shape functions, the blocks of `side` px of each place for themselves.
+
+    `sign` (h, w) float32 holds s of each block; row and column of a block give its place modulo `apart`. `origin`
+    (E, 2) counts from the first block's first pixel. ``out`` (apart apart, E, 3, 3) receives the sums over shape
+    functions and D = (gx gx, gx gy, gy gy), added to what it holds.
+    """
+    for e in range(start, stop):
+        for run in range(run_offsets[e], run_offsets[e + 1]):
+            slot, left, x, y = runs[run, 0], runs[run, 1], runs[run, 2], runs[run, 3]
+            row = (origin[e, 1] + y) // side
+            while left > 0:
+                block = (origin[e, 0] + x) // side
+                number = min(left, (block + 1) * side - origin[e, 0] - x)
+                xx = xy = yy = turn_xx = turn_xy = turn_yy = _ZERO
+                first = np.uint64(slot)
+                for i in range(np.uint32(number)):
+                    t = np.float32(np.int32(i))
+                    wx, wy = weight[first + i] * gradient_x[first + i], weight[first + i] * gradient_y[first + i]
+                    p, q, r = wx * gradient_x[first + i], wx * gradient_y[first + i], wy * gradient_y[first + i]
+                    xx += p
+                    xy += q
+                    yy += r
+                    turn_xx += p * t
+                    turn_xy += q * t
+                    turn_yy += r * t
+                place = row % apart * apart + block % apart
+                for a in range(3):
+                    slope = sign[row, block] * barycentric[e, a, 1]
+                    value = sign[row, block] * (barycentric[e, a, 0] + barycentric[e, a, 2] * y) + slope * x
+                    out[place, e, a, 0] += value * xx + slope * turn_xx
+                    out[place, e, a, 1] += value * xy + slope * turn_xy
+                    out[place, e, a, 2] += value * yy + slope * turn_yy
+                slot, left, x = slot + number, left - number, x + number
 
 
 @over_ranges("elements")

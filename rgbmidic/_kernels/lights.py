@@ -10,7 +10,7 @@ import numpy as np
 from rgbmidic._kernels.interpolation import _FAST
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
-__all__ = ["PAD", "best_mean", "malvar", "pad_mosaic", "robust_weights", "scores", "unmix"]
+__all__ = ["PAD", "best_mean", "gradient_of_others", "malvar", "pad_mosaic", "robust_weights", "scores", "unmix"]
 
 BLOCK = 4096
 """Pixels at a time: what a core's fastest cache holds."""
@@ -113,6 +113,45 @@ def malvar(start, stop, padded, red_row, red_column, out):
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+
+
+@over_ranges("mean", axis=1, grain=BLOCK)
+@compiled(fastmath=_FAST)
+def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, products):
+    """Mean gradient of the lights other than `light`, and its products with that light's own.
+
+    For gradients (2, k, P) and weights (k, P): `mean` (2, P) receives the mean of the others that have weight; where
+    they are fewer than `fewest`, that of all that have. `products` (4, P) receives own times mean, mean times mean, own
+    times own and 1, all 0 where the light has no weight.
+    """
+    count, less, total = np.empty((3, BLOCK), dtype=np.float32)
+    own, lights = np.uint64(light), np.uint64(len(weights))
+    for block in range(start, stop, BLOCK):
+        first, number = np.uint64(block), np.uint64(min(BLOCK, stop - block))
+        for i in range(number):
+            count[i] = _ZERO
+        for j in range(lights):
+            for i in range(number):
+                count[i] += _ONE if weights[j, first + i] > _ZERO else _ZERO
+        for i in range(number):
+            seen = _ONE if weights[own, first + i] > _ZERO else _ZERO
+            less[i] = seen if count[i] - seen >= fewest else _ZERO
+            products[3, first + i] = seen
+        for axis in range(np.uint64(2)):
+            for i in range(number):
+                total[i] = _ZERO
+            for j in range(lights):
+                for i in range(number):
+                    total[i] += gradient[axis, j, first + i] if weights[j, first + i] > _ZERO else _ZERO
+            for i in range(number):
+                slope = gradient[axis, own, first + i]
+                mean[axis, first + i] = (total[i] - less[i] * slope) / max(count[i] - less[i], _ONE)
+        for i in range(number):
+            seen, x, y = products[3, first + i], gradient[0, own, first + i], gradient[1, own, first + i]
+            u, v = mean[0, first + i], mean[1, first + i]
+            products[0, first + i] = seen * (x * u + y * v)
+            products[1, first + i] = seen * (u * u + v * v)
+            products[2, first + i] = seen * (x * x + y * y)
 
 
 @over_ranges("fraction", axis=1, grain=BLOCK)

@@ -285,7 +285,7 @@ def _conclude(w, frames, reference, base, sums, lines, out):
                     out[1, o + 2 + 2 * side, i] = (part[3] + part[2]) / part[0] - mean**2
 
 
-@over_ranges("values")
+@over_ranges("values", least=0)
 @compiled()
 def mean_rates(start, stop, times, values, noise, common, reference, most, out):
     """Value, velocity and acceleration of series (N, T), those from before and from after each frame, and variances.

@@ -374,7 +374,7 @@ def _light(energy, left, work, rows, span, lights, j, frame, body, paint):
             line[s] = power * square * total if (row[_SEEN + s] > _ZERO) & (nl > _ZERO) & (ml > _ZERO) else _ZERO
 
 
-@over_ranges("out", axis=1, grain=TILE)
+@over_ranges("out", axis=1, grain=TILE, least=0)
 @compiled()
 def trace_rows(
     start, stop, out, first_row, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed
@@ -438,7 +438,7 @@ def _decimate(out, line, samples, taps):
         out[c] = total
 
 
-@over_ranges("out", grain=_POINTS)
+@over_ranges("out", grain=_POINTS, least=0)
 @compiled()
 def sample_paint(start, stop, out, points, body, paint, counts, seed):
     """Cover, height (mm) and slope vector of the paint at points on the body: `out` (N, 5)."""

@@ -77,7 +77,7 @@ thread .05 to .1 ms to begin and to report (measured)."""
 
 
 def over_ranges(
-    array: str, *, axis: int = 0, grain: int = 1, least: int = _LEAST
+    array: str, *, axis: int = 0, grain: int = 1, least: int | None = None
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Share the items of a compiled ``kernel(start, stop, *arguments)``, which is called without the first two.
 
@@ -88,8 +88,8 @@ def over_ranges(
     grain : int
         Ranges start at multiples of it: what is vectorised or gathered in blocks of so many items stays the same on
         any number of threads.
-    least : int
-        Entries of its largest array from which threads share a kernel.
+    least : int, optional
+        Entries of its largest array from which threads share a kernel; some 65,000 without.
     """
 
     def shared(kernel: Any) -> Callable[..., None]:
@@ -99,7 +99,8 @@ def over_ranges(
         @wraps(kernel)
         def call(*arguments: Any) -> None:
             most = threads()
-            if most > 1 and max(getattr(argument, "size", 0) for argument in arguments) < least:
+            entries = max(getattr(argument, "size", 0) for argument in arguments) if most > 1 else 0
+            if entries < (_LEAST if least is None else least):
                 most = 1
             _share(kernel, arguments, arguments[position].shape[axis], grain, most)
 

@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from scipy.linalg import eigh
 from scipy.sparse.linalg import splu
 
-from rgbmidic._kernels.correlation import element_hessian
+from rgbmidic._kernels.correlation import element_block_products, element_hessian
 from rgbmidic._kernels.mesh import factorise, solve_factors
 from rgbmidic.mesh import PixelMap, Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
@@ -381,28 +381,22 @@ def unfitted_fraction(
     side
         Of the blocks, px.
     """
-
-    def summed(signs: FloatImage | np.float32) -> FloatArray:
-        out = np.zeros((len(pixels.origin), 3, 3, 3))
-        own, geometry = np.empty_like(out), pixels.positions
-        for gx, gy, weight in zip(*gradient, weights, strict=True):
-            element_hessian(gx, gy, weight * signs, *geometry, own)
-            out += own
-        return out
-
-    hessian = summed(np.float32(1))
-    total = float(hessian[..., (0, 2)].sum())
-    if not total:
-        return 1.0
     rows, columns = pixels.grid(side)
     apart = int(np.clip(np.ceil(2 * np.sqrt(_MANY / (rows * columns))), 2, 4))
     sign = np.random.default_rng(0).choice(np.array([-1, 1], dtype=np.float32), (rows, columns))
+    top, left, _, _ = pixels.bounds
+    place = pixels.runs, pixels.run_offsets, pixels.origin - (left, top), pixels.barycentric
+    hessian, products = np.zeros((len(pixels.origin), 3, 3, 3)), np.zeros((apart**2, len(pixels.origin), 3, 3))
+    own = np.empty_like(hessian)
+    for gx, gy, weight in zip(*gradient, weights, strict=True):
+        element_hessian(gx, gy, weight, *pixels.positions, own)
+        hessian += own
+        element_block_products(gx, gy, weight, *place, sign, side, apart, products)
+    total = float(hessian[..., (0, 2)].sum())
+    if not total:
+        return 1.0
     projected = []
-    for place in np.ndindex(apart, apart):
-        chosen = np.zeros_like(sign)
-        chosen[place[0] :: apart, place[1] :: apart] = sign[place[0] :: apart, place[1] :: apart]
-        products = summed(pixels.in_blocks(chosen, side)).sum(axis=1)  # the shape functions of an element add up to 1
-        xx_to_yy = assembly.at_nodes(products)
+    for xx_to_yy in map(assembly.at_nodes, products):
         projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
     sides, anchor = np.stack(projected, axis=1), _ANCHOR * total / assembly.size
     solve = assembly.factorise(assembly.matrix(hessian, anchor * assembly.diagonal))

@@ -23,6 +23,7 @@ __all__ = [
     "usable_reach",
     "window_covariance",
     "window_means",
+    "window_ratios",
 ]
 
 _GAUSSIAN = np.exp(-(np.arange(-3, 4) ** 2) / 2)
@@ -113,8 +114,14 @@ _COARSE = 4
 
 
 def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-    """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P) or (1, P)."""
+    """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
     return _means(pixels.block_sums(fields * weights, _COARSE), pixels.block_sums(weights, _COARSE))
+
+
+def window_ratios(pixels: PixelMap, fields: FloatImage) -> FloatImage:
+    """Sums of fields (n, P) around each block of the grid over that of the last one, (n - 1, h, w)."""
+    sums = pixels.block_sums(fields, _COARSE)
+    return _means(sums[:-1], sums[-1:])
 
 
 def window_covariance(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:

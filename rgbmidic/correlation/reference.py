@@ -19,6 +19,7 @@ from rgbmidic._kernels.correlation import (
     warp,
 )
 from rgbmidic._kernels.interpolation import pixel_gradient, sample_with_gradient
+from rgbmidic._kernels.lights import gradient_of_others
 from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
 from rgbmidic.correlation.images import (
     spline_coefficients,
@@ -26,7 +27,7 @@ from rgbmidic.correlation.images import (
     spread,
     usable_pixels,
     usable_reach,
-    window_means,
+    window_ratios,
 )
 from rgbmidic.correlation.recovery import NodeColouring, linear_fit_offset
 from rgbmidic.errors import InputError
@@ -454,31 +455,27 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
     """
     if gradient.shape[1] == 1:
         return gradient
-    used = np.asarray(weights > 0, dtype=np.float32)
-    total, count = (gradient * used).sum(axis=1), used.sum(axis=0)
-    everyone = total / np.maximum(count, 1)
-    out = np.empty_like(gradient)
-    for light, seen in enumerate(used):
-        own, others = gradient[:, light], count - seen
-        mean = np.where(others > 1, (total - own * seen) / np.maximum(others, 1), everyone)
-        contrast, correlation = _regression(own, mean, seen, pixels)
-        if correlation < _SHARED:
-            mean = everyone
-            contrast, _ = _regression(own, mean, seen, pixels)
+    out, mean = np.empty_like(gradient), np.empty((2, weights.shape[1]), dtype=np.float32)
+    products = np.empty((4, weights.shape[1]), dtype=np.float32)
+    for light in range(len(weights)):
+        for fewest in (2, len(weights)):  # others; there are never so many
+            gradient_of_others(gradient, weights, light, fewest, mean, products)
+            contrast, correlation = _regression(products, pixels)
+            if correlation >= _SHARED:
+                break
         np.multiply(mean, contrast, out=out[:, light])
     return out
 
 
-def _regression(own: FloatImage, mean: FloatImage, used: FloatImage, pixels: PixelMap) -> tuple[FloatImage, float]:
-    """Regress a light's `own` gradient (2, P) on the `mean` (2, P), locally.
+def _regression(products: FloatImage, pixels: PixelMap) -> tuple[FloatImage, float]:
+    """Regress a light's own gradient on another, locally; their `products` (4, P) are those of `gradient_of_others`.
 
     Returns
     -------
     tuple
         The coefficient (P,), at least 0, and the median of the correlation coefficient.
     """
-    products = np.stack([(mean * own).sum(axis=0), (mean**2).sum(axis=0), (own**2).sum(axis=0)])
-    along, square, power = window_means(pixels, products, used[None])
+    along, square, power = window_ratios(pixels, products)
     known = (square > 0) & (power > 0)
     correlation = along[known] / np.sqrt(square[known] * power[known])
     contrast = np.divide(along, square, out=np.zeros_like(along), where=known)

@@ -266,29 +266,25 @@ def _noise(planes: Sequence[_Plane], repeat: Sequence[_Plane] | None, step: int)
             for a, b, c, d in zip(difference, mean, variance, flatness, strict=True)
         ]
     )
-    frames = 2 if repeat else 1
-    whole = slice(None)
-    groups = [(number, level) for number in (*range(len(planes)), whole) for level in (*range(LEVELS), whole)]
-    found: list[tuple[float, str, float, float]] = []
-    for number, level in groups:
-        for fraction in range(len(FLATTEST)):
-            sums = counts[number, level, fraction].reshape(-1, 6).sum(axis=0).tolist()
-            count, expected, chance, level_mean, deviation, places = sums
-            error = SIGNIFICANCE * np.sqrt(SHARED * chance)
-            if places and (count - expected > error or (repeat and expected - count > error)):
-                name = planes[number].name if isinstance(number, int) else "all colours"
-                found.append((count / expected, name, level_mean / places, deviation / places / np.sqrt(frames)))
-    if not found:
-        return
-    for (ratio, name, at, calibrated), doubtful in ((max(found), QUIET), (min(found), 1 / QUIET)):
-        if ratio > doubtful > 1 or ratio < doubtful < 1:
-            other = "" if ratio > 1 else ", motion between the two frames"
+    # of every colour and of all, at every grey level and at all
+    counts = np.concatenate([counts, counts.sum(axis=0, keepdims=True)])
+    counts = np.concatenate([counts, counts.sum(axis=1, keepdims=True)], axis=1)
+    count, expected, chance, level, deviation, places = np.moveaxis(counts, -1, 0)
+    beyond = (count - expected) / (SIGNIFICANCE * np.sqrt(SHARED * np.maximum(chance, 1e-9)))
+    ratio = np.divide(count, expected, out=np.ones_like(count), where=(beyond > 1) | ((beyond < -1) & bool(repeat)))
+    for where, doubtful in ((int(ratio.argmax()), QUIET), (int(ratio.argmin()), 1 / QUIET)):
+        at = np.unravel_index(where, ratio.shape)
+        if ratio[at] > doubtful > 1 or ratio[at] < doubtful < 1:
+            name = [*(plane.name for plane in planes), "all colours"][at[0]]
+            calibrated = deviation[at] / places[at] / np.sqrt(2 if repeat else 1)
+            other = "" if ratio[at] > 1 else ", motion between the two frames"
             yield Mismatch(
                 check="noise",
-                certain=ratio > QUIETER,
-                text=f"the noise of {name} at {at:.0f} DN above black is {calibrated / ratio:.2g} DN"
-                f"{'' if repeat else ' or less'}, the calibration states {calibrated:.2g} DN (another camera or gain, "
-                f"gamma, noise reduction, interpolated samples, black level{other}?)",
+                certain=bool(ratio[at] > QUIETER),
+                text=f"the noise of {name} at {level[at] / places[at]:.0f} DN above black is "
+                f"{calibrated / ratio[at]:.2g} DN{'' if repeat else ' or less'}, the calibration states "
+                f"{calibrated:.2g} DN (another camera or gain, gamma, noise reduction, interpolated samples, black "
+                f"level{other}?)",
             )
 
 

@@ -167,13 +167,6 @@ class PixelMap:
         from_grid(self.lines, self.line_offsets, np.ascontiguousarray(grids, dtype=np.float32), side, out)
         return out
 
-    def in_blocks(self, grid: FloatImage, side: int) -> FloatImage:
-        """Return the value of its block in such a grid (rows, columns) for every owned pixel (P,)."""
-        image = np.repeat(np.repeat(grid, side, axis=1), side, axis=0)[None]
-        out = np.empty((1, self.local_x.size), dtype=np.float32)
-        from_image(self.lines, image, 0, 0, out)
-        return np.asarray(out[0])
-
     def window(self, values: FloatImage) -> FloatImage:
         """`values` (n, P) as images of the rectangle `bounds`; 0 where no pixel is owned."""
         images = np.zeros((len(values), *self.bounds[2:]), dtype=np.float32)

@@ -26,11 +26,12 @@ _FREEDOM = 4.0
 who found 4 to work well). With 2 or 8 lights under a reflection differ by 2e-3 px at most, beside a gap by 4e-2, their
 uncertainty by 11 % (benchmarks/constants.py)."""
 _LEAST_VARIANCE = 0.1
-"""Least variance of a light's residual that is believed, over the median of all. Chosen: noise varies less over a
-frame, so that less is a saturated image."""
+"""Least variance of a light's residual that is believed, over the median of all. Chosen; with half or twice of it
+lights under a reflection do not change, those beside a gap by 8e-2 px at most, their uncertainty by 42 %
+(benchmarks/constants.py)."""
 _ROUNDING = 1e-6
-"""Least variance of a residual, over that of the grey levels, where two images are the same: a residual of 1e-3 of the
-contrast. Chosen, far above the rounding of the spline in single precision."""
+"""Least variance of a residual, over that of the grey levels, where two images are the same. Chosen; with half or twice
+of it nothing changes (benchmarks/constants.py)."""
 _OWN = 0.1
 """Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same."""
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bits import assert_same_on_threads
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from textures import Affine, Texture, noisy_pair
 
 from rgbmidic import Solution, Status, correlate
-from rgbmidic._kernels.threads import set_threads, threads
 
 SHAPE = (120, 132)
 REGION = (18, 16, 112, 104)
@@ -123,14 +123,12 @@ def test_an_excluded_light_has_no_say():
 
 def test_the_same_bits_every_time_and_on_any_number_of_threads():
     pair = strained(5)
-    first = correlate(*pair, region=REGION)
-    before, results = threads(), [correlate(*pair, region=REGION)]
-    try:
-        for number in (1, 2, 5):
-            set_threads(number)
-            results.append(correlate(*pair, region=REGION))
-    finally:
-        set_threads(before)
-    for result in results:
-        np.testing.assert_array_equal(result.displacement, first.displacement)
-        np.testing.assert_array_equal(result.displacement_std, first.displacement_std)
+
+    def found():
+        results = [correlate(*pair, region=REGION) for _ in range(2)]
+        return [values for result in results for values in (result.displacement, result.displacement_std)]
+
+    assert_same_on_threads(found)
+    first, first_std, second, second_std = found()
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(first_std, second_std)

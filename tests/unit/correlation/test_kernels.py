@@ -143,6 +143,22 @@ def test_hessian_equals_the_naive_twin(outlined):
     close(out, naive.element_hessian(case.gradient, case.weight, case.pixels))
 
 
+@pytest.mark.parametrize(("outlined", "side", "apart"), [(False, 4, 2), (True, 4, 3), (True, 50, 2)])
+def test_products_of_blocks_equal_the_naive_twin(outlined, side, apart):
+    case = scene(6, outlined=outlined)
+    sign = case.random.choice(np.float32([-1, 1]), case.pixels.grid(side))
+    out = block_products(case, sign, side, apart, fill=2.0) - 2.0
+    close(out, naive.element_block_products(case.gradient, case.weight, case.pixels, sign, side, apart))
+
+
+def block_products(case, sign, side, apart, fill=0.0):
+    """What `element_block_products` adds."""
+    pixels, out = case.pixels, np.full((apart * apart, len(case.mesh.elements), 3, 3), fill)
+    place = pixels.runs, pixels.run_offsets, pixels.origin - pixels.bounds[1::-1], pixels.barycentric
+    kernels.element_block_products(*case.gradient, case.weight, *place, sign, side, apart, out)
+    return out
+
+
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_what_is_brought_back_equals_the_naive_twins(motion):
     case = scene(6, motion)
@@ -234,7 +250,8 @@ def all_outputs():
     kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, vector)
     kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
-    found = right, hessian, difference, weights, moments, squares, sums, vector, fields, curved
+    blocks = block_products(case, np.ones(case.pixels.grid(7), dtype=np.float32), 7, 2)
+    found = right, hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks
     return [case.coefficients, *found]
 
 

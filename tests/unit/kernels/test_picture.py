@@ -5,9 +5,9 @@ from __future__ import annotations
 import naive_picture
 import numpy as np
 import pytest
+from bits import assert_same_on_threads
 
 from rgbmidic._kernels.interpolation import paint_field
-from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.mesh import Region, Tri3Mesh
 
 MESH = Tri3Mesh.from_region(Region.from_rectangle((3, 2, 40, 30), (34, 46)), 9)
@@ -40,13 +40,11 @@ def test_it_paints_as_its_naive_twin(seed, nearest):
 
 
 def test_any_number_of_threads_paints_the_same():
-    given, before = arguments(5, nearest=False), threads()
-    one, three = np.zeros((2, 34, 46), dtype=np.uint32)
-    try:
-        set_threads(1)
-        paint_field(one, *given)
-        set_threads(3)
-        paint_field(three, *given)
-    finally:
-        set_threads(before)
-    assert (one == three).all()
+    given = arguments(5, nearest=False)
+
+    def painted():
+        image = np.zeros((34, 46), dtype=np.uint32)
+        paint_field(image, *given)
+        return [image]
+
+    assert_same_on_threads(painted)

@@ -7,7 +7,7 @@ import pytest
 from bits import assert_same_on_threads
 
 from rgbmidic._kernels.interpolation import product_sums
-from rgbmidic._kernels.lights import scores
+from rgbmidic._kernels.lights import gradient_of_others, scores
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 
@@ -30,8 +30,6 @@ def expected_blocks(pixels, side):
 def expected_sums(pixels, fields, side):
     row, column = expected_blocks(pixels, side)
     assert pixels.grid(side) == (row.max() + 1, column.max() + 1)
-    numbers = np.arange(np.prod(pixels.grid(side)), dtype=np.float32).reshape(pixels.grid(side))
-    np.testing.assert_array_equal(pixels.in_blocks(numbers, side), row * (column.max() + 1) + column)
     wanted = np.zeros((len(fields), *pixels.grid(side)))
     np.add.at(wanted, (slice(None), row, column), fields)
     return wanted
@@ -66,15 +64,35 @@ def test_scores_of_all_lights_together():
     np.testing.assert_array_equal(out[3], (weight > 0).any(axis=0))
 
 
+@pytest.mark.parametrize("fewest", [2, 3])
+@pytest.mark.parametrize("light", [0, 2])
+def test_gradient_of_the_other_lights(light, fewest):
+    random = np.random.default_rng(5)
+    gradient, weights = random.normal(size=(2, 3, 5000)).astype(np.float32), random.uniform(-1, 1, size=(3, 5000))
+    mean, products = np.full((2, 5000), 7, dtype=np.float32), np.full((4, 5000), 7, dtype=np.float32)
+    gradient_of_others(gradient, weights.astype(np.float32), light, fewest, mean, products)
+    for i in range(5000):
+        every = [j for j in range(3) if weights[j, i] > 0]
+        others = [j for j in every if j != light]
+        chosen = others if len(others) >= fewest else every
+        wanted, own = gradient[:, chosen, i].sum(axis=1) / max(len(chosen), 1), gradient[:, light, i]
+        np.testing.assert_allclose(mean[:, i], wanted, atol=1e-5)
+        expected = np.array([own @ wanted, wanted @ wanted, own @ own, 1]) * (light in every)
+        np.testing.assert_allclose(products[:, i], expected, atol=1e-5)
+
+
 def test_the_same_bits_on_one_and_three_threads(pixels):
     values = np.random.default_rng(3).uniform(size=(2, pixels.rows.size)).astype(np.float32)
 
     def found():
         sums, summed = np.zeros((2, 2, 2, *pixels.grid(4)), np.float32), np.zeros((4, 20000), np.float32)
         product_sums(values, values, pixels.lines, pixels.line_offsets, 4, sums)
-        scores(*[np.resize(values, (2, 20000))] * 4, summed)
+        many = np.resize(values, (2, 20000))
+        scores(many, many, many, many, summed)
+        mean, products = np.zeros((2, 20000), np.float32), np.zeros((4, 20000), np.float32)
+        gradient_of_others(np.stack([many, many**2]), many, 1, 1, mean, products)
         blocks = pixels.block_sums(values, 5)
-        return sums, summed, blocks, pixels.from_blocks(blocks, 5), pixels.window(values)
+        return sums, summed, mean, products, blocks, pixels.from_blocks(blocks, 5), pixels.window(values)
 
     assert_same_on_threads(found)
 

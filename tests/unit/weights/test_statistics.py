@@ -9,6 +9,7 @@ from rgbmidic.correlation import Precision
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh import Region
 from rgbmidic.weights import MaskWeights, Statistics
+from rgbmidic.weights.statistics import _OWN, _best_fractions
 
 SIDE = 160
 REGION = (15, 15, SIDE - 16, SIDE - 16)
@@ -69,6 +70,19 @@ def test_weights_that_learn_are_asked_for_their_precision(statistics):
     weights = MasksOfOneLight(np.ones((3, SIDE, SIDE)))
     _, last = measure_sequence(states, region=REGION, statistics=statistics, weights=weights)
     np.testing.assert_allclose(last.weight_fraction, [0.5, 0, 0.5])
+
+
+@pytest.mark.parametrize("lights", [1, 2, 3, 5])
+def test_the_best_fractions_are_the_inverse_covariance_times_one(lights):
+    random = np.random.default_rng(lights)
+    residuals = random.normal(size=(6, 7, lights, 40)) + random.normal(size=(6, 7, 1, 40))
+    covariance = residuals @ residuals.swapaxes(2, 3)
+    bounded = covariance.copy()
+    own = np.broadcast_to(np.eye(lights, dtype=bool), covariance.shape)
+    bounded[~own] *= 1 - _OWN
+    wanted = np.linalg.solve(bounded, np.ones((lights, 1)))[..., 0]
+    found = _best_fractions(np.moveaxis(covariance, (2, 3), (0, 1)).astype(np.float32), np.float32(1e-3))
+    np.testing.assert_allclose(np.moveaxis(found, 0, 2), wanted, rtol=1e-3, atol=1e-6)
 
 
 def test_two_copies_of_a_light_count_nearly_as_one():
