@@ -378,13 +378,14 @@ class Rectification:
         points = np.array(place[: len(place) // 2 * 2], dtype=np.float64).reshape(-1, 2)
         return (*(self.camera.to_mm(points) / self.units.mm_per_pixel).ravel().tolist(), *place[2 * len(points) :])
 
-    def displacement(self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) -> FloatArray:
-        """Rectify the displacement of every node and its standard uncertainty, (N,) each in px; stacked (4, N)."""
-        field = np.stack([u, v, u_std, v_std]).astype(np.float64)
+    def displacement(
+        self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Rectify the displacement of every node and its standard uncertainty, (N,) each in px; NaN stays NaN."""
         if self.camera is None or self.units.mm_per_pixel is None:
-            return field
-        moved = self.image.nodes + field[:2].T
+            return u, v, u_std, v_std
+        moved = self.image.nodes + np.stack([u, v], axis=1)
+        along = self.camera.to_mm(moved) / self.units.mm_per_pixel - self.mesh.nodes
         slopes = self.camera.jacobian(moved) / self.units.mm_per_pixel
-        field[:2] = (self.camera.to_mm(moved) / self.units.mm_per_pixel - self.mesh.nodes).T
-        field[2:] = np.sqrt((slopes**2 @ (field[2:].T ** 2)[:, :, None])[:, :, 0]).T
-        return field
+        std = np.sqrt(np.einsum("nij,jn->in", slopes**2, np.square([u_std, v_std], dtype=np.float64)))
+        return along[:, 0], along[:, 1], std[0], std[1]

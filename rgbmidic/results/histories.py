@@ -233,7 +233,8 @@ def _read(
     motions = np.full((len(clock), 3, 2), np.nan)
     speed, before = np.full(len(clock), np.nan), np.full((2, len(rectified.mesh.nodes)), np.nan)
     for row, values in enumerate(each):
-        field = rectified.displacement(*(values[name] for name in ("u", "v", "u_std", "v_std")))
+        parts = rectified.displacement(*(values[name] for name in ("u", "v", "u_std", "v_std")))
+        field = np.stack(parts).astype(np.float64)
         moved = np.hypot(*(field[:2] - before))
         if row and np.isfinite(moved).any():
             speed[row] = np.nanpercentile(moved, _FAST) / (clock[row] - clock[row - 1])

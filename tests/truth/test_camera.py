@@ -133,7 +133,8 @@ def test_stated_uncertainty_is_that_of_noise_and_of_the_calibration(tmp_path: Pa
     exact = MOTIONS["translation"][0](np.zeros((1, 2)))[0]
     axes = turn_of(where, lens)
     errors = [
-        (one.units.mm_per_pixel or 0) * one.displacement(*field, 0 * field[0], 0 * field[0])[:2].T - exact @ axes.T
+        (one.units.mm_per_pixel or 0) * np.stack(one.displacement(*field, 0 * field[0], 0 * field[0])[:2], axis=1)
+        - exact @ axes.T
         for one in found
     ]
     actual = np.sqrt(np.mean(np.sum(np.square(errors), axis=2)))
