@@ -26,6 +26,7 @@ from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings, read_test
 from rgbmidic.typing import FloatArray
+from rgbmidic.view.fields import Fields
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 
 BOX = (60.0, 60.0, 580.0, 420.0)
@@ -200,6 +201,10 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
     assert float(data.x_mm[node]) == pytest.approx(camera.to_mm(place[None])[0, 0])
     np.testing.assert_allclose(data.strain[1, :, 0], values["exx"], rtol=1e-5)
     assert data.u_mm.units == "mm"
+    viewed = Fields.of(result)
+    assert viewed.read("u", 1).values[node] == pytest.approx(u, abs=1e-6)
+    np.testing.assert_allclose(viewed.read("exx", 1).values, values["exx"])
+    np.testing.assert_allclose(viewed.read("u", 1).moved[node], now)
     write_report(result, folder / "report.html")
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert "lens and plane" in text

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from small_tests import SHAPE, SmallTest, colour_test, grey_frame
 
-from rgbmidic import Calibration, Status, cli, correlate, measure, read_frame, read_test
+from rgbmidic import Calibration, CameraCalibration, Status, cli, correlate, measure, read_frame, read_test
 from rgbmidic.command import execute
 from rgbmidic.errors import CalibrationError, FrameError
 from rgbmidic.frames import open_series
@@ -161,6 +161,17 @@ def _mask_of_another_size(folder: Path, out: Path) -> tuple[list[str], Sequence[
     return _changed(test, "", out), [r"\(120, 100\)", r"\(144, 144\)"]
 
 
+def _camera_of_another_size(folder: Path, out: Path) -> tuple[list[str], Sequence[str]]:
+    test = _colour(folder)
+    CameraCalibration(shape=(100, 120), homography=np.diag([0.1, 0.1, 1])).write(test.folder / "camera.json")
+    return _changed(test, '[scale]\ncamera = "camera.json"\n', out), [r"scale\.camera", "120 x 100 px", "144 x 144 px"]
+
+
+def _two_scales(folder: Path, out: Path) -> tuple[list[str], Sequence[str]]:
+    scale = '[scale]\ncamera = "camera.json"\nmm_per_pixel = 0.1\n'
+    return _changed(_colour(folder), scale, out), [r"scale\.camera", r"scale\.mm_per_pixel"]
+
+
 def _another_test_than_the_result(folder: Path, out: Path) -> tuple[list[str], Sequence[str]]:
     test = _colour(folder)
     arguments = _changed(test, "", out)
@@ -183,6 +194,8 @@ CASES: Mapping[tuple[str, str, str], Case] = {
     ("names of the lights", "the calibration", "SCENE.toml"): _lights_of_another_scene,
     ("size of the mask", "the file", "`region.mask`"): _mask_of_another_size,
     ("size of the scene", "the file", "SCENE.toml"): _scene_of_another_size,
+    ("size of lens and plane", "the file", "`scale.camera`"): _camera_of_another_size,
+    ("scale", "`scale.mm_per_pixel`", "`scale.camera`"): _two_scales,
     ("the test", "the result", "`run --resume`"): _another_test_than_the_result,
 }
 
@@ -190,7 +203,7 @@ CASES: Mapping[tuple[str, str, str], Case] = {
 def test_every_pair_of_the_table_is_walked_through() -> None:
     pairs = {(row, *pair) for row, sayers in ROWS.items() for pair in combinations(sayers, 2)}
     assert pairs == set(CASES)
-    assert len(ROWS) == 11
+    assert len(ROWS) == 13
 
 
 @pytest.mark.parametrize("pair", CASES, ids=lambda pair: "-".join(pair).replace("`", ""))
