@@ -69,12 +69,12 @@ def undistorted(lens: FloatArray, points: FloatArray) -> FloatArray:
     By fixed-point iteration, which gains a factor of 15 with each step where the distortion is 2 % (derived).
     """
     straight = points
-    for _ in range(_INVERSE):
-        step = points - distorted(lens, straight)
-        straight = straight + step
-        if not (np.abs(step) > _EXACT).any():
-            break
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):  # where there is no inverse
+        for _ in range(_INVERSE):
+            step = points - distorted(lens, straight)
+            straight = straight + step
+            if not (np.abs(step) > _EXACT).any():
+                break
         return np.asarray(np.where(np.abs(distorted(lens, straight) - points) < 1e-6, straight, np.nan))
 
 

@@ -270,7 +270,7 @@ class MapDrawer:
     def __init__(self, result: Result, dpi: int | None = None) -> None:
         from matplotlib.tri import Triangulation
 
-        self.result, self._dpi = result, dpi
+        self.result, self._dpi, self._physical = result, dpi, Physical.untimed(result)
         self._figures: dict[int, Figure] = {}
         self._mesh = Triangulation(result.nodes[:, 0], result.nodes[:, 1], result.elements)
         low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
@@ -283,7 +283,7 @@ class MapDrawer:
     def of_kind(self, frame: int, kind: str) -> Figure:
         """Draw one of `MAPS` of a frame, as `map_figure` does."""
         record = self.result.frame(frame)
-        physical, values = Physical.untimed(self.result), {**record.values}
+        physical, values = self._physical, {**record.values}
         if physical.rectified.camera is not None:
             values |= physical.frame(frame)
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -129,6 +130,11 @@ def test_stated_uncertainty_is_that_of_noise_and_of_the_calibration(tmp_path: Pa
     stated = rectified.displacement(*field, STD[0] * one, STD[1] * one)[2:]
     ratio = np.std(draws, axis=0) / stated
     assert np.abs(ratio.mean(axis=1) - 1).max() < 0.02
+    field[:, 7] = np.nan  # a node without data
+    np.testing.assert_array_equal(
+        np.isnan(rectified.displacement(*field, one, one)), np.broadcast_to(np.arange(NODES) == 7, (4, NODES))
+    )
+    field = moved(where, lens, MOTIONS["translation"][0])
     # the camera's own: calibrations that differ by the noise of their corners alone
     found = [Rectification.of(MESH, ScaleSettings(), calibrated(where, lens, seed)) for seed in range(8)]
     exact = MOTIONS["translation"][0](np.zeros((1, 2)))[0]
@@ -201,6 +207,7 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
     assert float(data.x_mm[node]) == pytest.approx(camera.to_mm(place[None])[0, 0])
     np.testing.assert_allclose(data.strain[1, :, 0], values["exx"], rtol=1e-5)
     assert data.u_mm.units == "mm"
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(data)).strain, data.strain)
     viewed = Fields.of(result)
     assert viewed.read("u", 1).values[node] == pytest.approx(u, abs=1e-6)
     np.testing.assert_allclose(viewed.read("exx", 1).values, values["exx"])
@@ -228,6 +235,9 @@ def test_another_camera_takes_its_place_and_contradictions_are_refused(
         read_histories(result, ProbeSettings(points=((300, 200),)), scale=ScaleSettings(camera=folder / "other.json"))
     with pytest.raises(CalibrationError, match=r"not found: .*none\.json"):
         result.to_xarray(ScaleSettings(camera=folder / "none.json"))
+    replace(camera, lens=camera.lens * [1, 1, 1, -40, 1, 1, 1, 1]).write(folder / "bent.json")
+    with pytest.raises(InputError, match=r"bent\.json does not image all of the mesh"):
+        Physical.of(result, ScaleSettings(camera=folder / "bent.json"))
     with pytest.raises(ConfigurationError, match=r"scale\.camera .* scale\.mm_per_pixel"):
         ScaleSettings(camera=folder / "camera.json", mm_per_pixel=0.1)
     test = folder / "TEST.toml"
