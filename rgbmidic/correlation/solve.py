@@ -246,6 +246,13 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
     """Run passes until the weights have settled."""
     tolerance = problem.options.tolerance
     weighting = first_weighting(problem, estimate)
+    if not weighting.matched.all():
+        from rgbmidic.correlation.start import nearer
+
+        moved = Estimate.start(problem, nearer(weighting.residual, estimate.displacement))
+        closer = first_weighting(problem, moved)
+        if closer.matched.sum() > weighting.matched.sum():
+            estimate, weighting = moved, closer
     equations: Equations | None = None
     for number in range(_PASSES):
         if equations is not None and not refining(problem, weighting, number) and settled(weighting, equations):

@@ -350,6 +350,56 @@ def _followed(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: flo
     return np.asarray(at_nodes @ affine + _robust_fit(local, rest[near], 0.3, scale)[:, 0])
 
 
+_HALF = 2
+_PATCH = 6
+_SHIFT = 4
+_SCORE = 0.5
+
+
+def nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
+    """Bring an initial guess nearer."""
+    mesh, pixels = residual.reference.mesh, residual.reference.pixels
+    f, g = _reduced(residual)
+    left, top = pixels.bounds[1], pixels.bounds[0]
+    at = np.round((mesh.nodes - (left, top) - (_HALF - 1) / 2) / _HALF).astype(int) + _PATCH + _SHIFT
+    inside = np.clip(at, _PATCH + _SHIFT, np.array(f.shape)[::-1] - _PATCH - _SHIFT - 1)
+    shift, score = np.zeros((len(at), 2)), np.zeros(len(at))
+    for node, (column, row) in enumerate(inside):
+        patch = f[row - _PATCH : row + _PATCH + 1, column - _PATCH : column + _PATCH + 1]
+        reach = _PATCH + _SHIFT
+        around = g[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        found = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
+        i, j = divmod(int(found.argmax()), 2 * _SHIFT + 1)
+        if 0 < i < 2 * _SHIFT and 0 < j < 2 * _SHIFT:
+            score[node] = found[i, j]
+            shift[node] = j - _SHIFT + _crest(*found[i, j - 1 : j + 2]), i - _SHIFT + _crest(*found[i - 1 : i + 2, j])
+    agrees = score >= _SCORE
+    if agrees.sum() < _FITTED:
+        return displacement
+    shift *= _HALF
+    motion = displacement + shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement), shift)
+    return _followed(mesh.nodes[agrees], motion[agrees], mesh, 1.0)
+
+
+def _crest(before: float, here: float, after: float) -> float:
+    bend = before - 2 * here + after
+    return 0.5 * (before - after) / bend if bend < 0 else 0.0
+
+
+def _reduced(residual: Residual) -> FloatImage:
+    pixels = residual.reference.pixels
+    weights = pixels.block_sums(residual.weights, _HALF)
+    out = []
+    for values in (residual.values, residual.warped):
+        sums = pixels.block_sums(values * residual.weights, _HALF)
+        total = np.zeros(sums.shape[1:], dtype=np.float32)
+        for light, weight in zip(sums, weights, strict=True):
+            mean = light.sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-30)
+            total += light - np.float32(mean) * weight
+        out.append(np.pad(total / np.maximum(weights.sum(axis=0), np.float32(1e-6)), _PATCH + _SHIFT))
+    return np.stack(out)
+
+
 def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: float) -> FloatArray:
     """Coefficients (T, 3, 2) of T fits of `motion` (T, K, 2) by `basis` (T, K, 3), with Cauchy weights of `scale` px.
 
