@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from rgbmidic.correlation.precision import correlation_around
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.residual import Residual, follow
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.mesh import Tri3Mesh
@@ -231,11 +231,6 @@ _CONTEXT = 24.0
 differ by 2e-5 px at most (benchmarks/constants.py)."""
 _REACH = 128.0
 """Motion (px) that is looked for at least; the longer side of the region where that is more. Chosen: 30 speckles."""
-_FITTED = 12
-"""Pairs to which the motion around a node is fitted: four times the three that determine an affine motion. With half or
-twice of it results differ by 5e-6 px at most (benchmarks/constants.py)."""
-_TURNS = 5
-"""Robust fits until the weights have settled: twice as many change results by 1e-11 px (benchmarks/constants.py)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,7 +296,7 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
     reference, deformed
         The two states.
     last : ndarray, shape (N, 2), optional
-        Displacement of the frame before, px.
+        Displacement of the frame before, px; what is found of the motion since is added to it.
 
     Yields
     ------
@@ -315,8 +310,9 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
         return
     side = float(np.ptp(nodes, axis=0).max())
     here = Box.around(nodes, _CONTEXT, reference.images.shape[1:])
-    known = nodes if last is None else np.concatenate([nodes, nodes + last])
-    there = Box.around(known - offset, search_reach(nodes), deformed.weights.shape[1:])
+    known = rest if last is None else last
+    slopes = reference.mesh.nodal_gradient(known)
+    there = Box.around(np.concatenate([nodes, nodes + known]) - offset, search_reach(nodes), deformed.weights.shape[1:])
     most = int(min(_KEYPOINTS * there.area / here.area, _MOST))
     best, images = 0.0, deformed.images
     for reduction in _REDUCTIONS if side <= _SMALL else _REDUCTIONS[:-1]:
@@ -325,96 +321,16 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
         points, motion = pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
         if not len(points):
             continue
-        displacement = _followed(points, motion, reference.mesh, float(reduction))
+        # what moves beyond the last displacement is smooth where parts of the specimen turn on their own
+        nearest = np.asarray(cKDTree(nodes).query(points)[1])
+        before = known[nearest] + np.einsum("pij,pj->pi", slopes[nearest], points - nodes[nearest])
+        displacement = known + follow(points, motion - before, reference.mesh, float(reduction))
         found = FoundStart(displacement=displacement, confidence=confidence(reference, deformed, displacement))
         if found.confidence > best:
             best = found.confidence
             yield found
         if best >= _SURE:
             return
-
-
-def _followed(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
-    """Motion (N, 2) of the nodes: one affine field, and what the pairs around each add to it by a local one.
-
-    Around the nodes at a crack the pairs on their own side count.
-    """
-    nodes = mesh.nodes
-    middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
-    basis, at_nodes = (np.c_[np.ones(len(where)), (where - middle) / size] for where in (points, nodes))
-    affine = _robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
-    rest = motion - basis @ affine
-    distance, near = map(np.asarray, cKDTree(points).query(mesh.places, k=[*range(1, min(_FITTED, len(points)) + 1)]))
-    step = (points[near] - nodes[:, None]) / np.maximum(distance[:, -1:, None], 1.0)
-    local = np.concatenate([np.ones((*step.shape[:2], 1)), step], axis=2)
-    return np.asarray(at_nodes @ affine + _robust_fit(local, rest[near], 0.3, scale)[:, 0])
-
-
-_HALF = 2
-_PATCH = 6
-_SHIFT = 4
-_SCORE = 0.5
-
-
-def nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
-    """Bring an initial guess nearer."""
-    mesh, pixels = residual.reference.mesh, residual.reference.pixels
-    f, g = _reduced(residual)
-    left, top = pixels.bounds[1], pixels.bounds[0]
-    at = np.round((mesh.nodes - (left, top) - (_HALF - 1) / 2) / _HALF).astype(int) + _PATCH + _SHIFT
-    inside = np.clip(at, _PATCH + _SHIFT, np.array(f.shape)[::-1] - _PATCH - _SHIFT - 1)
-    shift, score = np.zeros((len(at), 2)), np.zeros(len(at))
-    for node, (column, row) in enumerate(inside):
-        patch = f[row - _PATCH : row + _PATCH + 1, column - _PATCH : column + _PATCH + 1]
-        reach = _PATCH + _SHIFT
-        around = g[row - reach : row + reach + 1, column - reach : column + reach + 1]
-        found = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
-        i, j = divmod(int(found.argmax()), 2 * _SHIFT + 1)
-        if 0 < i < 2 * _SHIFT and 0 < j < 2 * _SHIFT:
-            score[node] = found[i, j]
-            shift[node] = j - _SHIFT + _crest(*found[i, j - 1 : j + 2]), i - _SHIFT + _crest(*found[i - 1 : i + 2, j])
-    agrees = score >= _SCORE
-    if agrees.sum() < _FITTED:
-        return displacement
-    shift *= _HALF
-    motion = displacement + shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement), shift)
-    return _followed(mesh.nodes[agrees], motion[agrees], mesh, 1.0)
-
-
-def _crest(before: float, here: float, after: float) -> float:
-    bend = before - 2 * here + after
-    return 0.5 * (before - after) / bend if bend < 0 else 0.0
-
-
-def _reduced(residual: Residual) -> FloatImage:
-    pixels = residual.reference.pixels
-    weights = pixels.block_sums(residual.weights, _HALF)
-    out = []
-    for values in (residual.values, residual.warped):
-        sums = pixels.block_sums(values * residual.weights, _HALF)
-        total = np.zeros(sums.shape[1:], dtype=np.float32)
-        for light, weight in zip(sums, weights, strict=True):
-            mean = light.sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-30)
-            total += light - np.float32(mean) * weight
-        out.append(np.pad(total / np.maximum(weights.sum(axis=0), np.float32(1e-6)), _PATCH + _SHIFT))
-    return np.stack(out)
-
-
-def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: float) -> FloatArray:
-    """Coefficients (T, 3, 2) of T fits of `motion` (T, K, 2) by `basis` (T, K, 3), with Cauchy weights of `scale` px.
-
-    The first function of the basis is 1; `ridge` holds the slopes back where the points do not determine them.
-    """
-    weight = np.ones(basis.shape[:2])
-    held = np.diag([1e-6, ridge, ridge])
-    for _ in range(_TURNS):
-        # no BLAS, whose sums may depend on the number of threads
-        weighted = (basis * weight[..., None])[..., None]
-        normal, right = ((weighted * side[:, :, None]).sum(axis=1) for side in (basis, motion))
-        found = np.linalg.solve(normal + held, right)
-        off = np.linalg.norm(motion - np.einsum("tka,tab->tkb", basis, found), axis=2)
-        weight = 1 / (1 + (off / scale) ** 2)
-    return np.asarray(found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
