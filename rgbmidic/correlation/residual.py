@@ -378,7 +378,7 @@ def _crest(before: float, here: float, after: float) -> float:
 
 
 def _reduced(residual: Residual) -> FloatImage:
-    """Return reduced pictures (2, h, w) of both states, the lights' deviations from their means added; 0 around and beyond."""
+    """Return reduced pictures (2, h, w) of both states: the lights' deviations from their means, added; 0 around."""
     pixels, weights = residual.reference.pixels, residual.weights
     count = pixels.block_sums(weights, _REDUCTION)
     level = count.sum(axis=(1, 2), dtype=np.float64)[:, None, None]
