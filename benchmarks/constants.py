@@ -39,7 +39,7 @@ CONSTANTS = {
     ),
     "images": ("_RANGE",),
     "residual": ("_SMOOTHNESS", "_LEAST_GAIN"),
-    "nodes": ("_WANDERING", "_MISFIT", "_ONE_SIDED", "_NOISY"),
+    "nodes": ("_MISFIT", "_ONE_SIDED", "_NOISY"),
     "solve": ("_STARTED", "_SETTLED", "_LOOKED_AT"),
     "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT", "_FITTED", "_TURNS"),
 }

@@ -22,16 +22,13 @@ from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["LOST", "RULES", "Evidence", "Rule", "judge", "lost_elements", "nodal_std", "one_sided_texture"]
+__all__ = ["LOST", "RULES", "Evidence", "Rule", "judge", "nodal_std", "one_sided_texture"]
 
 LOST = 0.5
 """Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match."""
 _MISFIT = 4.0
 """Residual around a node, over the median, from which it is decorrelated where elements near it do not match. Chosen;
 with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
-_WANDERING = 0.1
-"""Motion (px) in the last iteration of a pass from which a node is decorrelated: ten times what ends the first
-pass. Chosen; with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
 _ONE_SIDED = 0.3
 """Texture in the worse direction over that in the better one under which the former may be noise...
 Chosen; with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
@@ -108,31 +105,6 @@ def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
     """`NodeStatus` of every node (N,) by the `RULES`."""
     applied = [rule.applies(evidence) for rule in RULES]
     return np.select(applied, [np.uint8(rule.status) for rule in RULES], np.uint8(NodeStatus.MEASURED))
-
-
-def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray, one_sided: BoolArray) -> BoolArray:
-    """Find the elements to leave out of the next pass for a node that its own pixels do not hold.
-
-    A node whose own pixels match nothing wanders, though its elements match as a whole; so does one whose texture is
-    one-sided, but that is no mismatch.
-
-    Parameters
-    ----------
-    mesh
-        N nodes, E elements.
-    std : ndarray, shape (N, 2)
-        Standard uncertainty of u and v, px.
-    motion : ndarray, shape (N,)
-        Motion in the last iteration, px.
-    one_sided : ndarray, shape (N,), bool
-        See `one_sided_texture`.
-
-    Returns
-    -------
-    ndarray, shape (E,), bool
-    """
-    lost = ~one_sided & ((std.max(axis=1) > LOST) | (motion > _WANDERING))
-    return np.asarray(lost[mesh.elements].any(axis=1))
 
 
 def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:

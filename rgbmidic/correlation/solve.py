@@ -21,7 +21,7 @@ import numpy.typing as npt
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
-from rgbmidic.correlation.nodes import Evidence, judge, lost_elements, nodal_std, one_sided_texture
+from rgbmidic.correlation.nodes import LOST, Evidence, judge, nodal_std, one_sided_texture
 from rgbmidic.correlation.precision import Precision, learn_precision, matching_elements, misfit
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -53,8 +53,8 @@ _STARTED = 0.25
 nearer. Chosen; with half or twice of it results do not change (benchmarks/constants.py)."""
 _RETURNS = 2
 """Passes after which elements may take part again. At a fragment's edge some come and go with every pass: with 4 plates
-under glare took 8 to 22 iterations instead of 7 to 16; with 1 they took 6 to 11, but what a crack or another body pulls
-at first is left out for good (benchmarks/fast_event.py, tests/truth)."""
+under glare took up to 22 iterations instead of 16; with 1 they took 11, but what a crack or another body pulls at first
+is left out for good (benchmarks/fast_event.py, tests/truth)."""
 _SETTLED = 1e-3
 """Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
 change (benchmarks/constants.py)."""
@@ -62,8 +62,8 @@ _LOOKED_AT = 16
 """That change is the sum over one weight in so many. Chosen; with half or twice of it nothing changes
 (benchmarks/constants.py)."""
 _PATIENCE = 5
-"""Last iterations after which a tenth of the nodes may still move: they wander where nothing matches, for from within
-half a speckle 4 to 5 iterations do (measured on the truth tests)."""
+"""Iterations of the end after which a tenth of the nodes may still move: they wander where nothing matches, for from
+within half a speckle 4 to 5 iterations do (measured on the truth tests)."""
 _PASSES = 8
 """Most passes: each warps the weights with the latest displacement; `_RETURNS`, and the `_REFINED` ones after."""
 
@@ -138,12 +138,10 @@ def next_weighting(
     residual = compare(problem, last.values, estimate)
     matched = matching_elements(residual, last.precision)
     if not matched.all() or estimate.longest > FIRST_PASS:
-        # a node under a reflection may wander in the first pass, in which the lights' precision is not known
-        judged = number > 0 and len(estimate.increments) < problem.options.max_iterations
-        motion = estimate.increments[-1] if judged else np.zeros(len(estimate.displacement))
         std = standard_uncertainty(residual, equations, last.precision)
-        one_sided = one_sided_texture(equations, residual)
-        matched &= ~lost_elements(problem.reference.mesh, std, motion, one_sided)
+        # a node that its own pixels do not hold leaves the next pass, but not for a one-sided texture: that matches
+        lost = ~one_sided_texture(equations, residual) & (std.max(axis=1) > LOST)
+        matched &= ~lost[problem.reference.mesh.elements].any(axis=1)
     if number >= _RETURNS:
         matched &= last.matched
     # where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in
