@@ -19,7 +19,6 @@ from rgbmidic.correlation.precision import light_covariances, score_covariance
 from rgbmidic.correlation.recovery import Functional, Recovery, displacement_functionals, functional_std
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.solution import NodeStatus
-from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["LOST", "RULES", "Evidence", "Rule", "judge", "nodal_std", "one_sided_texture"]
