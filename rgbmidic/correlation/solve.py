@@ -55,6 +55,10 @@ _RETURNS = 2
 """Passes after which elements may take part again. At a fragment's edge some come and go with every pass: with 4 plates
 under glare took up to 22 iterations instead of 16; with 1 they took 11, but what a crack or another body pulls at first
 is left out for good (benchmarks/fast_event.py, tests/truth)."""
+_WANDERING = 0.1
+"""Motion (px) in the last iteration of a pass, and more than half of that in the one before, from which the elements
+around a node are left out after `_RETURNS` passes: its own pixels match nothing. Chosen: ten times what ends the first
+pass."""
 _SETTLED = 1e-3
 """Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
 change (benchmarks/constants.py)."""
@@ -140,7 +144,11 @@ def next_weighting(
     if not matched.all() or estimate.longest > FIRST_PASS:
         std = standard_uncertainty(residual, equations, last.precision)
         # a node that its own pixels do not hold leaves the next pass, but not for a one-sided texture: that matches
-        lost = ~one_sided_texture(equations, residual) & (std.max(axis=1) > LOST)
+        one_sided = one_sided_texture(equations, residual)
+        lost = ~one_sided & (std.max(axis=1) > LOST)
+        if number >= _RETURNS and len(estimate.increments) < problem.options.max_iterations:
+            before, motion = estimate.increments[-2:]
+            lost |= ~one_sided & (motion > np.maximum(_WANDERING, before / 2))
         matched &= ~lost[problem.reference.mesh.elements].any(axis=1)
     if number >= _RETURNS:
         matched &= last.matched
