@@ -357,8 +357,8 @@ class Start:
     def after(self, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray) -> Start:
         """Return the start of the frame after one that started here.
 
-        Nodes without data move as the nearest measured one. Where a frame has none that is measured, the next starts
-        here too.
+        Nodes without data go on with the displacement, turn and strain of the nearest measured one. Where a frame has
+        none that is measured, the next starts here too.
 
         Parameters
         ----------
@@ -371,10 +371,22 @@ class Start:
         """
         if not measured.any():
             return self
-        nearest = mesh.nearest(measured)[1]
-        return replace(self, displacement=displacement[nearest], unmeasured=float((~measured).mean()))
+        gradient = mesh.element_gradient(np.where(measured[:, None], displacement, 0.0))
+        deformation = np.eye(2) + gradient
+        stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
+        intact = measured[mesh.elements].all(axis=1) & (np.linalg.norm(stretch, axis=(1, 2)) < _TORN)
+        weight = np.where(intact, mesh.areas, 0.0)
+        around = mesh.to_nodes(weight)
+        nearest = mesh.nearest(measured & (around > 0) if intact.any() else measured)[1]
+        parts = [mesh.to_nodes(weight * part) for part in gradient.reshape(-1, 4).T]
+        slope = (np.stack(parts, axis=1) / np.maximum(around, 1e-300)[:, None]).reshape(-1, 2, 2)[nearest]
+        beyond = displacement[nearest] + np.einsum("nij,nj->ni", slope, mesh.nodes - mesh.nodes[nearest])
+        filled = np.where(measured[:, None], displacement, beyond)
+        return replace(self, displacement=filled, unmeasured=float((~measured).mean()))
 
 
+_TORN = 0.5
+"""Stretch (norm of C - 1) from which an element is torn, not strained: 20 % of strain in both directions give .6."""
 LARGEST_TURN = 30.0
 """Turn (degrees) that the search finds, with strains of 20 % or alone (benchmarks/starts.py)."""
 NEEDED = 0.15
