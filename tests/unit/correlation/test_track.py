@@ -51,7 +51,7 @@ def test_a_jump_of_100_px_is_found(texture, reference):
 def test_a_guess_some_pixels_away_costs_hardly_more_iterations_than_a_near_one(texture, reference, motion):
     nodes = reference.mesh.nodes
     last = Start(displacement=np.zeros_like(nodes))
-    found = track(reference, moved(texture, motion), last, OPTIONS)
+    found = track(reference, moved(texture, motion), last, OPTIONS, Statistics())
     assert found.status is Status.CONVERGED
     assert found.measured.all()
     assert found.iterations <= 6  # 8 to 22 where elements come back row by row
@@ -81,7 +81,7 @@ def test_a_fragment_that_has_turned_is_followed_as_the_specimen_jumps(texture, j
         return np.where(away[:, None] < 0, *(one.displacement(mesh.nodes, SHAPE) for one in (turned, rigid)))
 
     second = Deformed.prepare(np.asarray(state(12.0, jump), dtype=np.float32)[None], prefilter="binomial")
-    found = track(reference, second, Start(displacement=motion(11.7, (0.0, 0.0))), OPTIONS)
+    found = track(reference, second, Start(displacement=motion(11.7, (0.0, 0.0))), OPTIONS, Statistics())
     assert found.status is Status.CONVERGED
     for part in (inner, outer):
         assert found.measured[part].mean() > 0.97
