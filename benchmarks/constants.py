@@ -30,8 +30,8 @@ CONSTANTS = {
     "uncertainty": ("_LEAST_RATIO", "_LEAST_FRACTION", "_EVEN", "_SCORE_RANGE", "_PRIOR"),
     "images": ("_RANGE",),
     "residual": ("_SMOOTHNESS", "_LEAST_GAIN", "_LEAST_BEND"),
-    "nodes": ("_WORSE", "_WANDERING", "_MISFIT", "_ONE_SIDED", "_NOISY"),
-    "solve": ("_STARTED", "_SETTLED", "_LOOKED_AT"),
+    "nodes": ("_WORSE", "_MISFIT", "_ONE_SIDED", "_NOISY"),
+    "solve": ("_STARTED", "_WANDERING", "_SETTLED", "_LOOKED_AT"),
     "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT", "_FITTED", "_TURNS"),
     "statistics": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING"),
 }

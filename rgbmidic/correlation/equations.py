@@ -42,9 +42,15 @@ _LONGEST_STEP = 4.0
 """Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's."""
 _PASS_ITERATIONS = 12
 """Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests)."""
-_PATIENCE = 5
-"""Iterations after which a tenth of the nodes may still move: they wander where nothing matches, for from within half a
-speckle 4 to 5 iterations do (measured on the truth tests)."""
+_PATIENCE = 1
+"""Iterations of a pass after which a tenth of the nodes may still move: with the weights of the next pass they do so
+faster. With 5 a plate under glare took 9 to 22 iterations instead of 6 to 11 (benchmarks/fast_event.py)."""
+
+
+_SLOW, _LARGEST_SUM, _CLOSE = 0.15, 3.0, 0.1
+"""Fraction of its last motion from which a node's motion is taken for the term of a series, the most that is made of
+it, and the last motion (px) up to which it is: beyond, the images are not linear. The rim of a fragment then takes 12
+iterations instead of 14 (benchmarks/fast_event.py); with sums up to 10 and motions up to .3 px some nodes swung."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -271,6 +277,7 @@ def iterate(
     residual: Residual,
     estimate: Estimate,
     tolerance: float,
+    patience: int = _PATIENCE,
 ) -> Estimate:
     """Iterate with one Hessian until no textured node moves by more than `tolerance`.
 
@@ -286,6 +293,8 @@ def iterate(
         From which the pass begins.
     tolerance
         px.
+    patience
+        Iterations after which a tenth of the nodes may still move.
 
     Raises
     ------
@@ -293,23 +302,43 @@ def iterate(
         The iteration diverged.
     """
     known: FloatImage | None = residual.difference_from(values)
+    before: FloatArray | None = None
     for turn in range(min(_PASS_ITERATIONS, problem.options.max_iterations - len(estimate.increments))):
-        estimate = _stepped(problem, equations, values, estimate, known)
+        estimate, before = _stepped(problem, equations, values, estimate, known, before)
         known = None
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
         # a few nodes that wander where nothing matches must not keep the others waiting
-        most = turn >= _PATIENCE and np.quantile(estimate.increments[-1][equations.textured], 0.9) <= tolerance
+        most = turn >= patience and np.quantile(estimate.increments[-1][equations.textured], 0.9) <= tolerance
         if estimate.longest <= tolerance or most:
             break
     return estimate
 
 
 def _stepped(
-    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
-) -> Estimate:
-    """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
+    problem: Problem,
+    equations: Equations,
+    values: FloatImage,
+    estimate: Estimate,
+    known: FloatImage | None,
+    before: FloatArray | None,
+) -> tuple[Estimate, FloatArray | None]:
+    """One Gauss-Newton iteration.
+
+    `known` is the difference (k, P) of the states at the estimate, if it is. A node half of whose pixels match nothing,
+    or whose lights err, has another Hessian than the reference's, and its motions shrink by a fraction of their own:
+    from that `before` (N, 2) the sum of the series follows. What is returned with the estimate is the motion for the
+    next iteration, None after such a sum.
+    """
     motion, shifts = equations.increment(*_right_sides(problem, equations, values, estimate, known))
+    plain: FloatArray | None = motion
+    if before is not None:
+        square = (before**2).sum(axis=1)
+        ratio = np.divide((motion * before).sum(axis=1), square, out=np.zeros(len(square)), where=square > 0)
+        slow = (ratio > _SLOW) & (square < _CLOSE**2)
+        if slow.any():
+            factor = np.where(slow, 1 / np.maximum(1 - ratio, 1 / _LARGEST_SUM), 1.0)
+            motion, plain = motion * factor[:, None], None
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
     rigid = estimate.rigid.copy()
@@ -318,12 +347,13 @@ def _stepped(
         rigid[1:] += shifts
         longest = max(longest, float(np.abs(problem.functions @ shifts.T).max()))
     bounded = motion * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
-    return Estimate(
+    stepped = Estimate(
         displacement=estimate.displacement + bounded,
         rigid=rigid,
         increments=(*estimate.increments, length),
         longest=longest,
     )
+    return stepped, plain
 
 
 def _right_sides(

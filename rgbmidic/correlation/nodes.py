@@ -27,7 +27,6 @@ __all__ = [
     "correlation",
     "correlation_around",
     "judge",
-    "lost_elements",
     "matching_elements",
     "misfit",
     "one_sided_texture",
@@ -38,9 +37,6 @@ LOST = 0.5
 _MISFIT = 4.0
 """Residual around a node, over the median, from which it is decorrelated where elements near it do not match. Chosen;
 with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
-_WANDERING = 0.1
-"""Motion (px) in the last iteration of a pass from which a node is decorrelated: ten times what ends the first
-pass. Chosen; with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
 _ONE_SIDED = 0.3
 """Texture in the worse direction over that in the better one under which the former may be noise...
 Chosen; with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
@@ -94,31 +90,6 @@ def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
     status, applies = zip(*RULES, strict=True)
     applied = [rule(evidence) for rule in applies]
     return np.select(applied, [np.uint8(one) for one in status], np.uint8(NodeStatus.MEASURED))
-
-
-def lost_elements(mesh: Tri3Mesh, std: FloatArray, motion: FloatArray, one_sided: BoolArray) -> BoolArray:
-    """Find the elements to leave out of the next pass for a node that its own pixels do not hold.
-
-    A node whose own pixels match nothing wanders, though its elements match as a whole; so does one whose texture is
-    one-sided, but that is no mismatch.
-
-    Parameters
-    ----------
-    mesh
-        N nodes, E elements.
-    std : ndarray, shape (N, 2)
-        Standard uncertainty of u and v, px.
-    motion : ndarray, shape (N,)
-        Motion in the last iteration, px.
-    one_sided : ndarray, shape (N,), bool
-        See `one_sided_texture`.
-
-    Returns
-    -------
-    ndarray, shape (E,), bool
-    """
-    lost = ~one_sided & ((std.max(axis=1) > LOST) | (motion > _WANDERING))
-    return np.asarray(lost[mesh.elements].any(axis=1))
 
 
 def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:

@@ -1,7 +1,8 @@
 """The residual f - g(x + u) of every light at a displacement, and the brightness and contrast that enter it.
 
 The grey-level correction brings the reference to the brightness and contrast of the deformed images (paper, section
-2.2). The brightness change is reported for every light: lamps flicker, shutters jitter, a light goes out.
+2.2). The brightness change is reported for every light: lamps flicker, shutters jitter, a light goes out. What the
+residual shows of the motion beyond an initial guess brings that nearer.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
+import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import element_squares, interpolate_nodal, subtract_quadratic
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -18,7 +21,16 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Precision", "PrecisionMethod", "Residual", "brightness_change", "corrected_values", "curved_deviation"]
+__all__ = [
+    "Precision",
+    "PrecisionMethod",
+    "Residual",
+    "brightness_change",
+    "brought_nearer",
+    "corrected_values",
+    "curved_deviation",
+    "follow",
+]
 
 _LEAST_BEND = 0.1
 """Least bend of the loss around a node, over that of its weights. Chosen; with half or twice of it nothing changes
@@ -308,3 +320,116 @@ def _gain_and_offset(f: FloatImage, g: FloatImage, inside: BoolArray) -> tuple[f
         return float("nan"), float("nan")
     gain = float(np.median(np.sqrt(contrast_g[textured] / contrast_f[textured])))
     return gain, float(np.median(mean_g[textured] - gain * mean_f[textured]))
+
+
+_FITTED = 12
+"""Pairs to which the motion around a node is fitted: four times the three that determine an affine motion. With half or
+twice of it results differ by 5e-6 px at most (benchmarks/constants.py)."""
+_TURNS = 5
+"""Robust fits until the weights have settled: twice as many change results by 1e-11 px (benchmarks/constants.py)."""
+
+
+def follow(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
+    """Follow the motion (P, 2) of points (P, 2) at the nodes (N, 2): one affine field, and what a local one adds to it.
+
+    Both are robust fits, with Cauchy weights of `scale` px. Around the nodes at a crack the points on their own side
+    count.
+    """
+    nodes = mesh.nodes
+    middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
+    basis, at_nodes = (np.c_[np.ones(len(where)), (where - middle) / size] for where in (points, nodes))
+    affine = _robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
+    rest = motion - basis @ affine
+    distance, near = map(np.asarray, cKDTree(points).query(mesh.places, k=[*range(1, min(_FITTED, len(points)) + 1)]))
+    step = (points[near] - nodes[:, None]) / np.maximum(distance[:, -1:, None], 1.0)
+    local = np.concatenate([np.ones((*step.shape[:2], 1)), step], axis=2)
+    return np.asarray(at_nodes @ affine + _robust_fit(local, rest[near], 0.3, scale)[:, 0])
+
+
+def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: float) -> FloatArray:
+    """Coefficients (T, 3, 2) of T fits of `motion` (T, K, 2) by `basis` (T, K, 3), with Cauchy weights of `scale` px.
+
+    The first function of the basis is 1; `ridge` holds the slopes back where the points do not determine them.
+    """
+    weight = np.ones(basis.shape[:2])
+    held = np.diag([1e-6, ridge, ridge])
+    for _ in range(_TURNS):
+        # no BLAS, whose sums may depend on the number of threads
+        weighted = (basis * weight[..., None])[..., None]
+        normal, right = ((weighted * side[:, :, None]).sum(axis=1) for side in (basis, motion))
+        found = np.linalg.solve(normal + held, right)
+        off = np.linalg.norm(motion - np.einsum("tka,tab->tkb", basis, found), axis=2)
+        weight = 1 / (1 + (off / scale) ** 2)
+    return np.asarray(found)
+
+
+_REDUCTION = 2
+"""Reduction of the pictures in which patches are matched: a speckle of 4 px keeps 2, and they cost 16 times less."""
+_PATCH = 6
+"""Pixels of a patch to each side of its node there: 26 px hold some 40 speckles, of which chance reaches a correlation
+of .3 in 81 places (derived)."""
+_SHIFT = 4
+"""Largest shift of a patch, px there: 8 px of the image, two speckles. Twice as many cost 3 times as much."""
+_AGREES = 0.5
+"""Correlation coefficient from which a patch has been found, as in `confidence`."""
+
+
+def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
+    """Bring an initial guess to within some tenths of a pixel by matching patches around the nodes.
+
+    Both states are compared as the residual holds them, in the reference's axes, so that turn and strain of the guess
+    are no hindrance. What the patches move by beyond the guess is followed as in `follow`: nodes whose patch is not
+    found move as those around them.
+
+    Parameters
+    ----------
+    residual
+        At the initial guess.
+    displacement : ndarray, shape (N, 2)
+        The guess, at most 8 px away in x and y.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        px; the guess itself where too few patches are found.
+    """
+    mesh, pixels, reach = residual.reference.mesh, residual.reference.pixels, _PATCH + _SHIFT
+    f, g = _reduced(residual)
+    top, left = pixels.bounds[:2]
+    at = np.round((mesh.nodes - (left, top) - (_REDUCTION - 1) / 2) / _REDUCTION).astype(int) + reach
+    at = np.clip(at, reach, np.array(f.shape)[::-1] - reach - 1)
+    shift, score = np.zeros((len(at), 2)), np.zeros(len(at))
+    for node, (column, row) in enumerate(at):
+        patch = f[row - _PATCH : row + _PATCH + 1, column - _PATCH : column + _PATCH + 1]
+        around = g[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        found = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
+        i, j = divmod(int(found.argmax()), 2 * _SHIFT + 1)
+        if 0 < i < 2 * _SHIFT and 0 < j < 2 * _SHIFT:
+            score[node] = found[i, j]
+            shift[node] = j - _SHIFT + _crest(*found[i, j - 1 : j + 2]), i - _SHIFT + _crest(*found[i - 1 : i + 2, j])
+    agrees = score >= _AGREES
+    if agrees.sum() < _FITTED:
+        return displacement
+    shift *= _REDUCTION
+    beyond = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement), shift)
+    return displacement + follow(mesh.nodes[agrees], beyond[agrees], mesh, 1.0)
+
+
+def _crest(before: float, here: float, after: float) -> float:
+    """Return the place of the crest of the parabola through three values, counted from the middle one, the largest."""
+    bend = before - 2 * here + after
+    return 0.5 * (before - after) / bend if bend < 0 else 0.0
+
+
+def _reduced(residual: Residual) -> FloatImage:
+    """Return reduced pictures (2, h, w) of both states: the lights' deviations from their means, added; 0 around."""
+    pixels, weights = residual.reference.pixels, residual.weights
+    count = pixels.block_sums(weights, _REDUCTION)
+    level = count.sum(axis=(1, 2), dtype=np.float64)[:, None, None]
+    pictures = []
+    for values in (residual.values, residual.warped):
+        sums = pixels.block_sums(values * weights, _REDUCTION)
+        mean = sums.sum(axis=(1, 2), dtype=np.float64)[:, None, None] / np.maximum(level, 1e-30)
+        total = (sums - mean.astype(np.float32) * count).sum(axis=0)
+        pictures.append(np.pad(total / np.maximum(count.sum(axis=0), np.float32(1e-6)), _PATCH + _SHIFT))
+    return np.stack(pictures)

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from rgbmidic.correlation.nodes import correlation_around
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import PrecisionMethod, Residual
+from rgbmidic.correlation.residual import PrecisionMethod, Residual, follow
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status
 from rgbmidic.correlation.solve import solve
 from rgbmidic.mesh import Tri3Mesh
@@ -231,11 +231,6 @@ _CONTEXT = 24.0
 differ by 2e-5 px at most (benchmarks/constants.py)."""
 _REACH = 128.0
 """Motion (px) that is looked for at least; the longer side of the region where that is more. Chosen: 30 speckles."""
-_FITTED = 12
-"""Pairs to which the motion around a node is fitted: four times the three that determine an affine motion. With half or
-twice of it results differ by 5e-6 px at most (benchmarks/constants.py)."""
-_TURNS = 5
-"""Robust fits until the weights have settled: twice as many change results by 1e-11 px (benchmarks/constants.py)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,7 +296,7 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
     reference, deformed
         The two states.
     last : ndarray, shape (N, 2), optional
-        Displacement of the frame before, px.
+        Displacement of the frame before, px; what is found of the motion since is added to it.
 
     Yields
     ------
@@ -315,8 +310,9 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
         return
     side = float(np.ptp(nodes, axis=0).max())
     here = Box.around(nodes, _CONTEXT, reference.images.shape[1:])
-    known = nodes if last is None else np.concatenate([nodes, nodes + last])
-    there = Box.around(known - offset, search_reach(nodes), deformed.weights.shape[1:])
+    known = rest if last is None else last
+    slopes = reference.mesh.nodal_gradient(known)
+    there = Box.around(np.concatenate([nodes, nodes + known]) - offset, search_reach(nodes), deformed.weights.shape[1:])
     most = int(min(_KEYPOINTS * there.area / here.area, _MOST))
     best, (images, weights) = 0.0, deformed.pictures(reference.registration)
     for reduction in _REDUCTIONS if side <= _SMALL else _REDUCTIONS[:-1]:
@@ -325,46 +321,16 @@ def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | Non
         points, motion = pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
         if not len(points):
             continue
-        displacement = _followed(points, motion, reference.mesh, float(reduction))
+        # what moves beyond the last displacement is smooth where parts of the specimen turn on their own
+        nearest = np.asarray(cKDTree(nodes).query(points)[1])
+        before = known[nearest] + np.einsum("pij,pj->pi", slopes[nearest], points - nodes[nearest])
+        displacement = known + follow(points, motion - before, reference.mesh, float(reduction))
         found = FoundStart(displacement=displacement, confidence=confidence(reference, deformed, displacement))
         if found.confidence > best:
             best = found.confidence
             yield found
         if best >= _SURE:
             return
-
-
-def _followed(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
-    """Motion (N, 2) of the nodes: one affine field, and what the pairs around each add to it by a local one.
-
-    Around the nodes at a crack the pairs on their own side count.
-    """
-    nodes = mesh.nodes
-    middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
-    basis, at_nodes = (np.c_[np.ones(len(where)), (where - middle) / size] for where in (points, nodes))
-    affine = _robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
-    rest = motion - basis @ affine
-    distance, near = map(np.asarray, cKDTree(points).query(mesh.places, k=[*range(1, min(_FITTED, len(points)) + 1)]))
-    step = (points[near] - nodes[:, None]) / np.maximum(distance[:, -1:, None], 1.0)
-    local = np.concatenate([np.ones((*step.shape[:2], 1)), step], axis=2)
-    return np.asarray(at_nodes @ affine + _robust_fit(local, rest[near], 0.3, scale)[:, 0])
-
-
-def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: float) -> FloatArray:
-    """Coefficients (T, 3, 2) of T fits of `motion` (T, K, 2) by `basis` (T, K, 3), with Cauchy weights of `scale` px.
-
-    The first function of the basis is 1; `ridge` holds the slopes back where the points do not determine them.
-    """
-    weight = np.ones(basis.shape[:2])
-    held = np.diag([1e-6, ridge, ridge])
-    for _ in range(_TURNS):
-        # no BLAS, whose sums may depend on the number of threads
-        weighted = (basis * weight[..., None])[..., None]
-        normal, right = ((weighted * side[:, :, None]).sum(axis=1) for side in (basis, motion))
-        found = np.linalg.solve(normal + held, right)
-        off = np.linalg.norm(motion - np.einsum("tka,tab->tkb", basis, found), axis=2)
-        weight = 1 / (1 + (off / scale) ** 2)
-    return np.asarray(found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -391,8 +357,8 @@ class Start:
     def after(self, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray) -> Start:
         """Return the start of the frame after one that started here.
 
-        Nodes without data move as the nearest measured one. Where a frame has none that is measured, the next starts
-        here too.
+        Nodes without data go on with the displacement, turn and strain of the nearest measured one. Where a frame has
+        none that is measured, the next starts here too.
 
         Parameters
         ----------
@@ -405,10 +371,22 @@ class Start:
         """
         if not measured.any():
             return self
-        nearest = mesh.nearest(measured)[1]
-        return replace(self, displacement=displacement[nearest], unmeasured=float((~measured).mean()))
+        gradient = mesh.element_gradient(np.where(measured[:, None], displacement, 0.0))
+        deformation = np.eye(2) + gradient
+        stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
+        intact = measured[mesh.elements].all(axis=1) & (np.linalg.norm(stretch, axis=(1, 2)) < _TORN)
+        weight = np.where(intact, mesh.areas, 0.0)
+        around = mesh.to_nodes(weight)
+        nearest = mesh.nearest(measured & (around > 0) if intact.any() else measured)[1]
+        parts = [mesh.to_nodes(weight * part) for part in gradient.reshape(-1, 4).T]
+        slope = (np.stack(parts, axis=1) / np.maximum(around, 1e-300)[:, None]).reshape(-1, 2, 2)[nearest]
+        beyond = displacement[nearest] + np.einsum("nij,nj->ni", slope, mesh.nodes - mesh.nodes[nearest])
+        filled = np.where(measured[:, None], displacement, beyond)
+        return replace(self, displacement=filled, unmeasured=float((~measured).mean()))
 
 
+_TORN = 0.5
+"""Stretch (norm of C - 1) from which an element is torn, not strained: 20 % of strain in both directions give .6."""
 LARGEST_TURN = 30.0
 """Turn (degrees) that the search finds, with strains of 20 % or alone (benchmarks/starts.py)."""
 NEEDED = 0.15

@@ -40,6 +40,54 @@ def test_a_jump_of_100_px_is_found(texture, reference):
     assert np.abs(found.displacement - (160.0, 0.0)).max() < 0.01
 
 
+@pytest.mark.parametrize(
+    "motion",
+    [
+        Affine(shift=(6.0, -5.0)),
+        Affine.strain_and_rotation(0.02, 5.0, (2.0, 1.0)),
+        Affine(gradient=((1.08, 0), (0, 1))),
+    ],
+)
+def test_a_guess_some_pixels_away_costs_hardly_more_iterations_than_a_near_one(texture, reference, motion):
+    nodes = reference.mesh.nodes
+    last = Start(displacement=np.zeros_like(nodes))
+    found = track(reference, moved(texture, motion), last, OPTIONS, Statistics())
+    assert found.status is Status.CONVERGED
+    assert found.measured.all()
+    assert found.iterations <= 6  # 8 to 22 where elements come back row by row
+    assert np.abs(found.displacement - motion.displacement(nodes, SHAPE)).max() < 0.01
+
+
+@pytest.mark.parametrize("jump", [(5.0, -3.0), (30.0, 12.0)])
+def test_a_fragment_that_has_turned_is_followed_as_the_specimen_jumps(texture, jump):
+    """It has turned by 12 degrees about its middle: what it moves by from frame to frame is what the plate does."""
+    middle, radius = np.array([SHAPE[1], SHAPE[0]]) / 2 - 0.5, 58.0
+
+    def state(degrees, shift):
+        y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+        inside = np.hypot(x - middle[0] - shift[0], y - middle[1] - shift[1]) < radius
+        plate, fragment = (texture.image(SHAPE, Affine.strain_and_rotation(0, turn, shift)) for turn in (0.0, degrees))
+        return np.where(inside, fragment, plate) + np.random.default_rng(1).normal(0, 2, SHAPE)
+
+    region = Region.from_rectangle((50, 20, 270, 180), SHAPE)
+    mesh = Tri3Mesh.from_region(region, 12)
+    first = np.asarray(state(0.0, (0.0, 0.0)), dtype=np.float32)[None]
+    reference = Reference.prepare(first, region, mesh=mesh, prefilter="binomial")
+    away = np.hypot(*(mesh.nodes - middle).T) - radius
+    inner, outer = away < -25, away > 25
+
+    def motion(degrees, shift):
+        turned, rigid = (Affine.strain_and_rotation(0, turn, shift) for turn in (degrees, 0.0))
+        return np.where(away[:, None] < 0, *(one.displacement(mesh.nodes, SHAPE) for one in (turned, rigid)))
+
+    second = Deformed.prepare(np.asarray(state(12.0, jump), dtype=np.float32)[None], prefilter="binomial")
+    found = track(reference, second, Start(displacement=motion(11.7, (0.0, 0.0))), OPTIONS, Statistics())
+    assert found.status is Status.CONVERGED
+    for part in (inner, outer):
+        assert found.measured[part].mean() > 0.97
+        assert np.nanmax(np.abs(found.displacement - motion(12.0, jump))[part]) < 0.3
+
+
 def test_a_specimen_that_leaves_is_found_again_and_a_restored_start_gives_the_same_bits(texture, reference):
     start, statuses = Start(displacement=None), []
     for shift in (0.0, -110.0, -400.0, 60.0):
