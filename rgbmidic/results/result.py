@@ -193,8 +193,8 @@ class Result:
             in px), such as `u` (frame, node), `light_fraction` (frame, node, light) and `status` (frame); the six
             components of the small strain and its uncertainty as `strain` and `strain_std` (frame, node, component);
             `elements` (element, corner). Where ``[scale]`` has a camera, `u_mm`, `v_mm`, `u_mm_std`, `v_mm_std` are the
-            displacements on the plane, and `strain` is Green-Lagrange strain there. Each has the attributes ``units`` and ``long_name``, a status
-            ``flag_values`` and ``flag_meanings``.
+            displacements on the plane, and `strain` is Green-Lagrange strain there. Each has the attributes ``units``
+            and ``long_name``, a status ``flag_values`` and ``flag_meanings``.
             Attributes: ``settings``, ``calibration`` and ``versions`` as JSON texts, ``references``, dates, and
             ``mm_per_pixel`` with its uncertainty where the scale is known, and ``camera``.
 
