@@ -38,10 +38,10 @@ CONSTANTS = {
         "_WORSE",
     ),
     "images": ("_RANGE",),
-    "residual": ("_SMOOTHNESS", "_LEAST_GAIN"),
+    "residual": ("_SMOOTHNESS", "_LEAST_GAIN", "_FITTED", "_TURNS"),
     "nodes": ("_MISFIT", "_ONE_SIDED", "_NOISY"),
-    "solve": ("_STARTED", "_SETTLED", "_LOOKED_AT"),
-    "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT", "_FITTED", "_TURNS"),
+    "solve": ("_STARTED", "_WANDERING", "_SWINGING", "_SETTLED", "_LOOKED_AT"),
+    "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT"),
 }
 TENFOLD = ("_SMOOTHNESS", "_ROUNDING", "_ANCHOR")
 """Constants of `equations` and `assembly` of which only the order of magnitude counts."""
