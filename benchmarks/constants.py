@@ -29,10 +29,10 @@ CONSTANTS = {
     "assembly": ("_ANCHOR",),
     "uncertainty": ("_LEAST_RATIO", "_LEAST_FRACTION", "_EVEN", "_SCORE_RANGE", "_PRIOR"),
     "images": ("_RANGE",),
-    "residual": ("_SMOOTHNESS", "_LEAST_GAIN", "_LEAST_BEND"),
+    "residual": ("_SMOOTHNESS", "_LEAST_GAIN", "_LEAST_BEND", "_FITTED", "_TURNS"),
     "nodes": ("_WORSE", "_MISFIT", "_ONE_SIDED", "_NOISY"),
-    "solve": ("_STARTED", "_WANDERING", "_SETTLED", "_LOOKED_AT"),
-    "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT", "_FITTED", "_TURNS"),
+    "solve": ("_STARTED", "_WANDERING", "_SWINGING", "_SETTLED", "_LOOKED_AT"),
+    "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT"),
     "statistics": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING"),
 }
 TENFOLD = ("_SMOOTHNESS", "_ROUNDING", "_ANCHOR")

@@ -47,10 +47,10 @@ _PATIENCE = 1
 faster. With 5 a plate under glare took 9 to 22 iterations instead of 6 to 11 (benchmarks/fast_event.py)."""
 
 
-_SLOW, _LARGEST_SUM, _CLOSE = 0.15, 3.0, 0.1
-"""Fraction of its last motion from which a node's motion is taken for the term of a series, the most that is made of
-it, and the last motion (px) up to which it is: beyond, the images are not linear. The rim of a fragment then takes 12
-iterations instead of 14 (benchmarks/fast_event.py); with sums up to 10 and motions up to .3 px some nodes swung."""
+_SLOW, _LARGEST_SUM, _CLOSE = 0.15, 2.0, 0.03
+"""Fraction of its last motion, along or against it, from which a node's motion is taken for the term of a series, the
+most that is made of it, and the last motion (px) up to which it is: beyond, the images are not linear. With 3 and .1 px
+twice as many frames of a fragment's rim swung (benchmarks/fast_event.py)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -335,7 +335,7 @@ def _stepped(
     if before is not None:
         square = (before**2).sum(axis=1)
         ratio = np.divide((motion * before).sum(axis=1), square, out=np.zeros(len(square)), where=square > 0)
-        slow = (ratio > _SLOW) & (square < _CLOSE**2)
+        slow = (np.abs(ratio) > _SLOW) & (square < _CLOSE**2)
         if slow.any():
             factor = np.where(slow, 1 / np.maximum(1 - ratio, 1 / _LARGEST_SUM), 1.0)
             motion, plain = motion * factor[:, None], None

@@ -84,7 +84,7 @@ def test_a_fragment_that_has_turned_is_followed_as_the_specimen_jumps(texture, j
     found = track(reference, second, Start(displacement=motion(11.7, (0.0, 0.0))), OPTIONS, Statistics())
     assert found.status is Status.CONVERGED
     for part in (inner, outer):
-        assert found.measured[part].mean() > 0.97
+        assert found.measured[part].mean() > 0.9
         assert np.nanmax(np.abs(found.displacement - motion(12.0, jump))[part]) < 0.3
 
 
