@@ -35,8 +35,8 @@ MESH = Tri3Mesh.from_region(Region.from_rectangle(BOX, SHAPE), 25)
 NODES = len(MESH.nodes)
 CORNER = 0.01
 """Noise of a corner, px: `find_view` finds them to 0.005 px (tests/unit/calibration/test_camera.py)."""
-LEFT = 1e-5
-"""Strain that the calibration may leave: issue 25. Found: 0.5e-5 at most, where px give 0.3 to 4e-3."""
+LEFT = 7e-6
+"""Strain that the calibration may leave; issue 25 asks for 1e-5. Found: 4.6e-6 at most, in px 3e-4 to 4e-3."""
 STD = (0.01, 0.03)
 """Standard uncertainty of u and v, px."""
 
@@ -185,7 +185,7 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
     length = np.hypot(*np.diff(camera.to_mm(np.reshape(ends, (2, 2))), axis=0)[0])
     extension = found["gauge_1_extension_mm"].values[1]
     assert extension / length == pytest.approx(found["gauge_1_strain"].values[1], rel=1e-9)
-    assert found["strain_gauge_1_e1"].values == pytest.approx([0, 0.01005], abs=2 * LEFT)
+    assert found["strain_gauge_1_e1"].values == pytest.approx([0, 0.01005], abs=LEFT)
     assert any("camera.json" in remark and camera.summary() in remark for remark in found.remarks)
 
     export_result(result, "csv", folder / "out.csv")
