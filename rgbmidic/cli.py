@@ -401,8 +401,8 @@ def plan(
 ) -> None:
     """Predict where each lamp reflects, the uncertainty to expect, and better places for the lamps."""
     from rgbmidic.lab import check_folder
-    from rgbmidic.lab.planning import report as planning
-    from rgbmidic.lab.planning.plan import make_plan, propose_colours, propose_lamps
+    from rgbmidic.lab import planning_report as planning
+    from rgbmidic.lab.planning import make_plan, propose_colours, propose_lamps
     from rgbmidic.scene.scene import read_scene
 
     check_folder(out, planning.FILES, overwrite=overwrite)

@@ -18,7 +18,7 @@ import scipy.sparse as sp
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NO_MATCH", "NodeStatus", "Solution", "Status", "fill"]
+__all__ = ["NO_MATCH", "NodeStatus", "Solution", "Status", "fill", "rank"]
 
 NO_MATCH = "the images do not match anywhere in the region"
 """Reason of a frame in which nothing was found."""
@@ -135,6 +135,30 @@ class Solution:
     def unmeasured_fraction(self) -> float:
         """Fraction of the nodes that are not measured."""
         return float((self.node_status != NodeStatus.MEASURED).mean())
+
+
+_UNSETTLED = 0.02
+"""Fraction of the nodes whose loss is as bad as iterations that did not converge: of a fragment that turns, 1 to 3 of
+900 nodes still move by some .002 px (benchmarks/fast_event.py), while the solve that converges has lost all of it."""
+
+
+def rank(status: int, node_status: npt.NDArray[np.uint8]) -> tuple[bool, float]:
+    """Rank of a solve among several of one frame; the smallest is the best.
+
+    Parameters
+    ----------
+    status
+        `Status` of the frame.
+    node_status : ndarray, shape (N,)
+        `NodeStatus` of its nodes.
+
+    Returns
+    -------
+    tuple
+        Whether it failed; the fraction of the nodes without data, more where the iterations did not converge.
+    """
+    without = float((node_status != NodeStatus.MEASURED).mean())
+    return status == Status.FAILED, without + _UNSETTLED * (status == Status.NOT_CONVERGED)
 
 
 def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from rgbmidic.correlation.nodes import correlation_around
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, follow
-from rgbmidic.correlation.solution import NO_MATCH, Solution, Status
+from rgbmidic.correlation.solution import NO_MATCH, Solution, Status, rank
 from rgbmidic.correlation.solve import solve
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import SolverSettings
@@ -427,7 +427,7 @@ def track(
         if found.confidence < NEEDED:
             continue
         trial = solve(reference, deformed, found.displacement, options, method)
-        if best is None or (trial.status, trial.unmeasured_fraction) < (best.status, best.unmeasured_fraction):
+        if best is None or rank(trial.status, trial.node_status) < rank(best.status, best.node_status):
             best = trial
         if best.status is Status.CONVERGED and best.unmeasured_fraction <= start.unmeasured + (number + 0.5) * _LOSS:
             break

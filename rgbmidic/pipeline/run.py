@@ -27,7 +27,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame
 from rgbmidic.pipeline.pair import solver_settings
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank
+from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank_of
 from rgbmidic.pipeline.separation import LightSeparation
 from rgbmidic.pipeline.source import FrameSequence, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
@@ -361,7 +361,7 @@ def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[S
         if is_key(position) and loses(found, start):
             closer = starts[position - 1]
             again, after_again = _solved(plan, index, closer, updates, key=True)
-            if rank(again) < rank(found):
+            if rank_of(again) < rank_of(found):
                 found, after, start = again, after_again, closer
             elif not found.measured.any():
                 after = closer

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.correlation import NodeStatus, Solution, Start, Status
+from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
@@ -27,7 +28,18 @@ from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
 from rgbmidic.results import QUANTITIES, FrameRecord, ResultStore
 from rgbmidic.typing import AnyArray
 
-__all__ = ["STRIDE", "Schedule", "children", "dependants", "following", "is_key", "lineage", "loses", "parent", "rank"]
+__all__ = [
+    "STRIDE",
+    "Schedule",
+    "children",
+    "dependants",
+    "following",
+    "is_key",
+    "lineage",
+    "loses",
+    "parent",
+    "rank_of",
+]
 
 logger = logging.getLogger("rgbmidic.pipeline.frame")
 
@@ -152,7 +164,7 @@ class Schedule:
                 self._want(before)
             return
         if first is not None:
-            better = first if rank(first) <= rank(record) else record
+            better = first if rank_of(first) <= rank_of(record) else record
             record = replace(better, values={**better.values, "tries": 2})
         self._store.write_frame(position, record)
         self._finished[position] = True
@@ -165,7 +177,7 @@ class Schedule:
             done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
             line = f"{status.name.lower().replace('_', ' ')}: {record.reason}"
             if status is Status.CONVERGED:
-                measured = 1 - rank(record)[1]
+                measured = 1 - rank_of(record)[1]
                 line = f"converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
             progress(done, len(places), f"{self._plan.series.name(self._index(position))}: {line}")
 
@@ -224,15 +236,14 @@ def _error(future: Future[Measured]) -> BaseException | None:
         raise RgbmidicError(LOST_CLUSTER) from None
 
 
-def rank(record: FrameRecord | Solution) -> tuple[int, float]:
-    """The smaller, the better a frame is measured."""
-    return int(record.status), float((record.node_status != NodeStatus.MEASURED).mean())
+def rank_of(record: FrameRecord | Solution) -> tuple[bool, float]:
+    """The smaller, the better a frame is measured (`rgbmidic.correlation.solution.rank`)."""
+    return rank(int(record.status), record.node_status)
 
 
 def loses(record: FrameRecord | Solution, start: Start) -> bool:
     """Whether a key frame is measured worse than the one it starts from."""
-    status, unmeasured = rank(record)
-    return status != Status.CONVERGED or unmeasured > start.unmeasured + _LOSS
+    return record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + _LOSS
 
 
 STRIDE = 16

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.lab.planning.plan import APART, Plan, make_plan, propose_colours, propose_lamps
+from rgbmidic.lab.planning import APART, Plan, make_plan, propose_colours, propose_lamps
 from rgbmidic.lab.virtual import Cylinder, Light, Plate, Scene, State, turned
 from rgbmidic.lab.virtual.rendering import paint, sphere_scene
 from rgbmidic.scene.camera import reference_camera, three_lights

@@ -11,8 +11,8 @@ import pytest
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import ResultError
-from rgbmidic.lab.planning.plan import make_plan, propose_lamps
-from rgbmidic.lab.planning.report import lamp_rows, plan_document, plan_figure, uncertainty_rows, write_plan, zone_rows
+from rgbmidic.lab.planning import make_plan, propose_lamps
+from rgbmidic.lab.planning_report import lamp_rows, plan_document, plan_figure, uncertainty_rows, write_plan, zone_rows
 from rgbmidic.scene.scene import read_scene
 
 SCENE = """

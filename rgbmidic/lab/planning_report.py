@@ -11,7 +11,7 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.lab import check_folder, number_or_none, write_findings
-from rgbmidic.lab.planning.plan import Outlook, Plan, Proposal
+from rgbmidic.lab.planning import Outlook, Plan, Proposal
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS

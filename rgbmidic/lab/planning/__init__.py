@@ -1,1 +1,0 @@
-"""Where lamps will reflect, what uncertainty to expect, and where the lamps would stand better."""
