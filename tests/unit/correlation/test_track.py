@@ -9,7 +9,8 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic import Region, Status, Tri3Mesh
-from rgbmidic.correlation import Deformed, Reference, Start, track
+from rgbmidic.correlation import Deformed, NodeStatus, Reference, Start, track
+from rgbmidic.correlation.solution import rank
 from rgbmidic.settings import SolverSettings
 from rgbmidic.weights import Statistics
 
@@ -108,3 +109,16 @@ def test_a_frame_without_a_start_says_how_near_it_came(reference):
     assert "do not match anywhere" in failed.reason
     assert "of 15% needed" in failed.reason
     assert "turns up to about 30 degrees" in failed.reason
+
+
+def test_a_fragment_counts_for_more_than_the_last_iterations_of_a_node():
+    """The better of two solves of a frame is the one with more nodes, but for a fiftieth of them the one that ended."""
+
+    def nodes(lost):
+        status = np.full(1000, NodeStatus.MEASURED, dtype=np.uint8)
+        status[:lost] = NodeStatus.DECORRELATED
+        return status
+
+    held, ended = rank(Status.NOT_CONVERGED, nodes(0)), [rank(Status.CONVERGED, nodes(lost)) for lost in (0, 10, 80)]
+    assert ended[0] < ended[1] < held < ended[2]
+    assert rank(Status.CONVERGED, nodes(999)) < rank(Status.FAILED, nodes(1000))
