@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import erf
 
 from rgbmidic.fields.plane import distorted, undistorted
-from rgbmidic_calibration.camera import Target, View
+from rgbmidic_calibration.target import Target, View
 
 __all__ = [
     "DISTANCE",

@@ -12,307 +12,38 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import optimize, stats
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.fields.plane import CameraCalibration, distorted, undistorted
-from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.settings import FrameSettings
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import CaptureFiles, provenance
+from rgbmidic_calibration.target import Target, View, find_views
 
 __all__ = [
     "LensEstimate",
     "PlaneEstimate",
-    "Target",
-    "View",
     "estimate_lens",
     "estimate_plane",
-    "find_view",
-    "photograph",
 ]
 
-_KINDS = ("chessboard", "charuco", "circles", "acircles")
-_FORM = re.compile(rf"({'|'.join(_KINDS)}):(\d+)x(\d+):([\d.]+)mm(?::([\d.]+)mm)?(?::(DICT_\w+))?")
 LEAST_VIEWS = 5
 """Views of the target from which a lens is calibrated: each gives two equations for the focal length and principal
 point (Zhang), which leaves seven for the distortion and the check."""
 LEAST_ANGLE = 10.0
 """Largest angle (degrees) between two views below which all count as parallel: the focal length follows from 1 - cos of
 it, 1.5 %, with corners good to .1 % of the target (derived)."""
-CLIPPED = 0.005
-"""Fraction of saturated samples within the target above which a photograph is refused: chosen; glare on one square of
-a board of 54 is 1.9 %."""
-BLURRED = 0.25
-"""Blur of the target's edges (10 to 90 %), over the square's side, above which a photograph is refused: beyond it the
-blur of one edge reaches the next corner's window (chosen)."""
 LARGEST_RESIDUAL = 0.5
 """Residual of the points (px rms) above which no target is flat and rigid: ten times that of the detection (chosen)."""
 PAYS = 0.01
 """Level of the F test from which the next distortion term is taken up."""
 COVERED = 0.5
 """Fraction of the frame that the views' points must cover, or a warning says that the lens is extrapolated (chosen)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Target:
-    """A flat target with points at known places.
-
-    Attributes
-    ----------
-    kind
-        ``"chessboard"`` (inner corners), ``"charuco"`` (squares), ``"circles"`` or ``"acircles"`` (asymmetric).
-    columns, rows
-        Numbers of them along both sides.
-    spacing
-        mm between neighbours; of asymmetric circles half the distance in a row, as OpenCV counts it.
-    marker
-        Side of a ChArUco board's markers, mm.
-    dictionary
-        OpenCV's name of their dictionary.
-    """
-
-    kind: str
-    columns: int
-    rows: int
-    spacing: float
-    marker: float = 0.0
-    dictionary: str = "DICT_5X5_100"
-
-    @classmethod
-    def parse(cls, text: str) -> Self:
-        """Read ``KIND:COLUMNSxROWS:SPACINGmm``, for ``charuco`` with ``:MARKERmm`` and ``:DICTIONARY``.
-
-        Raises
-        ------
-        ConfigurationError
-            The text has another form, or names what cannot be a target.
-        """
-        found = _FORM.fullmatch(text.strip())
-        form = (
-            f"--target is KIND:COLUMNSxROWS:SPACINGmm with a kind of {', '.join(_KINDS)}, such as chessboard:9x6:2.5mm "
-            "(inner corners), charuco:8x6:10mm:7.5mm:DICT_5X5_100 (squares, markers)"
-        )
-        if found is None:
-            raise ConfigurationError(f"{form}; not {text!r}")
-        kind, columns, rows, spacing, marker, dictionary = found.groups()
-        try:
-            target = cls(kind=kind, columns=int(columns), rows=int(rows), spacing=float(spacing))
-            if kind == "charuco":
-                target = replace(target, marker=float(marker or 0), dictionary=dictionary or target.dictionary)
-        except ValueError:
-            raise ConfigurationError(f"{form}; not {text!r}") from None
-        wrong = min(target.columns, target.rows) < 3 or target.spacing <= 0
-        if wrong or (kind == "charuco") != bool(marker) or not target.marker < target.spacing:
-            raise ConfigurationError(
-                f"{form}; at least 3 points along a side, markers smaller than squares; not {text!r}"
-            )
-        if not hasattr(cv2.aruco, target.dictionary):
-            raise ConfigurationError(f"--target: OpenCV has no dictionary {target.dictionary}")
-        return target
-
-    @property
-    def points(self) -> FloatArray:
-        """Places (n, 2) of the points on the target, mm."""
-        if self.kind == "charuco":
-            return np.asarray(self._board().getChessboardCorners(), dtype=np.float64)[:, :2]
-        row, column = np.divmod(np.arange(self.columns * self.rows), self.columns)
-        if self.kind == "acircles":
-            column = 2 * column + row % 2
-        return np.stack([column, row], axis=1) * self.spacing
-
-    def _board(self) -> Any:
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.spacing, self.marker, dictionary)
-
-    def find(self, image: Any) -> tuple[FloatArray, FloatArray] | None:
-        """Find the target in an image (H, W) of 8 bit.
-
-        Returns
-        -------
-        tuple of ndarray, shape (m, 2), or None
-            Its points in mm and in px; None where it is not found whole (a ChArUco board: six points of it).
-        """
-        size = (self.columns, self.rows)
-        if self.kind == "charuco":
-            corners, numbers, *_ = cv2.aruco.CharucoDetector(self._board()).detectBoard(image)
-            if numbers is None or len(numbers) < 6:
-                return None
-            return self.points[np.ravel(numbers)], np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        if self.kind == "chessboard":
-            # normalised images (CALIB_CB_NORMALIZE_IMAGE) cost .2 px
-            there, points = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
-            if not there:
-                there, points = cv2.findChessboardCornersSB(
-                    image, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
-                )
-        else:
-            grid = cv2.CALIB_CB_ASYMMETRIC_GRID if self.kind == "acircles" else cv2.CALIB_CB_SYMMETRIC_GRID
-            there, points = cv2.findCirclesGrid(image, size, flags=grid)
-        return (self.points, np.asarray(points, dtype=np.float64).reshape(-1, 2)) if there else None
-
-
-def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, reach: float) -> FloatArray:
-    """Fit the model of a blurred corner to the image around each corner of a chessboard.
-
-    The grey levels are ``a + b erf(d1 / s) erf(d2 / s)`` with the distances d1 and d2 from the two edges: seven
-    unknowns a corner, by Gauss-Newton. What OpenCV finds is off by .015 px, this by .003 px (noise of .5 %, tests).
-
-    Parameters
-    ----------
-    image : ndarray, shape (H, W), float32
-        Grey levels.
-    points, pixels : ndarray, shape (m, 2)
-        The corners on the target, mm, and where they were found, px.
-    reach : float
-        mm around a corner in which the target shows nothing but its edges.
-
-    Returns
-    -------
-    ndarray, shape (m, 2)
-        px; where the fit leaves the corner's window, what was found before.
-    """
-    homography = np.asarray(cv2.findHomography(points, pixels)[0], dtype=np.float64)
-
-    def seen(places: FloatArray) -> FloatArray:
-        values = np.c_[places, np.ones(len(places))] @ homography.T
-        return np.asarray(values[:, :2] / values[:, 2:])
-
-    edges = [seen(points + step) - seen(points - step) for step in reach * np.eye(2)]
-    half = int(min(_WINDOW, np.min([np.linalg.norm(edge, axis=1).min() for edge in edges]) / (2 * np.sqrt(2))))
-    if half < _LEAST_WINDOW:
-        return pixels
-    y, x = (part.ravel() for part in np.mgrid[-half : half + 1, -half : half + 1])
-    corner = np.round(pixels).astype(int)
-    inside = ((corner >= half) & (corner < np.array(image.shape[::-1]) - half)).all(axis=1)
-    values = image[
-        np.clip(corner[:, 1:] + y, 0, image.shape[0] - 1), np.clip(corner[:, :1] + x, 0, image.shape[1] - 1)
-    ].astype(np.float64)
-    angles = [np.arctan2(edge[:, 1], edge[:, 0]) for edge in edges]
-    low, high = np.percentile(values, (5, 95), axis=1)
-
-    def model(state: FloatArray) -> FloatArray:
-        dx, dy = x - state[:, :1], y - state[:, 1:2]
-        distance = [dy * np.cos(angle) - dx * np.sin(angle) for angle in (state[:, 2:3], state[:, 3:4])]
-        width = np.exp(state[:, 4:5])
-        return np.asarray(
-            state[:, 5:6] + state[:, 6:7] * special.erf(distance[0] / width) * special.erf(distance[1] / width)
-        )
-
-    state = np.column_stack([pixels - corner, *angles, np.zeros(len(pixels)), (low + high) / 2, (high - low) / 2])
-    signs = np.einsum("mp,mp->m", model(state) - state[:, 5:6], values - values.mean(axis=1, keepdims=True))
-    state[:, 6] *= np.where(signs < 0, -1, 1)
-    steps = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-4, 1.0, 1.0])
-    for _ in range(_TURNS):
-        slopes = np.stack(
-            [(model(state + step) - model(state - step)) / (2 * step.sum()) for step in np.diag(steps)], axis=2
-        )
-        normal = slopes.transpose(0, 2, 1) @ slopes
-        scale = 1 / np.sqrt(np.maximum(np.einsum("maa->ma", normal), 1e-12))
-        normal = normal * scale[:, :, None] * scale[:, None] + 1e-9 * np.eye(7)
-        right = np.einsum("mpa,mp->ma", slopes, values - model(state)) * scale
-        change = np.linalg.solve(normal, right[..., None])[..., 0] * scale
-        state += np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE)
-    found = corner + state[:, :2]
-    sure = inside & (np.abs(found - pixels) < 1).all(axis=1) & np.isfinite(state).all(axis=1)
-    return np.where(sure[:, None], found, pixels)
-
-
-_WINDOW, _LEAST_WINDOW = 15.0, 4
-"""Largest and smallest half width (px) of the window around a corner: beyond 15 px nothing is gained, below 4 px there
-are hardly more samples than unknowns."""
-_TURNS = 12
-"""Gauss-Newton iterations of a corner: after 8 no corner moves by 1e-4 px (measured)."""
-_LARGEST_CHANGE = np.array([1.0, 1.0, 0.2, 0.2, 0.5, np.inf, np.inf])
-"""Largest step of position (px), angles, and logarithm of the width; the grey levels are linear."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class View:
-    """Points of the target in one photograph.
-
-    Attributes
-    ----------
-    name : str
-        Of the photograph.
-    points : ndarray, shape (m, 2)
-        Their places on the target, mm.
-    pixels : ndarray, shape (m, 2)
-        Where they are in the frame, px.
-    shape : tuple of int
-        Rows and columns of the frame.
-    """
-
-    name: str
-    points: FloatArray
-    pixels: FloatArray
-    shape: tuple[int, int]
-
-
-def photograph(frame: Mosaic | ChannelFrame) -> tuple[FloatImage, BoolArray]:
-    """Return the mean image (H, W) of a frame's samples, in grey levels above black, and where it is saturated.
-
-    Of a mosaic every pixel is the mean over red, green, green and blue around it in equal parts, with the weights 1 2 1
-    along both axes: no lattice of the colours is left, and nothing is shifted.
-    """
-    values = np.asarray(frame.values, dtype=np.float32) - np.float32(frame.black_level.mean())
-    clipped = np.asarray(frame.values) >= frame.white_level
-    if isinstance(frame, Mosaic):
-        smooth = np.array([0.25, 0.5, 0.25])
-        return np.asarray(cv2.sepFilter2D(values, -1, smooth, smooth, borderType=cv2.BORDER_REFLECT_101)), clipped
-    return np.asarray(values.mean(axis=0)), np.asarray(clipped.any(axis=0))
-
-
-def find_view(frame: Mosaic | ChannelFrame, target: Target, name: str) -> View:
-    """Find the target in a frame.
-
-    Raises
-    ------
-    CalibrationError
-        It is not found, saturated or blurred; the message names the photograph.
-    """
-    image, clipped = photograph(frame)
-    low, high = np.percentile(image, (0.5, 99.5))
-    grey = np.round(np.clip((image - low) * (255 / max(high - low, 1e-6)), 0, 255)).astype(np.uint8)
-    found = target.find(grey)
-    if found is None:
-        raise CalibrationError(f"{name}: the {target.kind} of {target.columns} x {target.rows} is not found")
-    points, pixels = found
-    inside = np.zeros(image.shape, dtype=np.uint8)
-    cv2.fillConvexPoly(inside, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
-    if (fraction := float(clipped[inside > 0].mean())) > CLIPPED:
-        raise CalibrationError(
-            f"{name}: {fraction:.1%} of the samples within the target are saturated, at most {CLIPPED:.1%} may be: "
-            "take away light or glare"
-        )
-    if target.kind == "chessboard":
-        sharpness = cv2.estimateChessboardSharpness(grey, (target.columns, target.rows), pixels.astype(np.float32))[0]
-        edge = float(np.ravel(np.asarray(sharpness))[0])
-        side = float(np.linalg.norm(np.diff(pixels[: target.columns], axis=0), axis=1).mean())
-        if not edge <= BLURRED * side:
-            raise CalibrationError(
-                f"{name}: the edges of the squares are {edge:.1f} px wide, at most {BLURRED:g} of their side of "
-                f"{side:.0f} px may be: focus, or hold the target still"
-            )
-    if target.kind in ("chessboard", "charuco"):
-        reach = target.spacing if target.kind == "chessboard" else (target.spacing - target.marker) / 2
-        pixels = refined_corners(image, points, pixels, 0.8 * reach)
-    return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]))
-
-
-def find_views(files: CaptureFiles, target: Target) -> tuple[list[View], tuple[str, ...]]:
-    """Find the target in every photograph; those without it come as reasons."""
-    views, reasons = list[View](), list[str]()
-    for frame, name in zip(files.frames(), files.labels, strict=True):
-        try:
-            views.append(find_view(frame, target, name))
-        except CalibrationError as error:
-            reasons.append(str(error))
-    return views, tuple(reasons)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -525,33 +256,23 @@ def estimate_plane(view: View, camera: CameraCalibration, std: float | None = No
     if first is None or not np.isfinite(first).all() or abs(np.linalg.det(first[:2, :2])) < 1e-12:
         raise CalibrationError(f"{view.name}: the points of the target lie on a line")
 
-    def off(entries: FloatArray, points: FloatArray, values: FloatArray | None) -> FloatArray:
+    points, start = _in_image_axes(view.points, np.asarray(first, dtype=np.float64), camera)
+
+    def off(entries: FloatArray, values: FloatArray | None = lens) -> FloatArray:
         back = np.c_[points, np.ones(len(points))] @ np.linalg.inv(np.r_[entries, 1.0].reshape(3, 3)).T
         ideal = back[:, :2] / back[:, 2:] + centre
-        return np.asarray((ideal if values is None else distorted(values, ideal)) - view.pixels)
+        return np.asarray((ideal if values is None else distorted(values, ideal)) - view.pixels).ravel()
 
-    # the axes of the image: the top left pixel is (0, 0), and x runs along the rows in the middle
-    slope = first[:2, :2] / first[2, 2] - np.outer(first[:2, 2], first[2, :2]) / first[2, 2] ** 2
-    x, y = slope[:, 0] / np.linalg.norm(slope[:, 0])
-    turn = np.array([[x, y], [-y, x]])
-    turn[1] *= np.sign(np.linalg.det(slope))
-    motion = np.eye(3)
-    motion[:2, :2] = turn
-    begin = replace(camera, homography=motion @ first / first[2, 2])
-    origin = begin.to_mm(np.zeros((1, 2)))[0]
-    motion[:2, 2] = -origin
-    points = view.points @ turn.T - origin
-    start = motion @ first
     entries = (start / start[2, 2]).ravel()[:8]
     # columns scaled alike: by what a px at the edge of the target does
     scale = np.maximum(np.abs(entries), np.r_[[1e-3 * abs(entries[0])] * 6, [1e-6] * 2])
 
     def scaled(part: FloatArray) -> FloatArray:
-        return off(part * scale, points, lens).ravel()
+        return off(part * scale)
 
     found = optimize.least_squares(scaled, entries / scale, jac="3-point", method="lm", xtol=1e-14)
-    entries = found.x * scale
-    residual = off(entries, points, lens)
+    entries, slopes = found.x * scale, found.jac / scale
+    residual = off(entries)
     rms = float(np.sqrt((residual**2).mean()))
     if rms > LARGEST_RESIDUAL and std is None:
         raise CalibrationError(
@@ -559,26 +280,38 @@ def estimate_plane(view: View, camera: CameraCalibration, std: float | None = No
             "flat target leaves" + (": calibrate the lens too, with --views" if lens is None else "")
         )
     variance = std**2 if std is not None else float((residual**2).sum()) / (residual.size - 8)
-    own = found.jac / scale
     covariance = np.zeros((16, 16))
-    fitted = np.linalg.inv(own.T @ own)
-    covariance[8:, 8:] = fitted * variance
-    if lens is not None:
-        steps = np.sqrt(np.diag(camera.covariance)[:8])
-        by_lens = np.zeros((residual.size, 8))
-        for number in np.flatnonzero(steps):
-            step = np.zeros(8)
-            step[number] = steps[number]
-            change = off(entries, points, lens + step) - off(entries, points, lens - step)
-            by_lens[:, number] = change.ravel() / (2 * steps[number])
-        follows = -fitted @ own.T @ by_lens
+    covariance[8:, 8:] = variance * np.linalg.inv(slopes.T @ slopes)
+    if lens is not None:  # a change of the lens' parameters moves the plane that fits best
         known = camera.covariance[:8, :8]
+        steps = np.diag(np.sqrt(np.diag(known)))
+        changes = np.stack([(off(entries, lens + step) - off(entries, lens - step)) / 2 for step in steps], axis=1)
+        by_lens = np.divide(changes, np.diag(steps), out=np.zeros_like(changes), where=np.diag(steps) > 0)
+        follows = -np.linalg.lstsq(slopes, by_lens, rcond=None)[0]
         covariance[:8, :8] = known
         covariance[8:, :8] = follows @ known
         covariance[:8, 8:] = covariance[8:, :8].T
         covariance[8:, 8:] += follows @ known @ follows.T
     plane = replace(camera, homography=np.r_[entries, 1.0].reshape(3, 3), covariance=covariance)
-    return PlaneEstimate(camera=plane, residual=residual, rms=rms)
+    return PlaneEstimate(camera=plane, residual=residual.reshape(-1, 2), rms=rms)
+
+
+def _in_image_axes(
+    points: FloatArray, homography: FloatArray, camera: CameraCalibration
+) -> tuple[FloatArray, FloatArray]:
+    """Points (m, 2) of the target, and the homography to them, in the axes of the image.
+
+    The top left pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
+    """
+    homography = homography / homography[2, 2]
+    slope = homography[:2, :2] - np.outer(homography[:2, 2], homography[2, :2])
+    x, y = slope[:, 0] / np.linalg.norm(slope[:, 0])
+    motion = np.eye(3)
+    motion[:2, :2] = [[x, y], [-y, x]]
+    motion[1] *= np.sign(np.linalg.det(slope))
+    turned = motion @ homography
+    motion[:2, 2] = -replace(camera, homography=turned).to_mm(np.zeros((1, 2)))[0]
+    return points @ motion[:2, :2].T + motion[:2, 2], motion @ homography
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -699,12 +432,7 @@ def calibrate_camera(
     view, fitted = None, None
     if plane and target:
         groups.append(CaptureFiles.find("plane", plane, stated))
-        shots, reasons = find_views(groups[-1], target)
-        if reasons:
-            raise CalibrationError("; ".join(reasons))
-        if any(len(shot.points) != len(shots[0].points) for shot in shots):
-            raise CalibrationError("--plane: the photographs show different points of the target: state one of them")
-        view = replace(shots[0], pixels=np.mean([shot.pixels for shot in shots], axis=0))
+        view = _mean_view(groups[-1], target)
     elif corners:
         if camera is None and stated.shape is None:
             raise ConfigurationError("--corners need the frames' size: --shape ROWSxCOLUMNS, or --lens")
@@ -715,19 +443,11 @@ def calibrate_camera(
         camera = camera or CameraCalibration(shape=view.shape)
         fitted = estimate_plane(view, camera, corners[2] if corners else None)
         camera = fitted.camera
-        tilt, tilt_std = camera.tilt_deg
-        scale, scale_std = camera.scale(camera.centre)
-        details["plane"] = {"photograph": view.name, "rms_px": fitted.rms, "mm_per_pixel": scale} | {
-            key: value
-            for key, value in (("mm_per_pixel_std", scale_std), ("tilt_deg", tilt), ("tilt_std_deg", tilt_std))
-            if np.isfinite(value)
-        }
+        details["plane"] = {"photograph": view.name, "rms_px": fitted.rms, **_plane_details(camera)}
         hull = cv2.contourArea(cv2.convexHull(view.pixels.astype(np.float32))) / np.prod(view.shape)
         if hull < COVERED / 2:
-            warnings = (
-                *warnings,
-                f"the target covers {hull:.0%} of the frame on the plane: beyond it the plane is extrapolated",
-            )
+            beyond = f"the target covers {hull:.0%} of the frame on the plane: beyond it the plane is extrapolated"
+            warnings = (*warnings, beyond)
     assert camera is not None
     details |= {"warnings": list(warnings), "provenance": provenance("camera", groups, {})}
     return CameraEstimate(
@@ -738,6 +458,25 @@ def calibrate_camera(
         plane=fitted,
         warnings=warnings,
     )
+
+
+def _mean_view(files: CaptureFiles, target: Target) -> View:
+    """Return the points of the target, averaged over the photographs of one plane."""
+    shots, reasons = find_views(files, target)
+    if reasons:
+        raise CalibrationError("; ".join(reasons))
+    if any(len(shot.points) != len(shots[0].points) for shot in shots):
+        raise CalibrationError("--plane: the photographs show different points of the target: state one of them")
+    return replace(shots[0], pixels=np.mean([shot.pixels for shot in shots], axis=0))
+
+
+def _plane_details(camera: CameraCalibration) -> dict[str, float]:
+    """Return scale and tilt of the plane with their standard uncertainties, as far as they are known."""
+    (scale, scale_std), (tilt, tilt_std) = camera.scale(camera.centre), camera.tilt_deg
+    names = ("mm_per_pixel", "mm_per_pixel_std", "tilt_deg", "tilt_std_deg")
+    return {
+        name: value for name, value in zip(names, (scale, scale_std, tilt, tilt_std), strict=True) if np.isfinite(value)
+    }
 
 
 def _lens_only(covariance: FloatArray) -> FloatArray:

@@ -196,6 +196,7 @@ def camera(
     from rgbmidic_calibration import camera as cameras
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import check_output
+    from rgbmidic_calibration.target import Target
 
     check_output(out, overwrite=overwrite)
     if picture is not None:
@@ -204,7 +205,7 @@ def camera(
         raise ConfigurationError("--corners and --size belong together: state both")
     estimate = cameras.calibrate_camera(
         stated,
-        None if target is None else cameras.Target.parse(target),
+        None if target is None else Target.parse(target),
         views=views,
         plane=plane,
         lens=None if lens is None else CameraCalibration.read(lens),

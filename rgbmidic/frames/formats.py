@@ -17,10 +17,9 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import TIFF_ENDINGS, HeaderlessFile, PngFile, TiffFile, is_headerless
 from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
+from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, TiffStack, is_tiff_stack, split_dataset
 from rgbmidic.frames.stored import Camera
 from rgbmidic.frames.tiff_pages import is_dng
-from rgbmidic.frames.tiff_stack import TiffStack, is_tiff_stack
 from rgbmidic.settings import FrameKind, FrameSettings
 
 __all__ = [
