@@ -60,7 +60,7 @@ nearer. Chosen; with half or twice of it results do not change (benchmarks/const
 _RETURNS = 2
 """Passes after which elements may take part again. At a fragment's edge some come and go with every pass: with 4 plates
 under glare took up to 22 iterations instead of 16 (plates it was chosen on; three others take up to 13); with 1 they
-took 11, but what a crack or another body pulls at first is left out for good (benchmarks/fast_event.py, tests/truth)."""
+took 11, but what a crack or another body pulls at first is left out for good (benchmarks/fast_event.py)."""
 _WANDERING = 0.1
 """Motion (px) in the last iteration of a pass, and more than half of that in the one before, from which the elements
 around a node are left out after `_RETURNS` passes: its own pixels match nothing. Chosen: ten times what ends the first
