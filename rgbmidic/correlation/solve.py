@@ -256,13 +256,13 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance, _PATIENCE)
         swinging = equations.textured & (estimate.increments[-1] > tolerance)
-        if swinging.any() and len(estimate.increments) < problem.options.max_iterations:
-            matched = weighting.matched & ~swinging[problem.reference.mesh.elements].any(axis=1)
+        matched = weighting.matched & ~swinging[problem.reference.mesh.elements].any(axis=1)
+        few = 0 < swinging.mean() < _SWINGING and matched.any()
+        if few and len(estimate.increments) < problem.options.max_iterations:
             residual = compare(problem, weighting.values, estimate)
-            rest = replace(weighting, residual=residual, matched=matched)
-            if matched.any() and swinging.mean() < _SWINGING:
-                weighting, equations = rest, _equations(problem, rest, estimate)
-                estimate = iterate(problem, equations, weighting.values, residual, estimate, tolerance, _PATIENCE)
+            weighting = replace(weighting, residual=residual, matched=matched)
+            equations = _equations(problem, weighting, estimate)
+            estimate = iterate(problem, equations, weighting.values, residual, estimate, tolerance, _PATIENCE)
         weighting = replace(weighting, residual=compare(problem, weighting.values, estimate))
     return estimate, equations, weighting
 

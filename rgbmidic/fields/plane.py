@@ -10,7 +10,7 @@ pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -180,13 +180,14 @@ class CameraCalibration:
 
     def sensitivity(self, points: FloatArray) -> FloatArray:
         """Derivative (N, 2, 16) of `to_mm` by the `parameters`, scaled by the root of the covariance's diagonal."""
-        values, scale = self.parameters, np.sqrt(np.diag(self.covariance))
-        out = np.zeros((len(points), 2, len(values)))
-        for number in np.flatnonzero(scale):
-            step = np.zeros_like(values)
-            step[number] = scale[number]
-            out[..., number] = (self.to_mm(points, values + step) - self.to_mm(points, values - step)) / 2
-        return out
+        return self._by_parameters(lambda values: self.to_mm(points, values))
+
+    def _by_parameters(self, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Derivative (..., 16) of a function (...) of the parameters, scaled as `sensitivity` states."""
+        values = self.parameters
+        steps = np.diag(np.sqrt(np.diag(self.covariance)))
+        parts = [(function(values + step) - function(values - step)) / 2 for step in steps]
+        return np.stack(parts, axis=-1)
 
     @property
     def correlation(self) -> FloatArray:
@@ -204,12 +205,7 @@ class CameraCalibration:
         """
         if self.lens is None:
             return float("nan"), float("nan")
-        values, scale = self.parameters, np.sqrt(np.diag(self.covariance))
-        here, slopes = self._slope(values), np.zeros((2, len(values)))
-        for number in np.flatnonzero(scale):
-            step = np.zeros_like(values)
-            step[number] = scale[number]
-            slopes[:, number] = (self._slope(values + step) - self._slope(values - step)) / 2
+        here, slopes = self._slope(self.parameters), self._by_parameters(self._slope)
         size = float(np.hypot(*here))
         along = here / size if size > 0 else np.array([1.0, 0.0])
         std = np.sqrt(along @ (slopes @ self.correlation @ slopes.T) @ along) / (1 + size**2)

@@ -35,9 +35,6 @@ _START = 180.0
 one that gets no memory for its threads never answers."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RGBMIDIC_THREADS")
 """What libraries read, when they start, for the number of their threads."""
-_MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**31)}
-"""What lets the C library of Linux keep the memory of a frame for the next: it takes 7 % less time then, and no more
-memory at its peak (1024 px, three lights)."""
 
 Updated = Sequence[tuple[int, Solution]]
 """Index and solution of frames that became the reference, see `measure_frame`."""
@@ -99,7 +96,7 @@ class Processes(Workers):
 
     def _begin(self) -> ProcessPoolExecutor:
         others = set(multiprocessing.active_children())
-        with _environment(dict.fromkeys(_THREADS, str(self._threads)) | _MEMORY):
+        with _environment(dict.fromkeys(_THREADS, str(self._threads))):
             spawn = multiprocessing.get_context("spawn")  # threads do not survive a fork
             pool = ProcessPoolExecutor(self.slots, spawn, initializer=_prepare, initargs=(self._plan, self._threads))
             # the processes must start while the environment says how many threads they have
