@@ -49,7 +49,9 @@ Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; ma
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
 Reading = Annotated[
     Path | None,
-    typer.Option("--test", help="TEST.toml whose [scale], [setup] and [probes] count instead of those kept."),
+    typer.Option(
+        "--test", help="TEST.toml whose [scale], [setup], [probes] and [channels] count instead of those kept."
+    ),
 ]
 Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")]
 
@@ -73,6 +75,30 @@ _PROBE_OPTIONS: dict[str, Any] = {
     ],
     "rigid_motion": Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")],
 }
+
+
+_CHANNEL_OPTIONS: dict[str, Any] = {
+    "file": Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then a column each.")],
+    "offset": Annotated[float | None, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")],
+    "trigger": Annotated[str | None, typer.Option("--trigger", help="Channel whose first step is the time 0.")],
+    "align": Annotated[
+        str | None, typer.Option("--align", metavar="CHANNEL=COLUMN", help="Offset by correlation with a history.")
+    ],
+    "area": Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")],
+    "force": Annotated[str | None, typer.Option("--force", help="Channel with the force (_N or _kN).")],
+}
+"""Keys of ``[channels]``."""
+
+
+def _read_channels(options: dict[str, Any]) -> dict[str, Any]:
+    """The keys of ``[channels]`` that the options state; of the three clocks only one is kept."""
+    stated = {key: value for key, value in options.items() if value is not None}
+    if (pair := stated.get("align")) is not None:
+        stated["align"] = tuple(part.strip() for part in pair.split("="))
+        if len(stated["align"]) != 2 or not all(stated["align"]):
+            raise InputError(f"--align is CHANNEL=COLUMN, such as force_kN=gauge_1_strain, not {pair!r}")
+    clocks = ("offset", "trigger", "align")
+    return ({"offset": 0.0, "trigger": None, "align": None} if any(key in stated for key in clocks) else {}) | stated
 
 
 def _read_probes(options: dict[str, Any]) -> dict[str, Any]:
@@ -280,15 +306,13 @@ def view(
 
 @app.command()
 @command.gather("probes", _PROBE_OPTIONS, _read_probes)
+@command.gather("channels", _CHANNEL_OPTIONS, _read_channels)
 def history(
     folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
     probes: dict[str, Any],
-    channels: Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then a column each.")] = None,
-    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
-    area: Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")] = None,
-    force: Annotated[str | None, typer.Option("--force", help="Channel with the force (_N or _kN).")] = None,
-    test: Annotated[Path | None, typer.Option("--test", help="TEST.toml whose [scale] and [probes] count now.")] = None,
+    channels: dict[str, Any],
+    test: Reading = None,
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
@@ -297,7 +321,7 @@ def history(
     Places are in px on the reference; the option of a place may be given several times.
     """
     from rgbmidic.report import history_figure, save_figure
-    from rgbmidic.results import Channels, Result, history_rows, probes_of, write_histories
+    from rgbmidic.results import Result, channels_of, history_rows, probes_of, write_histories
     from rgbmidic.results.files import check_file
     from rgbmidic.results.histories import read_histories
 
@@ -314,9 +338,7 @@ def history(
         result,
         replace(kept, **stated),
         scale=None if settings is None else settings.scale,
-        channels=None if channels is None else Channels.read(channels, offset),
-        area=area,
-        force=force,
+        channels=replace(channels_of(result) if settings is None else settings.channels, **channels),
     )
     write_histories(histories, out, overwrite=overwrite)
     save_figure(history_figure(histories), picture)

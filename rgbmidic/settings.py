@@ -24,6 +24,7 @@ from rgbmidic.errors import ConfigurationError
 __all__ = [
     "BAYER_PATTERNS",
     "ELEMENT_SIZE",
+    "ChannelSettings",
     "FrameKind",
     "FrameSettings",
     "IlluminationSettings",
@@ -420,6 +421,47 @@ class ProbeSettings(_Checked):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelSettings(_Checked):
+    """Analog channels recorded beside a test (``[channels]``), such as a force; nothing measured depends on them.
+
+    At most one of `offset`, `trigger` and `align` relates the clock of the recorder to that of the frames.
+
+    Attributes
+    ----------
+    file
+        CSV file (`rgbmidic.results.Channels`); None: there are no channels.
+    offset
+        Seconds that are added to the recorded times to make them those of the frames.
+    trigger
+        Name of the channel with the trigger signal: its first crossing of the middle of its range is the time 0.
+    align
+        Name of a channel and of a column of the histories: the offset is that of their largest correlation.
+    area
+        Cross-section of the specimen in square mm, for a stress.
+    force
+        Name of the channel with the force; None: the only one whose name ends in N or kN.
+    """
+
+    section = "channels"
+
+    file: Path | None = None
+    offset: float = 0.0
+    trigger: str | None = None
+    align: tuple[str, str] | None = None
+    area: float | None = bounded(None, above=0)
+    force: str | None = None
+
+    def _check(self) -> None:
+        stated = [name for name in ("offset", "trigger", "align") if getattr(self, name)]
+        _require(len(stated) < 2, f"channels.{' and channels.'.join(stated)} both relate the clocks: state one of them")
+        others = [entry.name for entry in fields(self) if getattr(self, entry.name) and entry.name != "file"]
+        _require(
+            self.file is not None or not others,
+            f"channels.{(others or ['file'])[0]} is of channels, whose file (channels.file) is not stated",
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SetupSettings(_Checked):
     """Description of the experiment for `rgbmidic report` (``[setup]``), which no file holds; None: not stated.
 
@@ -466,7 +508,7 @@ class TestSettings(_Checked):
 
     Attributes
     ----------
-    frames, region, illumination, weights, solver, scale, setup, probes
+    frames, region, illumination, weights, solver, scale, setup, probes, channels
         The sections of the same name.
     calibration_file
         ``file`` in ``[calibration]``; needed for colour frames, unless a script gives its own separation.
@@ -495,6 +537,7 @@ class TestSettings(_Checked):
     scale: ScaleSettings = field(default_factory=ScaleSettings)
     setup: SetupSettings = field(default_factory=SetupSettings)
     probes: ProbeSettings = field(default_factory=ProbeSettings)
+    channels: ChannelSettings = field(default_factory=ChannelSettings)
     base: Path = field(default_factory=Path, metadata={"key": ""})
 
     def _check(self) -> None:

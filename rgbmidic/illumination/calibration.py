@@ -215,6 +215,26 @@ class Calibration:
             document["registration"]["parameter_names"] = _PARAMETERS
         return {**document, **self.extra, "provenance": dict(self.provenance)}
 
+    def figures(self) -> dict[str, Any]:
+        """Return what a report states of the calibration: the document without what varies over the field."""
+        document = self.to_document()
+        kept = {"lights", "matrix", "std", "noise_amplification", "gain", "read_noise", "parameters"}
+        figures: dict[str, Any] = {
+            section: {key: value for key, value in document[section].items() if key in kept}
+            for section in ("crosstalk", "noise", "registration")
+            if section in document
+        }
+        made = {name: one for name, one in self.provenance.items() if isinstance(one, Mapping)}
+        origins = {
+            name: {
+                "date": one.get("date", "at an unknown time"),
+                "files": len(one.get("inputs", ())),
+                "warnings": list(one.get("warnings", ())),
+            }
+            for name, one in made.items()
+        }
+        return {**figures, "provenance": origins}
+
     def write(self, path: Path | str) -> None:
         """Write the calibration file; an existing file is replaced only once the new one is complete.
 

@@ -23,6 +23,7 @@ from rgbmidic._kernels import are_compiled
 from rgbmidic.correlation import Solution, Start, Status
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
+from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame
 from rgbmidic.pipeline.pair import solver_settings
@@ -207,7 +208,7 @@ def _places(chosen: range, frames: range | None) -> range:
 def _store(
     plan: Plan, out: Path, part: range | None, objects: dict[str, str], *, overwrite: bool, resume: bool
 ) -> ResultStore:
-    series = plan.series
+    series, calibration = plan.series, plan.settings.calibration_file
     recording = series.recording
     begun = (resume or part is not None) and (out / PROVENANCE).exists()
     fingerprint, unread = series.fingerprint(read_provenance(out).get("unread_files", ()) if begun else ())
@@ -228,6 +229,8 @@ def _store(
             "unread_files": list(unread),
             "frame_shape": list(plan.window.frame),
             "reference_origin": list(plan.window.origin),
+            "reference_exposure": list(_exposure(plan)),
+            "calibration_figures": Calibration.read(calibration).figures() if calibration else {},
         },
     )
     if part is not None:
@@ -235,6 +238,15 @@ def _store(
     if resume:
         return ResultStore.resume(out, origin)
     return ResultStore.create(out, origin, overwrite=overwrite)
+
+
+def _exposure(plan: Plan) -> Iterator[dict[str, Any]]:
+    """Yield of each light the median grey level in the region of the reference, and the part that is not usable."""
+    images, inside = plan.images, plan.region.mask
+    for light, values in zip(images.names, images.values, strict=True):
+        usable = (part := values[inside])[np.isfinite(part)]
+        level = float(np.median(usable)) / images.full_scale if usable.size else 0.0
+        yield {"light": light, "median": level, "excluded": 1 - usable.size / max(part.size, 1)}
 
 
 def measure_sequence(

@@ -15,10 +15,11 @@ from rgbmidic.report import figures
 from rgbmidic.report import setup as tables
 from rgbmidic.report.curves import field_history_figure, history_figure, status_figure, uncertainty_figure
 from rgbmidic.report.style import PAGE_DPI, embedded, time_text
-from rgbmidic.results import QUANTITIES, Result, probes_of
+from rgbmidic.results import QUANTITIES, Result, channels_of, probes_of
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.physical import Physical
-from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
+from rgbmidic.settings import ChannelSettings, ProbeSettings, SetupSettings, TestSettings, read_section
+from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,6 +29,8 @@ _MOST = 200
 """Frames that the time histories are drawn from at most: a panel is some 450 pixels wide, two for each."""
 _SHOWN = 3
 """Frames of which maps are shown where none are named: first third, second third and end of a test."""
+_KEYS = 5
+"""Key frames in a strip: as many as a page is wide with panels of 4 cm."""
 _LISTED = 20
 """Failed frames that are listed with their reason: half a page."""
 _NO_DATA, _MISFIT, _RATIO, _BLUR = 0.1, 2.0, 1.5, 1.0
@@ -52,7 +55,8 @@ def write_report(
     out
         HTML file to write; it appears once it is complete.
     settings
-        Settings whose ``[setup]``, ``[scale]`` and ``[probes]`` replace those kept in the result; None: those kept.
+        Settings whose ``[setup]``, ``[scale]``, ``[probes]`` and ``[channels]`` replace those kept in the result; None:
+        those kept.
     frames
         Indices of the frames of which maps are shown; None: three deformed ones that did not fail, evenly spaced,
         the last of them included, and the one that has moved farthest.
@@ -71,8 +75,9 @@ def write_report(
     kept = result.provenance.get("settings", {}).get("setup", {})
     setup = read_section(SetupSettings, "setup", kept) if settings is None else settings.setup
     probes = probes_of(result) if settings is None else settings.probes
+    channels = channels_of(result) if settings is None else settings.channels
     physical = Physical.of(result, None if settings is None else settings.scale)
-    text = _Report(physical, setup, probes, frames).page().html
+    text = _Report(physical, setup, probes, channels, frames).page().html
     write_complete(out, lambda file: file.write(text.encode()))
 
 
@@ -80,12 +85,17 @@ class _Report:
     """Data that all sections of a report are made from."""
 
     def __init__(
-        self, physical: Physical, setup: SetupSettings, probes: ProbeSettings, frames: Sequence[int] | None
+        self,
+        physical: Physical,
+        setup: SetupSettings,
+        probes: ProbeSettings,
+        channels: ChannelSettings,
+        frames: Sequence[int] | None,
     ) -> None:
         result = physical.result
         for frame in frames or ():
             result.frame(frame)  # an error of one is raised before the long work
-        self.physical, self.setup, self.probes = physical, setup, probes
+        self.physical, self.setup, self.probes, self.channels = physical, setup, probes, channels
         self.history = tables.TimeHistory(physical, figures.spread(figures.shown_frames(result), _MOST))
         measured = figures.spread(figures.measured_frames(result), _SHOWN)
         self.shown = tuple(sorted({*measured, self.history.farthest})) if frames is None else tuple(frames)
@@ -162,6 +172,20 @@ class _Report:
             f"Displacement in {length} and strain ({physical.measure_name}, virtual strain gauge of "
             f"{physical.in_units(physical.gauges.length)}), at their places on the reference image."
         )
+        if len(keys := self.history.key_frames(_KEYS)) > 2:
+            strips: dict[str, list[tuple[str, FloatArray]]] = {}
+            for frame in keys:
+                values, title = physical.frame(frame), self._when(frame, short=True)
+                strips.setdefault(f"displacement ({length})", []).append((title, np.hypot(values["u"], values["v"])))
+                strips.setdefault(f"larger principal strain ({physical.measure_name})", []).append(
+                    (title, values["e1"])
+                )
+            for label, strip in strips.items():
+                _show(
+                    page,
+                    self.maps.strip(strip, label),
+                    f"{label} in key frames, between which the field changes by equal amounts",
+                )
         for frame in self.shown:
             values = physical.frame(frame)
             maps = {f"{name} ({length})": (values[name], values[f"{name}_std"]) for name in ("u", "v")}
@@ -180,7 +204,7 @@ class _Report:
         page.heading("Probes")
         places = [(kind, ", ".join(f"{number:g}" for number in place)) for kind, place in self.probes.places]
         page.table(("probe", "place in px"), places)
-        histories = read_histories(self.physical.result, self.probes, scale=self.physical.scale)
+        histories = read_histories(self.physical.result, self.probes, scale=self.physical.scale, channels=self.channels)
         caption = "time history of the probes; the bands extend two standard uncertainties to both sides"
         _show(page, history_figure(histories), caption)
         if histories.remarks:
@@ -194,6 +218,9 @@ class _Report:
             page.text(
                 "The uncertainty of the image scale is part of that of every length in mm, the same in all of them."
             )
+        if self.floor is not None:
+            heads = ("noise floor", "unit", "standard deviation", "of the mean over the nodes", "stated, median")
+            page.table(heads, list(tables.noise_rows(physical, self.floor, self.history)))
         rows = []
         for name in ("u_std", "v_std", "exx_std", "eyy_std", "exy_std"):
             known = self.history.quantiles[name]
@@ -212,6 +239,8 @@ class _Report:
     def _lights(self, page: Page) -> None:
         result, frame = self.physical.result, self.shown[-1]
         page.heading("Lights and reflections")
+        for heads, rows in tables.calibration_tables(result):
+            page.table(heads, rows)
         _show(page, figures.brightness_figure(result), "gain and offset of each light against the reference")
         _show(page, figures.residual_figure(result), "residual of each light, and its fraction in the nodes")
         if len(result.lights) > 1:
@@ -255,9 +284,11 @@ class _Report:
         page.table(("what", ""), rows)
         page.table(("setting", "value"), list(tables.settings_rows(kept.get("settings", {}))))
 
-    def _when(self, frame: int) -> str:
+    def _when(self, frame: int, *, short: bool = False) -> str:
         times = self.physical.times
         when = f" at {time_text(times[frame], times)}" if self.physical.units.timed else ""
+        if short:
+            return f"frame {frame}{when.replace(' at', ',')}"
         return f"frame {frame} ({self.physical.result.names[frame]}){when}"
 
 

@@ -337,6 +337,34 @@ class MapDrawer:
         maps = {title: (part, Normalize(0, 1)) for title, part in zip(titles, fractions.T, strict=True)}
         return self._draw(frame, maps, "cividis")
 
+    def strip(self, maps: Sequence[tuple[str, FloatArray]], label: str) -> Figure:
+        """Draw small maps of one nodal field in several frames, side by side, in the same colours.
+
+        Parameters
+        ----------
+        maps
+            Title and values (N,) of each frame.
+        label
+            Title of the figure: the field and its unit.
+
+        Returns
+        -------
+        Figure
+        """
+        x, y = _view(self.result, self.result.nodes)
+        every = np.concatenate([values for _, values in maps])
+        norm = style.colour_scale(every[np.isfinite(every)]) if np.isfinite(every).any() else None
+
+        def draw(axes: list[Axes]) -> None:
+            for axis, (title, values) in zip(axes, maps, strict=False):
+                self._show(axis, values, norm, "viridis", bar=axis is axes[-2])
+                axis.set_title(title)
+                style.finish_picture(axis, x, y, first=axis is axes[0])
+            axes[-1].set_axis_off()  # room for the colour bar
+
+        aspect = np.ptp(y) / np.ptp(x)
+        return style.draw_figure(draw, count=len(maps) + 1, aspect=max(aspect, 0.5), beside=style.GAP, title=label)
+
     def _draw(self, frame: int, maps: Mapping[str, tuple[FloatArray, Normalize | None]], colours: str) -> Figure:
         """Draw one map per nodal field, over the reference where there is one."""
         import matplotlib as mpl
@@ -369,7 +397,7 @@ class MapDrawer:
             style.freeze_axes(figure, self._dpi)
         return figure
 
-    def _show(self, axis: Axes, values: FloatArray, norm: Normalize | None, colours: str) -> None:
+    def _show(self, axis: Axes, values: FloatArray, norm: Normalize | None, colours: str, *, bar: bool = True) -> None:
         """Show a nodal field, linear in each element as in the solve; blank where one of its nodes has no data."""
         if norm is None or not np.isfinite(values).any():
             box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
@@ -379,6 +407,8 @@ class MapDrawer:
         x, y, constant = np.concatenate([planes, np.full((1, 3), np.nan)])[self._element].transpose(2, 0, 1)
         picture = x * self._places[0] + y * self._places[1] + constant  # of no element, -1: NaN, the last row
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
+        if not bar:
+            return
         scaled = norm(values[np.isfinite(values)])
         beyond = bool(scaled.min() < -_EQUAL), bool(scaled.max() > 1 + _EQUAL)
         style.add_colour_bar(axis, norm, colours, beyond=beyond)

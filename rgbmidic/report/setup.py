@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rgbmidic.results.physical import Physical
 
 Rows = Iterator[tuple[str, str]]
+Cells = Iterator[tuple[str, ...]]
 
 _PREFILTERS = {"none": "none", "binomial": "[1 2 1]/4 along x and y", "gaussian": "Gaussian, σ = 1 px"}
 _WEIGHTS = {
@@ -125,6 +126,13 @@ def noise_text(physical: Physical, floor: NoiseFloor | None) -> str:
     return f"u {u:.3g} {length}, v {v:.3g} {length}; {parts} µm/m (one standard deviation, {floor.count} static frames)"
 
 
+def noise_rows(physical: Physical, floor: NoiseFloor, history: TimeHistory) -> Cells:
+    """Yield quantity, unit, noise floor, the part of it that all nodes have in common, and the stated uncertainty."""
+    for name, value in floor.measured.items():
+        unit = physical.units.length if name in "uv" else "1"
+        yield name, unit, *(f"{number:.3g}" for number in (value, floor.common[name], history.median(f"{name}_std")))
+
+
 def settings_rows(settings: Mapping[str, Mapping[str, Any]]) -> Rows:
     """Yield every key of the settings with its value, but for empty lists and for ``[setup]``, which stands elsewhere.
 
@@ -208,6 +216,16 @@ class TimeHistory:
         """Return the value farthest from 0 of a quantity's median over the nodes; NaN where nothing is measured."""
         return float(max(self.medians(name), key=abs))
 
+    def key_frames(self, count: int) -> tuple[int, ...]:
+        """Select frames between which the field changes by about as much: its quantiles' path in equal parts."""
+        fields = np.stack([self.quantiles[name] for name in ("u", "v")])
+        seen = np.flatnonzero(np.isfinite(fields).all(axis=(0, 2)))
+        if not len(seen):
+            return ()
+        path = np.cumsum(np.abs(np.diff(fields[:, seen], axis=1, prepend=0)).sum(axis=(0, 2)))  # from rest
+        places = np.searchsorted(path, path[-1] * np.arange(1, count + 1) / count * (1 - 1e-9))
+        return tuple(self.frames[seen[place]] for place in sorted({*places.tolist()}))
+
     @property
     def farthest(self) -> int:
         """The frame whose median displacement is the largest."""
@@ -225,10 +243,14 @@ class NoiseFloor:
         Number of static frames.
     measured
         Of u, v (in the unit of `Physical.units`), exx, eyy and exy: the rms over the nodes.
+    common
+        Of the same: the standard deviation of the mean over the nodes, which is what all nodes have in common, such as
+        vibration.
     """
 
     count: int
     measured: dict[str, float]
+    common: dict[str, float]
 
 
 def noise_floor(physical: Physical) -> NoiseFloor | None:
@@ -251,17 +273,48 @@ def noise_floor(physical: Physical) -> NoiseFloor | None:
     static = [place for place in result.provenance["references"] if result.status[place] != 2][:_STATIC]
     if len(static) < 2:
         return None
-    sums, squares = np.zeros((2, len(names), len(result.nodes)))
+    sums, squares, means = *np.zeros((2, len(names), len(result.nodes))), []
     for frame in static:
         values = physical.frame(frame)
         one = np.stack([values[name] for name in names]).astype(np.float64)
         sums, squares = sums + one, squares + one**2
-    count = len(static)
-    variance = np.maximum(squares - sums**2 / count, 0) / (count - 1)
-    variance *= 1 + 1 / len(result.setting("frames", "reference", static))
-    known = [row[np.isfinite(row)] for row in variance]
-    rms = [float(np.sqrt(row.mean())) if row.size else float("nan") for row in known]
-    return NoiseFloor(count=count, measured=dict(zip(names, rms, strict=True)))
+        known = [row[np.isfinite(row)] for row in one]
+        means.append([row.mean() if row.size else np.nan for row in known])
+    count, single = len(static), 1 + 1 / len(result.setting("frames", "reference", static))
+    known = [row[np.isfinite(row)] for row in np.maximum(squares - sums**2 / count, 0) / (count - 1)]
+    rms = [float(np.sqrt(single * row.mean())) if row.size else float("nan") for row in known]
+    common = np.sqrt(single) * np.std(means, axis=0, ddof=1)
+    return NoiseFloor(
+        count=count, measured=dict(zip(names, rms, strict=True)), common=dict(zip(names, common.tolist(), strict=True))
+    )
+
+
+def calibration_tables(result: Result) -> Iterator[tuple[tuple[str, ...], list[tuple[str, ...]]]]:
+    """Yield headings and rows of what the run kept of the calibration, and of the reference's exposure."""
+    exposed = result.provenance.get("reference_exposure", [])
+    rows: list[tuple[str, ...]] = [(one["light"], f"{one['median']:.1%}", f"{one['excluded']:.2%}") for one in exposed]
+    if rows:
+        yield ("light, in the region of the reference", "median grey level, of full scale", "pixels not usable"), rows
+    kept = result.provenance.get("calibration_figures", {})
+    if crosstalk := kept.get("crosstalk"):
+        std = crosstalk.get("std")
+        cells = [
+            [f"{value:.5f}" + (f" ± {std[i][j]:.1g}" if std and value != 1 else "") for j, value in enumerate(row)]
+            for i, row in enumerate(crosstalk["matrix"])
+        ]
+        rows = [(f"channel {i + 1}", *row) for i, row in enumerate(cells)]
+        rows.append(("amplification of noise", *(f"{value:.2f}" for value in crosstalk["noise_amplification"])))
+        yield ("crosstalk", *crosstalk["lights"]), rows
+    if registration := kept.get("registration"):
+        heads = ("registration", "shift in x, px", "in y, px", "rotation, rad", "scale", "radial")
+        parameters = zip(registration["lights"], registration["parameters"], strict=True)
+        yield heads, [(light, *(f"{value:.4g}" for value in row)) for light, row in parameters]
+    rows = [("noise model", ", ".join(f"{name} {value:.4g}" for name, value in kept.get("noise", {}).items()))]
+    for section, origin in kept.get("provenance", {}).items():
+        rows.append((f"{section} measured", f"{origin['date']}, from {origin['files']} files"))
+        rows += [(f"{section}: warning", warning) for warning in origin["warnings"]]
+    if rows := [row for row in rows if row[1]]:
+        yield ("calibration", ""), rows
 
 
 def speckle_size(result: Result) -> float | None:

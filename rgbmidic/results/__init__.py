@@ -6,6 +6,7 @@ from rgbmidic.results.export import EXPORT_FORMATS, export_result
 from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
 from rgbmidic.results.physical import (
     Channels,
+    channels_of,
     exposure,
     frame_times,
     probes_of,
@@ -32,6 +33,7 @@ __all__ = [
     "Result",
     "ResultQuantity",
     "ResultStore",
+    "channels_of",
     "export_result",
     "exposure",
     "finish_result",

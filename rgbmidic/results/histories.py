@@ -31,7 +31,7 @@ from rgbmidic.fields import (
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.physical import Channels, exposure, frame_times, rectification_of, reference_frames, shared_part
 from rgbmidic.results.result import Result
-from rgbmidic.settings import ProbeSettings, ScaleSettings
+from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 
 __all__ = ["Histories", "HistoryColumn", "history_csv", "history_rows", "read_histories", "write_histories"]
@@ -139,9 +139,7 @@ def read_histories(
     probes: ProbeSettings,
     *,
     scale: ScaleSettings | None = None,
-    channels: Channels | None = None,
-    area: float | None = None,
-    force: str | None = None,
+    channels: ChannelSettings | None = None,
 ) -> Histories:
     """Read probes off a result.
 
@@ -156,11 +154,7 @@ def read_histories(
     scale
         It replaces the ``[scale]`` that was kept with the result; None: that one.
     channels
-        Recorded beside the test.
-    area
-        Cross-section of the specimen in square mm, for a stress.
-    force
-        Name of the channel with the force, where there are several.
+        Recorded beside the test: file, clock, and what a stress needs; None: none.
 
     Returns
     -------
@@ -171,7 +165,7 @@ def read_histories(
     ------
     InputError
         A probe is outside the region, or measured in no frame; the window is longer than the test; the times of the
-        frames are not known, or have none in common with those of the channels.
+        frames are not known, or have none in common with those of the channels; the channels are not usable.
     """
     if not probes.places and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
@@ -206,7 +200,7 @@ def read_histories(
         for history in read
         for column in _in_units(history, units, clock, probes.window, shared_part(result), references)
     ]
-    beside, stress = _beside(channels, times, area, force)
+    beside, stress, clocks = _beside(channels or ChannelSettings(), times, quantities)
     strain = next((column.name for column in quantities if column.name.endswith(("_strain", "_e1"))), None)
     return Histories(
         frames=there,
@@ -216,7 +210,7 @@ def read_histories(
         quantities=(*quantities, *beside, *stress),
         stress_strain=(strain, stress[0].name) if stress and strain else None,
         units=units,
-        remarks=tuple(_remarks(rectified, speed, exposure(result), there, by_probe, beside)),
+        remarks=(*_remarks(rectified, speed, exposure(result), there, by_probe, beside), *clocks),
     )
 
 
@@ -282,24 +276,39 @@ def _in_units(
 
 
 def _beside(
-    channels: Channels | None, times: FloatArray | None, area: float | None, force: str | None
-) -> tuple[list[HistoryColumn], list[HistoryColumn]]:
-    """Interpolate the channels at the times of the frames; compute the stress where a cross-section (mm²) is known."""
-    if area is not None and (channels is None or not area > 0):
-        raise InputError(f"a stress needs channels with a force and an area above 0 mm², not {area:g}")
-    if channels is None:
-        return [], []
+    stated: ChannelSettings, times: FloatArray | None, histories: list[HistoryColumn]
+) -> tuple[list[HistoryColumn], list[HistoryColumn], list[str]]:
+    """Return the channels at the times of the frames, the stress where a cross-section is known, and remarks."""
+    if stated.file is None:
+        return [], [], []
     if times is None:
         raise InputError(
-            f"the channels {channels.path} cannot be brought to the frames, whose times are not known: state "
+            f"the channels {stated.file} cannot be brought to the frames, whose times are not known: state "
             "frame_rate in [scale]"
+        )
+    channels, remarks = Channels.read(stated.file, stated.offset, stated.trigger), []
+    if stated.align is not None:
+        name, wanted = stated.align
+        column = next((one for one in histories if wanted in (one.name, one.column)), None)
+        if column is None:
+            known = ", ".join(one.name for one in histories)
+            raise InputError(f'channels.align names the history "{wanted}", which is not one of {known}')
+        channels, std, coefficient = channels.aligned(name, times, column.values)
+        remarks.append(
+            f"the times of the channels were shifted by {channels.offset:.6g} s ({std:.2g} s standard uncertainty), "
+            f"where {name} and {column.name} correlate by {coefficient:.3f}"
+        )
+    elif stated.trigger is not None:
+        remarks.append(
+            f"the times of the channels were shifted by {channels.offset:.6g} s: {stated.trigger} rises at 0"
         )
     read = channels.at(times)
     beside = [HistoryColumn(name=name, unit="", values=values, std=None) for name, values in read.items()]
-    if area is None:
-        return beside, []
-    name, newtons = channels.force(force)
-    return beside, [HistoryColumn(name="stress", unit="MPa", values=read[name] * newtons / area, std=None)]
+    if stated.area is None:
+        return beside, [], remarks
+    name, newtons = channels.force(stated.force)
+    stress = HistoryColumn(name="stress", unit="MPa", values=read[name] * newtons / stated.area, std=None)
+    return beside, [stress], remarks
 
 
 def _remarks(

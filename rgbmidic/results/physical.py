@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import (
@@ -34,12 +35,13 @@ from rgbmidic.fields import (
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, ResultQuantity
 from rgbmidic.results.result import Result
-from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section, regular
+from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, read_section, regular
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = [
     "Channels",
     "Physical",
+    "channels_of",
     "exposure",
     "frame_times",
     "probes_of",
@@ -61,6 +63,10 @@ _DIFFERENT = 0.01
 in whole microseconds give the median interval of 10,000 frames per second to 1 %."""
 
 
+_FEWEST, _ALIKE = 8, 0.7
+"""Values that an alignment needs at least, and the correlation coefficient: half of the variance explained (chosen)."""
+
+
 def scale_of(result: Result) -> ScaleSettings:
     """Return the ``[scale]`` that a result was measured with."""
     return read_section(ScaleSettings, "scale", result.provenance.get("settings", {}).get("scale", {}))
@@ -69,6 +75,11 @@ def scale_of(result: Result) -> ScaleSettings:
 def probes_of(result: Result) -> ProbeSettings:
     """Return the ``[probes]`` that a result was measured with."""
     return read_section(ProbeSettings, "probes", result.provenance.get("settings", {}).get("probes", {}))
+
+
+def channels_of(result: Result) -> ChannelSettings:
+    """Return the ``[channels]`` that a result was measured with."""
+    return read_section(ChannelSettings, "channels", result.provenance.get("settings", {}).get("channels", {}))
 
 
 def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rectification:
@@ -188,7 +199,7 @@ class Channels:
     offset: float = 0.0
 
     @classmethod
-    def read(cls, path: Path | str, offset: float = 0.0) -> Self:
+    def read(cls, path: Path | str, offset: float = 0.0, trigger: str | None = None) -> Self:
         """Read a CSV file: a header line, then rows; the first column is ``time_s``, ``time_ms`` or ``time_us``.
 
         Columns are separated by commas, semicolons (then a comma may be the decimal point) or tabs.
@@ -199,11 +210,14 @@ class Channels:
             The file.
         offset
             Seconds that are added to its times to make them those of the frames.
+        trigger
+            In place of `offset`: the channel whose first crossing of the middle of its range is the time 0.
 
         Raises
         ------
         InputError
-            The file is missing, has no such header, a field is no number, or the times do not rise.
+            The file is missing, has no such header, a field is no number, the times do not rise, or the trigger is not
+            one of the channels or constant.
         """
         path = Path(path)
         try:
@@ -225,7 +239,93 @@ class Channels:
         if len(times) < 2 or not (np.diff(times) > 0).all():
             raise InputError(f"the times of the channels {path} must rise from row to row, over two rows or more")
         values = dict(zip(names[1:], table[:, 1:].T, strict=True))
-        return cls(path=path, times=times + offset, values=values, offset=offset)
+        channels = cls(path=path, times=times, values=values)
+        if trigger is not None:
+            signal = channels.named(trigger)
+            middle = (np.nanmin(signal) + np.nanmax(signal)) / 2
+            crossed = np.flatnonzero(np.diff(np.sign(signal - middle)) != 0)
+            if not len(crossed):
+                raise InputError(f"the trigger {trigger} of the channels {path} is constant: it marks no time")
+            i = int(crossed[0])
+            offset = -float(times[i] + (middle - signal[i]) / (signal[i + 1] - signal[i]) * (times[i + 1] - times[i]))
+        return channels.shifted(offset)
+
+    def shifted(self, offset: float) -> Self:
+        """Return the channels with an offset (s) added to the times."""
+        return replace(self, times=self.times + offset, offset=self.offset + offset)
+
+    def named(self, name: str) -> FloatArray:
+        """Return the values (n,) of a channel.
+
+        Raises
+        ------
+        InputError
+            There is none of this name.
+        """
+        if name not in self.values:
+            raise InputError(f'"{name}" is not one of the channels of {self.path}: {", ".join(self.values)}')
+        return self.values[name]
+
+    def aligned(self, name: str, times: FloatArray, values: FloatArray) -> tuple[Self, float, float]:
+        """Find the offset at which a channel correlates best with a history.
+
+        Of every offset that leaves half of the frames within the channel's times, the largest absolute correlation
+        coefficient of the channel, interpolated at the frames, with the history counts.
+
+        Parameters
+        ----------
+        name
+            The channel.
+        times, values : ndarray, shape (T,)
+            Seconds and values of the history; NaN where it has none.
+
+        Returns
+        -------
+        channels : Channels
+            With that offset.
+        std : float
+            Its standard uncertainty in seconds, from what the fit of the channel to the history leaves as noise, taken
+            as independent from frame to frame.
+        coefficient : float
+            The correlation coefficient.
+
+        Raises
+        ------
+        InputError
+            There is no such channel, too little of the history is known, or the two do not correlate.
+        """
+        signal, there = self.named(name), np.isfinite(values) & np.isfinite(times)
+        at, wanted = times[there], values[there]
+        if len(at) < _FEWEST or not np.ptp(wanted) > 0:
+            raise InputError(f"{len(at)} values of the history are too few, or constant, to align {name} with")
+        least = len(at) // 2
+
+        def fit(offset: float) -> tuple[float, float]:
+            """Correlation coefficient and standard uncertainty of the offset."""
+            moved = np.interp(at, self.times + offset, signal, np.nan, np.nan)
+            used = np.isfinite(moved)
+            if used.sum() < max(least, _FEWEST) or not np.ptp(moved[used]) > 0:
+                return 0.0, math.nan
+            coefficient = float(np.corrcoef(moved[used], wanted[used])[0, 1])
+            slope = coefficient * np.std(wanted[used]) / np.std(moved[used])
+            noise = np.var(wanted[used]) * (1 - coefficient**2)
+            steep = np.gradient(moved[used], at[used]) * slope
+            return coefficient, float(np.sqrt(noise / max((steep**2).sum(), np.finfo(float).tiny)))
+
+        step = float(np.median(np.diff(at))) / 2
+        grid = np.arange(at[least] - self.times[-1], at[-least - 1] - self.times[0] + step, step)
+        scores = [abs(fit(offset)[0]) for offset in grid]
+        best = float(grid[int(np.argmax(scores))]) if scores else 0.0
+        offset = float(
+            minimize_scalar(lambda x: -abs(fit(x)[0]), bounds=(best - step, best + step), method="bounded").x
+        )
+        coefficient, std = fit(offset)
+        if not abs(coefficient) > _ALIKE:
+            raise InputError(
+                f"the channel {name} of {self.path} correlates with the history by {coefficient:.2f} at best, {_ALIKE} "
+                "is needed to align them: state channels.offset"
+            )
+        return self.shifted(offset), std, coefficient
 
     def at(self, times: FloatArray) -> dict[str, FloatArray]:
         """Interpolate each channel linearly at the times (T,) of the frames; NaN beyond its values.
@@ -244,7 +344,8 @@ class Channels:
         if not ((times >= first) & (times <= last)).any():
             raise InputError(
                 f"the channels {self.path} span {first:.9g} to {last:.9g} s (offset {self.offset:g} s included), the "
-                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state the --offset between both clocks"
+                f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state channels.offset (--offset) between "
+                "both clocks"
             )
         return {name: np.interp(times, self.times, values, np.nan, np.nan) for name, values in self.values.items()}
 

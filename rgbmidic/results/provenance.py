@@ -48,7 +48,7 @@ PUT_BACK = "put back the file that was there, or delete it and go on with --resu
 """What to do about a file of another run."""
 _SEAL = "sha256"
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
-READING = ("scale", "probes", "setup")
+READING = ("scale", "probes", "setup", "channels")
 """Sections of the settings that state how a result is read, and not what is measured."""
 _NAMED = 3
 """Differences that an error names: more do not fit a line of a terminal."""
@@ -220,8 +220,8 @@ def read_provenance(path: Path) -> dict[str, Any]:
     if sealed(document)[_SEAL] != seal:
         raise ResultError(
             f"{path / PROVENANCE} was changed after it was written: put it back as it was. Another [scale], [setup] or "
-            "other [probes] are stated in TEST.toml: `rgbmidic run TEST.toml --out DIR --resume` keeps them, --test "
-            "TEST.toml of history, export and report reads with them"
+            "other [probes] or [channels] are stated in TEST.toml: `rgbmidic run TEST.toml --out DIR --resume` keeps "
+            "them, --test TEST.toml of history, export and report reads with them"
         )
     return document
 

@@ -16,6 +16,7 @@ import rgbmidic.settings
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings import (
     BAYER_PATTERNS,
+    ChannelSettings,
     FrameSettings,
     IlluminationSettings,
     ProbeSettings,
@@ -302,6 +303,9 @@ BUILT: dict[str, Any] = {
         window=7,
         rigid_motion="remove",
     ),
+    "channels": ChannelSettings(file=Path("daq.csv"), offset=0.5, area=20, force="load_N"),
+    "channels of a trigger": ChannelSettings(file=Path("daq.csv"), trigger="ttl"),
+    "channels of a history": ChannelSettings(file=Path("daq.csv"), align=("load_N", "gauge_1_strain")),
     "setup": SetupSettings(**{entry.name: f"some {entry.name}" for entry in fields(SetupSettings)}),
 }
 BUILT["test"] = TestSettings(

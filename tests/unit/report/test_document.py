@@ -15,10 +15,20 @@ from matplotlib.figure import Figure
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
+from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.report import document, remove_report, setup, style, write_report
 from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.results.physical import Physical
-from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SetupSettings, TestSettings
+from rgbmidic.settings import (
+    ChannelSettings,
+    FrameSettings,
+    ProbeSettings,
+    RegionSettings,
+    ScaleSettings,
+    SetupSettings,
+    TestSettings,
+)
 
 X, Y = MESH.nodes.T
 ROOM = (NODES, len(LIGHTS))
@@ -70,7 +80,8 @@ def settings(**sections: Any) -> TestSettings:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No pictures: drawing them takes nearly all of the time."""
     monkeypatch.setattr(document, "embedded", lambda _: "data:image/png;base64,")
-    monkeypatch.setattr(document.figures.MapDrawer, "_draw", lambda *_: None)
+    for method in ("_draw", "strip"):
+        monkeypatch.setattr(document.figures.MapDrawer, method, lambda *_: None)
     for module in (document, document.figures, style):
         for name in [name for name in vars(module) if name.endswith("_figure")]:
             monkeypatch.setattr(module, name, lambda *_, **__: None)
@@ -97,12 +108,13 @@ def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path, monkeypatch: p
         monkeypatch.setattr(document.figures, f"{name}_figure", lambda *_: Figure(facecolor="red"))
     image = np.random.default_rng(0).normal(1000, 100, (3, 80, 120))
     probes = ProbeSettings(points=((60.0, 40.0),))
-    records = [still(index, 0.01) for index in range(3)]
+    records = [still(index, 0.01, u=np.full(NODES, float(index))) for index in range(4)]
     result = make(tmp_path / "result", records, reference=image, settings=settings(probes=probes))
     write_report(result, tmp_path / "a.html", frames=[2])
     page = Reader(tmp_path / "a.html")
     assert page.open == []
-    assert len(page.pictures) >= 9
+    assert len(page.pictures) >= 11
+    assert "larger principal strain (Green-Lagrange) in key frames" in page.words
     assert all(re.fullmatch("data:image/png;base64,[A-Za-z0-9+/=]{1000,}", source) for source in page.pictures)
     assert "http" not in (tmp_path / "a.html").read_text(encoding="utf-8")
     for heading in (
@@ -150,6 +162,40 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["u_std"].startswith("mm | ")
     assert "by number or time: 2" in page.words
     assert "no image scale" not in page.words
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_calibration_exposure_and_stress_are_in_the_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    crosstalk = Crosstalk(lights=LIGHTS, matrix=[[1, 0.1, 0], [0.2, 1, 0.3], [0, 0.1, 1]], std=np.full((3, 3), 2e-4))
+    origin = {"crosstalk": {"date": "today", "inputs": [{}, {}], "warnings": ["drift"]}}
+    figures = Calibration(crosstalk=crosstalk, noise=NoiseModel(gain=0.5, read_noise=3.0), provenance=origin).figures()
+    exposure = [{"light": light, "median": 0.301, "excluded": 0.02} for light in LIGHTS]
+    (tmp_path / "c.csv").write_text("time_s,load_N\n0,0\n1,10\n")
+    channels = ChannelSettings(file=tmp_path / "c.csv", area=2.0)
+    stated = settings(
+        channels=channels, probes=ProbeSettings(gauges=((20.0, 20.0, 90.0, 60.0),)), scale=ScaleSettings(frame_rate=10)
+    )
+    notes = {"calibration_figures": figures, "reference_exposure": exposure}
+    result = make(tmp_path / "r", [still(index, 0.01) for index in range(3)], notes=notes, settings=stated)
+    seen: list[Any] = []
+    monkeypatch.setattr(document, "history_figure", seen.append)
+    write_report(result, tmp_path / "a.html")
+    page = Reader(tmp_path / "a.html")
+    assert page.rows["channel 2"] == "0.20000 ± 0.0002 | 1.00000 | 0.30000 ± 0.0002"
+    assert page.rows[LIGHTS[0]] == "30.1% | 2.00%"
+    assert page.rows["noise model"] == "gain 0.5, read_noise 3"
+    assert page.rows["crosstalk measured"] == "today, from 2 files"
+    assert page.rows["crosstalk: warning"] == "drift"
+    (histories,) = seen
+    np.testing.assert_allclose(histories["stress"].values, [0, 0.5, 1.0])
+
+
+def test_key_frames_share_the_change_of_the_field(tmp_path: Path) -> None:
+    """At rest, then a fast event, then slow motion: frames where the path of the field has equal parts."""
+    moved = np.r_[np.zeros(10), np.linspace(0, 9, 10), np.linspace(9, 10, 11)[1:]]
+    result = make(tmp_path / "r", [still(i, 1e-9, u=np.full(NODES, u)) for i, u in enumerate(moved)])
+    history = setup.TimeHistory(Physical.of(result), range(len(moved)))
+    assert history.key_frames(5) == (12, 14, 16, 18, 29)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -229,8 +275,10 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
     assert floor is not None
     assert floor.count == count
     accuracy = 4 / np.sqrt(2 * (count - 1) * NODES)
-    for name in ("u", "v"):
+    for name, field in (("u", u), ("v", v)):
         assert floor.measured[name] == pytest.approx(0.1 * 0.02 * np.sqrt(1 + 1 / count), rel=accuracy)
+        common = np.std(field.mean(axis=1), ddof=1) * np.sqrt(1 + 1 / count)
+        assert floor.common[name] == pytest.approx(0.1 * common, rel=1e-4)
 
 
 def test_one_static_frame_tells_no_noise(tmp_path: Path) -> None:

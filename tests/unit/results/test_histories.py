@@ -27,7 +27,14 @@ from rgbmidic.results import (
     write_histories,
 )
 from rgbmidic.results.histories import read_histories
-from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
+from rgbmidic.settings import (
+    ChannelSettings,
+    FrameSettings,
+    ProbeSettings,
+    RegionSettings,
+    ScaleSettings,
+    TestSettings,
+)
 
 NUMBERS = (0, 1, 2, 4, 5, 6, 7, 8)
 """Of the frames: number 3 is lost."""
@@ -207,8 +214,8 @@ CHANNELS = "time_ms;force_kN;room\n-1;-0,5;20\n3,002;1,5;\n20;10;22\n"
 
 def test_channels_are_brought_to_the_frames_and_make_a_stress(result: Result, tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text(CHANNELS, encoding="utf-8-sig")
-    channels = Channels.read(tmp_path / "c.csv", offset=1e-3)
-    found = read(result, gauges=((20, 15, 90, 60),), channels=channels, area=20.0)
+    channels = ChannelSettings(file=tmp_path / "c.csv", offset=1e-3, area=20.0)
+    found = read(result, gauges=((20, 15, 90, 60),), channels=channels)
     np.testing.assert_allclose(found["force_kN"].values[3], 1.5)
     np.testing.assert_allclose(found["stress_MPa"].values[3], 75)
     assert found.stress_strain == ("gauge_1_strain", "stress")
@@ -238,6 +245,29 @@ def test_a_channel_file_that_is_none_is_one_line(tmp_path: Path, text: str, word
         Channels.read(tmp_path / "c.csv")
 
 
+def test_a_trigger_channel_and_a_correlation_find_the_recorder_s_clock(tmp_path: Path) -> None:
+    recorded = np.arange(0, 20e-3, 20e-6)  # 50 kHz, its clock 7.3 ms behind that of the frames
+    pulse = np.exp(-(((recorded - 12e-3) / 1e-3) ** 2))
+    rows = zip(recorded, pulse, recorded >= 7.3e-3, strict=True)
+    (tmp_path / "c.csv").write_text("time_s,force_N,ttl\n" + "".join(f"{t:.7f},{f:.6g},{s:d}\n" for t, f, s in rows))
+    triggered = Channels.read(tmp_path / "c.csv", trigger="ttl")
+    assert triggered.offset == pytest.approx(-7.29e-3, abs=1e-9)  # in the middle of the rise
+    errors = []
+    times = np.arange(-2e-3, 10e-3, 50e-6)
+    for seed in range(40):
+        noise = np.random.default_rng(seed).normal(0, 0.02, len(times))
+        history = -3e-4 * (np.exp(-(((times - 4.7e-3) / 1e-3) ** 2)) + noise)
+        found, std, coefficient = Channels.read(tmp_path / "c.csv").aligned("force_N", times, history)
+        errors.append((found.offset + 7.3e-3) / std)
+        assert coefficient < -0.99
+    assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.25
+    with pytest.raises(InputError, match=r"correlates with the history by -?0\.\d+ at best, 0\.7 is needed"):
+        Channels.read(tmp_path / "c.csv").aligned("force_N", times, np.random.default_rng(1).normal(0, 1, len(times)))
+    (tmp_path / "d.csv").write_text("time_s,ttl\n0,1\n1,1\n")
+    with pytest.raises(InputError, match="is constant: it marks no time"):
+        Channels.read(tmp_path / "d.csv", trigger="ttl")
+
+
 def command(*arguments: object) -> int:
     return execute(cli.app, ["history", *map(str, arguments)])
 
@@ -258,7 +288,18 @@ def command(*arguments: object) -> int:
         (["--window", "3"], "probes.window must be 0 or at least 4 frames, not 3"),
         (["--window", "30"], "rates over a window of 30 frames need as many; 8 are measured"),
         (["--measure", "euler"], "probes.measure must be one of"),
-        (["--area", "20"], "a stress needs channels with a force"),
+        (["--area", "20"], "channels.area is of channels, whose file (channels.file) is not stated"),
+        (["--channels", "late.csv", "--trigger", "b"], '"b" is not one of the channels of late.csv: bridge'),
+        (
+            ["--channels", "late.csv", "--trigger", "b", "--offset", "3"],
+            "channels.offset and channels.trigger both relate",
+        ),
+        (["--channels", "late.csv", "--align", "bridge"], "--align is CHANNEL=COLUMN, such as"),
+        (
+            ["--channels", "late.csv", "--align", "bridge=force"],
+            'names the history "force", which is not one of point_1_u',
+        ),
+        (["--channels", "late.csv", "--align", "bridge=point_1_u"], "values of the history are too few"),
         (["--channels", "none.csv"], "none.csv cannot be read"),
         (
             ["--channels", "late.csv"],
@@ -285,7 +326,7 @@ def test_a_probe_that_no_frame_measures_and_a_result_without_probes_are_refused(
     with pytest.raises(InputError, match="no probe is stated"):
         read(lost)
     (tmp_path / "c.csv").write_text(CHANNELS)
-    channels = Channels.read(tmp_path / "c.csv")
+    channels = ChannelSettings(file=tmp_path / "c.csv")
     with pytest.raises(InputError, match=r"channels .* cannot be brought to the frames, whose times are not known"):
         read(lost, points=(PLACE,), channels=channels)
     origin = make_origin(1)
