@@ -291,7 +291,10 @@ def report(
 @app.command()
 def view(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="Result folder, also one that still grows; a TEST.toml; raw frames.")
+        Path,
+        typer.Argument(
+            metavar="PATH", help="Result, also one that still grows; TEST.toml; raw frames; folder of tests."
+        ),
     ],
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,

@@ -17,7 +17,9 @@ const rgbmidic = {
   // Mark the frame that is shown in the time line, and keep the view in the address.
   shown({state, now}) {
     now.setv({location: state.shown}, {sync: false});
-    history.replaceState(null, "", "?frame=" + state.shown + (state.query && "&" + state.query));
+    const path = new URL(location.href).searchParams.get("path");
+    const kept = path === null ? "?" : "?path=" + encodeURIComponent(path) + "&";
+    history.replaceState(null, "", kept + "frame=" + state.shown + (state.query && "&" + state.query));
   },
 
   // Take the tool of the button that was pressed; of two groups of buttons one is pressed.

@@ -9,9 +9,11 @@ import logging
 import secrets
 import webbrowser
 from collections.abc import Callable, Mapping
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from bokeh.application import Application
@@ -27,9 +29,10 @@ from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler
 
-from rgbmidic.errors import InputError, ResultError, RgbmidicError
+from rgbmidic.errors import ConfigurationError, InputError, ResultError, RgbmidicError
 from rgbmidic.results import Result
 from rgbmidic.results.provenance import PROVENANCE
+from rgbmidic.settings import read_table, read_toml
 from rgbmidic.view.address import ViewState
 from rgbmidic.view.curves import Progress
 from rgbmidic.view.fields import Fields
@@ -44,6 +47,10 @@ _FORGOTTEN = 15_000
 """Ms after which the data of a closed page are freed: a page that is loaded anew takes less."""
 _BREATH = 0.05
 """Seconds for other pages after each page that is freed: an answer takes as long."""
+_LISTED = 200
+"""Results and tests that a folder's page lists at most, the newest: some 5 ms each."""
+_LIST_STYLE = """<style>a { color: inherit; } td { padding: 3px 24px 3px 0; overflow-wrap: anywhere; }
+h1 { font-size: 22px; }</style>"""
 _THEMES = {"dark": "dark_minimal"}
 
 
@@ -71,7 +78,7 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
     Parameters
     ----------
     path
-        Result folder; a run may still add to it.
+        Result folder, to which a run may still add; a TEST.toml or frames to set a test up; or a folder of these.
     port
         0: any that is free.
     browser
@@ -130,29 +137,81 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
 
 
 def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
-    """Return the pages: a result, or a test to set up and the result of its run; bad input is reported at once."""
-    shared: dict[tuple[Path, str], Progress] = {}
-    if (path / PROVENANCE).exists():
-        Result.open(path, partial=True, check=False)
-        return {"/": partial(_or_error, partial(_fill, path, shared))}
-    from rgbmidic.view.draft import Draft
-    from rgbmidic.view.setup import SetupPage
-    from rgbmidic.view.setup_panel import DraftFrames
+    """Return the pages: a result, a test to set up and the result of its run, or the list of those in a folder.
 
-    DraftFrames.of(Draft.of(path))
+    Bad input is reported at once.
+    """
+    shared: dict[tuple[Path, str], Progress] = {}
     runs: list[Run] = []
 
-    def setup(document: Document) -> None:
-        theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
-        page = SetupPage(document, Draft.of(path), runs, dark=theme == "dark")
-        _place(document, page.roots, f"rgbmidic: {path.name}", theme)
+    def opened(place: Path) -> Callable[[Document], None]:
+        if (place / PROVENANCE).exists():
+            Result.open(place, partial=True, check=False)
+            return partial(_fill, place, shared)
+        from rgbmidic.view.draft import Draft
+        from rgbmidic.view.setup import SetupPage
+        from rgbmidic.view.setup_panel import DraftFrames
+
+        DraftFrames.of(Draft.of(place))
+
+        def setup(document: Document) -> None:
+            theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
+            page = SetupPage(document, Draft.of(place), runs, dark=theme == "dark")
+            _place(document, page.roots, f"rgbmidic: {place.name}", theme)
+
+        return setup
+
+    def one(document: Document) -> None:
+        name = _query(document).get("path", [b""])[-1].decode("utf-8", "replace")
+        if (found := {str(file.relative_to(path)): file for file in _found(path)}.get(name)) is None:
+            raise InputError(f"{path} has no result and no test {name!r}")
+        opened(found)(document)
 
     def result(document: Document) -> None:
         if not runs:
             raise ResultError("no run was started yet")
         _fill(runs[-1].out, shared, document)
 
-    return {"/": partial(_or_error, setup), "/result": partial(_or_error, result)}
+    several = not (path / PROVENANCE).exists() and path.is_dir() and any(_found(path))
+    pages = {"/": partial(_fill_list, path), "/open": one} if several else {"/": opened(path)}
+    return {route: partial(_or_error, page) for route, page in {**pages, "/result": result}.items()}
+
+
+def _found(folder: Path) -> list[Path]:
+    """Return the results and the TEST.toml files in a folder and in two levels of folders below, newest first."""
+    times: dict[Path, float] = {}
+    for pattern in ("", "*/", "*/*/"):
+        for file in (*folder.glob(f"{pattern}{PROVENANCE}"), *folder.glob(f"{pattern}*.toml")):
+            try:
+                if file.name == PROVENANCE or "path" in read_table(read_toml(file, "settings file"), "frames"):
+                    times[file.parent if file.name == PROVENANCE else file] = file.stat().st_mtime
+            except (ConfigurationError, OSError):  # of another program, or gone by now
+                continue
+    return sorted(times, key=lambda file: times[file], reverse=True)[:_LISTED]
+
+
+def _fill_list(folder: Path, document: Document) -> None:
+    """Fill the page that lists the results and tests of a folder."""
+    rows = []
+    for file in _found(folder):
+        name = str(file.relative_to(folder))
+        about, when = "test to set up or run", datetime.fromtimestamp(file.stat().st_mtime)
+        if file.suffix != ".toml":
+            try:
+                result = Result.open(file, partial=True, check=False)
+                about = f"result: {int(result.finished.sum())} of {len(result)} frames, {', '.join(result.lights)}"
+            except RgbmidicError as error:
+                about = f"result that cannot be opened: {error}"
+        cells = (
+            f'<a href="open?path={quote(name)}">{html.escape(name)}</a>',
+            html.escape(about),
+            f"{when:%Y-%m-%d %H:%M}",
+        )
+        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    head = f"<h1>{html.escape(folder.resolve().name)}</h1><p>Results and tests, newest first.</p>"
+    theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
+    table = Div(text=f"{_LIST_STYLE}{head}<table>{''.join(rows)}</table>", sizing_mode="stretch_width")
+    _place(document, {"list": table}, f"rgbmidic: {folder.resolve().name}", theme)
 
 
 def _or_error(fill: Callable[[Document], None], document: Document) -> None:

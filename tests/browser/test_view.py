@@ -218,3 +218,25 @@ def test_a_damaged_frame_is_told_and_the_page_goes_on(driver, tmp_path):
         page.until("model('description').text.includes('damaged in frame 1')")
         page.do("model('frame').value = 0")
         shown(page, 0)
+
+
+def test_a_folder_s_page_opens_its_results_and_a_reload_stays(driver, result):
+    with serving(result.path.parent) as told:
+        driver.get(told)
+        page = Page(driver, f"{told}open?path={result.path.name}")
+        shown(page, 6)
+        page.keys(LEFT)
+        shown(page, 5)
+        page.until("new URL(location.href).searchParams.get('frame') === '5'")
+        driver.refresh()
+        assert "converged" in shown(page, 5)
+        driver.get(f"{told}open?path=..%2Fother")
+        wait = "return Bokeh.documents[0] && Bokeh.documents[0].roots()[0].text"
+        text = ""
+        while "has no result and no test" not in (text or ""):
+            text = driver.execute_script(wait)
+        driver.get(told)
+        listed = ""
+        while "2 of 7" not in (listed or "") and "7 of 7" not in (listed or ""):
+            listed = driver.execute_script(wait)
+        assert "result: 7 of 7 frames" in listed

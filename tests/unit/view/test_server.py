@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import http.client
+import os
 import random
 import re
 import socket
@@ -20,7 +21,7 @@ from viewer import serving
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.view.address import ViewState
-from rgbmidic.view.server import start
+from rgbmidic.view.server import _found, start
 
 REQUESTS = 300
 """Enough for every kind of request below to come a few times; 20,000 were sent once before this was merged."""
@@ -113,6 +114,22 @@ def test_a_second_viewer_of_a_result_has_an_address_of_its_own(tmp_path):
     with serving(path) as one, serving(path) as other:
         assert ask(one, "GET", urlsplit(one).path)[0] == ask(other, "GET", urlsplit(other).path)[0] == 200
         assert ask(one, "GET", urlsplit(other).path)[0] == 404
+
+
+def test_a_folder_lists_its_results_and_tests_newest_first_and_opens_only_those(tmp_path):
+    older, newer = (make_result(tmp_path / name, frames=2).path for name in ("old & <b>", "deep/new"))
+    os.utime(older / "provenance.json", (1e9, 1e9))
+    (tmp_path / "test.toml").write_text("[frames]\npath = 'none/*.tif'\n")
+    os.utime(tmp_path / "test.toml", (1.1e9, 1.1e9))
+    (tmp_path / "pyproject.toml").write_text("[frames]\n")
+    assert _found(tmp_path) == [newer, tmp_path / "test.toml", older]
+    with serving(tmp_path) as told:
+        path = urlsplit(told).path
+        assert ask(told, "GET", path)[0] == 200
+        for name in ("deep/new", "../x", "/etc/passwd", "", "test.toml"):
+            status, body = ask(told, "GET", f"{path}open?path={quote(name)}")
+            assert status == 200
+            assert b"Traceback" not in body
 
 
 def bad_inputs(folder):
