@@ -173,6 +173,7 @@ def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
         _fill(runs[-1].out, shared, document)
 
     several = not (path / PROVENANCE).exists() and path.is_dir() and any(_found(path))
+    pages: dict[str, Callable[[Document], None]]
     pages = {"/": partial(_fill_list, path), "/open": one} if several else {"/": opened(path)}
     return {route: partial(_or_error, page) for route, page in {**pages, "/result": result}.items()}
 
