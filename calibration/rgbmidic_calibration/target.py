@@ -9,6 +9,7 @@ from typing import Any, Self
 import cv2
 import numpy as np
 from scipy import special
+from scipy.spatial import cKDTree
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
@@ -19,9 +20,10 @@ __all__ = ["Target", "View", "find_view", "find_views", "photograph", "refined_c
 
 _KINDS = ("chessboard", "charuco", "circles", "acircles")
 _FORM = re.compile(rf"({'|'.join(_KINDS)}):(\d+)x(\d+):([\d.]+)mm(?::([\d.]+)mm)?(?::(DICT_\w+))?")
-CLIPPED = 0.005
-"""Fraction of saturated samples within the target above which a photograph is refused: chosen; glare on one square of
-a board of 54 is 1.9 %."""
+CLIPPED = 0.05
+"""Fraction of saturated samples within the target above which a photograph is refused. In OpenCV's own pictures up to
+2.9 % lie in white squares and leave the residual of the corners as it is (benchmarks/camera.py); of a board that is
+overexposed it is half."""
 BLURRED = 0.25
 """Blur of the target's edges (10 to 90 %), over the square's side, above which a photograph is refused: beyond it the
 blur of one edge reaches the next corner's window (chosen)."""
@@ -150,7 +152,7 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
     Returns
     -------
     ndarray, shape (m, 2)
-        px; where the fit leaves the corner's window, what was found before.
+        px; where the fit moves a corner by more than a quarter of its window, what was found before.
     """
     homography = np.asarray(cv2.findHomography(points, pixels)[0], dtype=np.float64)
 
@@ -194,7 +196,7 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
         change = np.linalg.solve(normal, right[..., None])[..., 0] * scale
         state += np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE)
     found = corner + state[:, :2]
-    sure = inside & (np.abs(found - pixels) < 1).all(axis=1) & np.isfinite(state).all(axis=1)
+    sure = inside & (np.abs(found - pixels) < half / 2).all(axis=1) & np.isfinite(state).all(axis=1)
     return np.where(sure[:, None], found, pixels)
 
 
@@ -212,12 +214,16 @@ class View:
         Where they are in the frame, px.
     shape : tuple of int
         Rows and columns of the frame.
+    radius : float
+        Of the circles that the points are the centres of, mm; `pixels` are then the centroids of their images. 0:
+        corners.
     """
 
     name: str
     points: FloatArray
     pixels: FloatArray
     shape: tuple[int, int]
+    radius: float = 0.0
 
 
 def photograph(frame: Mosaic | ChannelFrame) -> tuple[FloatImage, BoolArray]:
@@ -268,7 +274,20 @@ def find_view(frame: Mosaic | ChannelFrame, target: Target, name: str) -> View:
     if target.kind in ("chessboard", "charuco"):
         reach = target.spacing if target.kind == "chessboard" else (target.spacing - target.marker) / 2
         pixels = refined_corners(image, points, pixels, 0.8 * reach)
-    return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]))
+        return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]))
+    radius = _radius(grey, points, pixels)
+    return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]), radius=radius)
+
+
+def _radius(image: Any, points: FloatArray, pixels: FloatArray) -> float:
+    """Radius of a grid's circles, mm: the median of the blobs that OpenCV finds at the points (m, 2), mm and px."""
+    blobs = cv2.SimpleBlobDetector.create().detect(image)
+    places, sizes = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
+    away, nearest = cKDTree(places).query(pixels)
+    homography = np.asarray(cv2.findHomography(points, pixels)[0], dtype=np.float64)
+    w = homography[2, :2] @ points.T + 1
+    scale = np.sqrt(np.abs(np.linalg.det(homography)) / np.abs(w) ** 3)  # px per mm, by the determinant of the map
+    return float(np.median((sizes[nearest] / 2 / scale)[away < 1]))
 
 
 def find_views(files: CaptureFiles, target: Target) -> tuple[list[View], tuple[str, ...]]:

@@ -17,8 +17,9 @@ from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.fields.plane import CameraCalibration
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.settings import FrameSettings
-from rgbmidic_calibration.camera import calibrate_camera, estimate_lens, estimate_plane
+from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.cli import app
+from rgbmidic_calibration.jobs import calibrate_camera
 from rgbmidic_calibration.target import Target, View, find_view, photograph
 
 
