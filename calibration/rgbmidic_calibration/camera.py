@@ -164,8 +164,8 @@ def _fit(views: Sequence[View], radial: int, tangential: int) -> _Fit:
 def _centre_offset(points: FloatArray, radius: float, image: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """Offset (m, 2), px, of the centroids of circles' images from the images of their centres.
 
-    Where perspective or distortion enlarge one side of a circle, its centroid lies there (Heikkila, IEEE PAMI 22, 2000):
-    that of the polygon which `image`, from mm to px, makes of the circle.
+    Where perspective or distortion enlarge one side of a circle, its centroid lies there (Heikkila, IEEE PAMI 22,
+    2000): that of the polygon which `image`, from mm to px, makes of the circle.
     """
     if not radius:
         return np.zeros((1, 2))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import re
-import shlex
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from target_scene import DISTANCE, LENS, SHAPE, TARGET, imaged, on_plane, photo, pose, random_views, view_of
+from target_scene import LENS, SHAPE, TARGET, imaged, on_plane, photo, pose, random_views, view_of
 
 from rgbmidic import command
 from rgbmidic.errors import CalibrationError, ConfigurationError
@@ -202,24 +200,6 @@ def test_too_few_parallel_and_bent_views_are_refused() -> None:
         estimate_lens(bent)
     with pytest.raises(CalibrationError, match="640 x 480 px, the lens was calibrated with 600 x 480"):
         estimate_plane(bent[0], CameraCalibration(shape=(480, 600)))
-
-
-def test_the_commands_of_the_page_run_as_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    random = np.random.default_rng(5)
-    for number, tilt in enumerate(((20, 0), (-20, 5), (5, 22), (0, -22), (15, 15), (-14, -16))):
-        (tmp_path / "target").mkdir(exist_ok=True)
-        written(tmp_path / "target", f"{number}.png", photo(pose(*tilt, turn=4.0 * number, far=1.15), random))
-    (tmp_path / "plane").mkdir()
-    written(tmp_path / "plane", "plane.png", photo(pose(2.0), random))
-    monkeypatch.chdir(tmp_path)
-    page = Path(__file__).parents[3] / "calibration" / "README.md"
-    (block,) = re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for line in block.replace("\\\n", " ").splitlines():
-        assert command.execute(app, shlex.split(line)[1:]) == 0, line
-    made = [CameraCalibration.read(name) for name in ("camera.json", "new_plane.json", "by_corners.json")]
-    scales = [camera.scale(camera.centre)[0] for camera in made]
-    assert scales[:2] == pytest.approx([DISTANCE / LENS[0]] * 2, rel=1e-3)  # there of the target, here of the frame
-    assert scales[2] == pytest.approx(41.3 / 440, rel=0.01)  # and a lens that distorts by as much
 
 
 def test_the_command_writes_what_the_library_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
