@@ -455,9 +455,9 @@ def plan(
         print("no better place was found for the lamps")
     unseen = "" if motion["unseen_mm"] is None else f"; below {motion['unseen_mm']:.2g} mm the noise hides it"
     print(
-        f"out-of-plane motion reads as strain dz / D: {motion['strain_per_mm']:.2e} per mm at D = "
-        f"{motion['stand_off_mm']:g} mm, {motion['edge_px_per_mm']:.2g} px per mm at the field's edge{unseen}"
+        f"out-of-plane motion at {motion['stand_off_mm']:g} mm reads as strain, {motion['strain_per_mm']:.2e} per mm:"
     )
+    print(f"  {motion['edge_px_per_mm']:.2g} px per mm at the field's edge{unseen}")
     print(f"plan: {out / 'plan.json'}   picture: {out / 'plan.png'}")
 
 
