@@ -255,6 +255,11 @@ def test_too_few_parallel_and_bent_views_are_refused() -> None:
         estimate_lens(random_views(random, 4), ["shot 3: not found"])
     with pytest.raises(CalibrationError, match="parallel"):
         estimate_lens(random_views(random, 8, tilt=1.0))
+    views = random_views(random, 8)
+    assert not any("half the views" in word for word in estimate_lens(views).warnings)
+    moved = replace(views[3], pixels=views[3].pixels + random.normal(0, 0.2, (63, 2)), name="moved")
+    (warning,) = (word for word in estimate_lens([*views[:3], moved, *views[4:]]).warnings if "half the" in word)
+    assert warning.startswith("moved: ")
     bent = random_views(random, 8)
     bent[2] = View(
         name="bent", points=bent[2].points, pixels=bent[2].pixels + random.normal(0, 4, (63, 2)), shape=SHAPE
