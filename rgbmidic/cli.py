@@ -376,19 +376,37 @@ def demo(
     _note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
     _explain_first_run()
     from rgbmidic._kernels.threads import threads
-    from rgbmidic.lab.demo import run_demo
+    from rgbmidic.lab.demo import run_demo, run_plate, write_plate
     from rgbmidic.report import write_figures
     from rgbmidic.results import Result
 
     started = time.perf_counter()
     with _progress("demo") as progress:
         rows = run_demo(out, _note, _calibrate_demo, progress)
-    _note(f"5 of 5: pictures of the result in {out / 'figures'}")
+    _note("5 of 7: a flat plate, tilted, behind a lens that distorts, and photographs of a chessboard")
+    truth = write_plate(out / "test")
+    _calibrate_demo_camera(out / "test")
+    _note(f"6 of 7: measurement on it: rgbmidic run {out / 'test' / 'plate.toml'}, with [scale] camera = camera.json")
+    plate = run_plate(out / "test", truth)
+    _note(f"7 of 7: pictures of the result in {out / 'figures'}")
     write_figures(Result.open(out / "result"), out / "figures", (len(rows),), processes=threads())
     columns = ["angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"]
     errors = [(row.rms_px, *row.single_px, row.nodal_px, row.predicted_px) for row in rows]
     lines = [[f"{row.angle_deg:g} deg", *(f"{e:.4f}" for e in each)] for row, each in zip(rows, errors, strict=True)]
     title = "Displacement error against the exact truth, px (a sphere turning under moving reflections)"
+    _print_table(title, columns, lines)
+    columns = ["plate", "lens and plane", "one scale", "stated", "strain, lens and plane", "one scale", "stated"]
+    lines = [
+        [
+            row.motion,
+            *(f"{1e3 * value:.2f}" for value in (*row.displacement_mm, row.stated_mm)),
+            *(f"{1e6 * value:.0f}" for value in (*row.strain, row.stated_strain)),
+        ]
+        for row in plate
+    ]
+    title = (
+        "Displacement error, um, and strain error, 1e-6, against the exact truth (a flat plate, tilted by 5 degrees)"
+    )
     _print_table(title, columns, lines)
     print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")
 
@@ -403,6 +421,19 @@ def _calibrate_demo(test: Path) -> None:
     captures = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",)))
     calibration, _ = calibrate_crosstalk(captures)
     calibration.write(test / "calibration.json")
+
+
+def _calibrate_demo_camera(test: Path) -> None:
+    """Lens and plane from the demo's photographs, as `rgbmidic-calibrate camera` finds them."""
+    from rgbmidic.settings import FrameSettings
+    from rgbmidic_calibration.jobs import calibrate_camera
+    from rgbmidic_calibration.target import Target
+
+    stated = FrameSettings(path=("photographs",), kind="monochrome", white_level=65535)
+    found = calibrate_camera(
+        stated, Target.parse("chessboard:9x7:5mm"), views=str(test / "target/*.png"), plane=str(test / "plane/*.png")
+    )
+    found.camera.write(test / "camera.json")
 
 
 @app.command()
@@ -422,6 +453,9 @@ def virtual(
 def plan(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Lamps, camera, paint, body and its states.")],
     out: Out,
+    distance: Annotated[
+        float | None, typer.Option("--distance", metavar="MM", help="From camera to specimen; else the scene's.")
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict where each lamp reflects, the uncertainty to expect, and better places for the lamps."""
@@ -432,8 +466,9 @@ def plan(
 
     check_folder(out, planning.FILES, overwrite=overwrite)
     made = make_plan(read_scene(scene))
+    motion = planning.out_of_plane(made, distance)
     proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
-    planning.write_plan(made, proposals, out, overwrite=overwrite)
+    planning.write_plan(made, proposals, out, distance=distance, overwrite=overwrite)
     title = "fraction of the field where lights reflect, all of them do, and only one or none is clean"
     _print_table(title, *planning.zone_rows(made), planning.ZONE_WORDS)
     uncertainty = "standard uncertainty to expect over the field, px"
@@ -443,6 +478,11 @@ def plan(
         _print_table(f"{name}: {planning.summary(lamps)}", *planning.lamp_rows(lamps))
     if not better:
         print("no better place was found for the lamps")
+    unseen = "" if motion["unseen_mm"] is None else f"; below {motion['unseen_mm']:.2g} mm the noise hides it"
+    print(
+        f"out-of-plane motion at {motion['stand_off_mm']:g} mm reads as strain, {motion['strain_per_mm']:.2e} per mm:"
+    )
+    print(f"  {motion['edge_px_per_mm']:.2g} px per mm at the field's edge{unseen}")
     print(f"plan: {out / 'plan.json'}   picture: {out / 'plan.png'}")
 
 

@@ -193,8 +193,7 @@ def camera(
 ) -> None:
     """Calibrate lens distortion and the plane of the specimen, from photographs of a target: px to mm."""
     from rgbmidic.fields.plane import CameraCalibration
-    from rgbmidic_calibration import camera as cameras
-    from rgbmidic_calibration import display
+    from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import check_output
     from rgbmidic_calibration.target import Target
 
@@ -203,7 +202,7 @@ def camera(
         check_output(picture, overwrite=overwrite, option="--picture")
     if (corners is None) != (size is None):
         raise ConfigurationError("--corners and --size belong together: state both")
-    estimate = cameras.calibrate_camera(
+    estimate = jobs.calibrate_camera(
         stated,
         None if target is None else Target.parse(target),
         views=views,
@@ -212,9 +211,9 @@ def camera(
         corners=None if corners is None or size is None else (corners, size, corner_std),
     )
     estimate.camera.write(out)
-    display.camera(estimate, out)
+    display.camera(estimate.camera, out)
     if picture is not None:
-        cameras.draw_camera(estimate, picture)
+        display.draw_camera(estimate, picture)
 
 
 @app.command()
@@ -297,13 +296,20 @@ def show(
     file: Annotated[Path, typer.Argument(help="Calibration file.")],
     picture: Path | None = None,
 ) -> None:
-    """Show a calibration file as tables, and in one picture."""
+    """Show a calibration or camera file as tables, and in one picture."""
+    from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
+    from rgbmidic_calibration.design import draw_calibration
+    from rgbmidic_calibration.jobs import CameraEstimate
 
+    if CameraCalibration.is_in(file):
+        camera = CameraCalibration.read(file)
+        display.camera(camera, file, written=False)
+        if picture is not None:
+            display.draw_camera(CameraEstimate(camera=camera), picture)
+        return
     calibration = Calibration.read(file)
     display.calibration(calibration, file)
     if picture is not None:
-        from rgbmidic_calibration.design import draw_calibration
-
         draw_calibration(calibration, picture)

@@ -11,19 +11,19 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from rgbmidic.fields.plane import LENS_PARAMETERS
+from rgbmidic.fields.plane import LENS_PARAMETERS, CameraCalibration, distorted
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import CameraNoise
 from rgbmidic.illumination.registration import Registration
-from rgbmidic_calibration.camera import CameraEstimate
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design
+from rgbmidic_calibration.jobs import CameraEstimate
 from rgbmidic_calibration.noise import NoiseEstimate
 from rgbmidic_calibration.registration import RegistrationEstimate
 from rgbmidic_calibration.verdict import Verdict
 
-__all__ = ["calibration", "camera", "crosstalk", "designs", "merged", "noise", "registration", "verdict"]
+__all__ = ["calibration", "camera", "crosstalk", "designs", "draw_camera", "merged", "noise", "registration", "verdict"]
 
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
@@ -54,25 +54,27 @@ def registration(estimate: RegistrationEstimate, out: Path) -> None:
     _print([*_marked(estimate.warnings), _registration(estimate.registration), *fits, _written(out)])
 
 
-def camera(estimate: CameraEstimate, out: Path) -> None:
-    """Print the parameters of lens and plane with their standard uncertainty, and the warnings."""
-    found, lens, plane = estimate.camera, estimate.lens, estimate.plane
-    parts: list[str | Table] = list(_marked(estimate.warnings))
+def camera(found: CameraCalibration, file: Path, *, written: bool = True) -> None:
+    """Print the parameters of lens and plane with their standard uncertainty, how they were found, and the warnings."""
+    details = dict(found.details)
+    parts: list[str | Table] = list(_marked(details.get("warnings", ())))
     if found.lens is not None:
         table = _table("Lens", ("parameter", "value", "standard uncertainty"))
         for name, value, variance in zip(LENS_PARAMETERS, found.lens, np.diag(found.covariance), strict=False):
             unit = " px" if name in ("f", "cx", "cy") else ""
             table.add_row(name, f"{value:.6g}{unit}", f"{np.sqrt(variance):.2g}{unit}" if variance else "not taken up")
         parts.append(table)
-    if lens is not None:
-        tests = ", ".join(f"{name}: p = {value:.2g}" for name, value in lens.tests.items())
+    if lens := details.get("lens"):
+        tests = ", ".join(f"{name}: p = {value:.2g}" for name, value in lens["p_values"].items())
         parts.append(
-            f"{len(estimate.views)} views, up to {lens.angle:.0f} degrees apart, over {lens.covered:.0%} of the frame; "
-            f"residual {lens.rms:.3f} px rms; {tests}"
+            f"{len(lens['views'])} views, up to {lens['largest_angle_deg']:.0f} degrees apart, over "
+            f"{lens['covered']:.0%} of the frame; residual {lens['rms_px']:.3f} px rms; {tests}"
         )
-    if plane is not None:
-        parts.append(f"plane: {found.summary()}; residual {plane.rms:.3f} px rms")
-    _print([*parts, _written(out)])
+    if found.homography is not None:
+        residual = f"; residual {details['plane']['rms_px']:.3f} px rms" if "plane" in details else ""
+        parts.append(f"plane: {found.summary()}{residual}")
+    parts.append(f"frames of {found.shape[1]} x {found.shape[0]} px")
+    _print([*parts, _written(file) if written else escape(str(file))])
 
 
 def verdict(result: Verdict) -> None:
@@ -215,3 +217,34 @@ def _noise(result: CameraNoise) -> tuple[Table, str]:
     table.add_row("dynamic range, dB", *(f"{value:.1f}" for value in result.dynamic_range))
     counts = [f"{sum(kind == name for *_, kind in result.defects)} {name}" for name in ("hot", "dead")]
     return table, f"pixels to distrust: {', '.join(counts)}"
+
+
+def draw_camera(estimate: CameraEstimate, path: Path) -> None:
+    """Draw the residuals of all points, the distortion over the frame, and the local scale on the plane."""
+    from matplotlib.figure import Figure
+
+    camera = estimate.camera
+    rows, columns = camera.shape
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    axes = figure.subplots(1, 3)
+    y, x = np.mgrid[0 : rows - 1 : 24j, 0 : columns - 1 : 24j]
+    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+    shown = list(zip(estimate.views, estimate.lens.residuals, strict=True)) if estimate.lens else []
+    if estimate.plane_view and estimate.plane:
+        shown.append((estimate.plane_view, estimate.plane.residual))
+    largest = max((np.abs(residual).max() for _, residual in shown), default=1.0)
+    unit = float(f"{max(largest, 1e-6):.0e}")
+    for view, residual in shown:
+        axes[0].quiver(*view.pixels.T, *residual.T, angles="xy", scale_units="width", scale=10 * unit, width=0.003)
+    axes[0].set_title(f"residuals of the points (a tenth of the width: {unit:g} px)" if shown else "no residuals")
+    if camera.lens is not None:
+        shift = np.linalg.norm(distorted(camera.lens, grid) - grid, axis=1).reshape(x.shape)
+        axes[1].clabel(axes[1].contour(x, y, shift, cmap="viridis"), fmt="%.2f")
+    axes[1].set_title("distortion, px" if camera.lens is not None else "no lens calibrated")
+    if camera.homography is not None:
+        scale = np.sqrt(np.linalg.det(camera.jacobian(grid))).reshape(x.shape)
+        axes[2].clabel(axes[2].contour(x, y, 100 * (scale / scale.mean() - 1), cmap="viridis"), fmt="%.3f")
+    axes[2].set_title("scale on the plane, % of its mean" if camera.homography is not None else "no plane calibrated")
+    for axis in axes:
+        axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal", xlabel="x, px", ylabel="y, px")
+    figure.savefig(path, dpi=120)

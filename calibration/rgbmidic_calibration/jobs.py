@@ -5,24 +5,45 @@ Noise, crosstalk and registration are often measured on different days, hence th
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
+from rgbmidic.fields.plane import CameraCalibration
 from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import unevenness
 from rgbmidic.settings import FrameSettings
+from rgbmidic_calibration.camera import (
+    COVERED,
+    LARGEST_RESIDUAL,
+    LensEstimate,
+    PlaneEstimate,
+    estimate_lens,
+    estimate_plane,
+)
 from rgbmidic_calibration.captures import CaptureFiles, Captures, provenance, stack_frames
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
 from rgbmidic_calibration.ratio import BlockMeans, block_means
 from rgbmidic_calibration.registration import ELEMENT, RegistrationEstimate, estimate_registration
+from rgbmidic_calibration.target import Target, View, find_views
 
-__all__ = ["calibrate_crosstalk", "calibrate_noise", "calibrate_registration", "merge_files"]
+__all__ = [
+    "CameraEstimate",
+    "calibrate_camera",
+    "calibrate_crosstalk",
+    "calibrate_noise",
+    "calibrate_registration",
+    "merge_files",
+    "read_corners",
+]
 
 LIT = 0.1
 """Mean above black, relative to the full scale, of a plane whose histogram is looked at: in the dark, noise is too
@@ -138,6 +159,179 @@ def _calibration(
 
 SECTIONS = ("crosstalk", "camera_noise", "noise", "registration")
 CAMERA = ("kind", "cfa", "black_level", "white_level", "shape")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraEstimate:
+    """Result of `calibrate_camera`: what is written, how it was found, and warnings."""
+
+    camera: CameraCalibration
+    views: tuple[View, ...] = ()
+    lens: LensEstimate | None = None
+    plane_view: View | None = None
+    plane: PlaneEstimate | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def read_corners(corners: str, size: str, std: float, shape: tuple[int, int]) -> View:
+    """Read the corners of a rectangle on the specimen, in px, and its two sides in mm.
+
+    Parameters
+    ----------
+    corners
+        ``X0,Y0:X1,Y1:X2,Y2:X3,Y3`` in the order around the rectangle, beginning at its top left.
+    size
+        ``WIDTHxHEIGHTmm``.
+    std
+        Standard uncertainty of a corner, px.
+    shape
+        Rows and columns of the frames.
+
+    Raises
+    ------
+    ConfigurationError
+        An option has another form, the corners lie outside the frame or do not go around a convex quadrilateral.
+    """
+    sides = re.fullmatch(r"([\d.]+)x([\d.]+)mm", size)
+    groups = [part.split(",") for part in corners.split(":")]
+    try:
+        pixels = np.array([[float(number) for number in group] for group in groups])
+        width, height = (float(side) for side in sides.groups()) if sides else (0.0, 0.0)
+    except ValueError:
+        pixels, width, height = np.zeros(0), 0.0, 0.0
+    if pixels.shape != (4, 2) or not np.isfinite(pixels).all() or not (width > 0 and height > 0 and std > 0):
+        raise ConfigurationError(
+            "--corners is X0,Y0:X1,Y1:X2,Y2:X3,Y3 in px around a rectangle and --size its WIDTHxHEIGHTmm, "
+            f"--corner-std positive; not {corners!r}, {size!r}, {std:g}"
+        )
+    if (pixels < -0.5).any() or (pixels > np.array(shape[::-1]) - 0.5).any():
+        raise ConfigurationError(f"--corners lie outside the frame of {shape[1]} x {shape[0]} px: {corners}")
+    steps = np.roll(pixels, -1, axis=0) - pixels
+    turns = steps[:, 0] * np.roll(steps[:, 1], -1) - steps[:, 1] * np.roll(steps[:, 0], -1)
+    if not (turns > 0).all():
+        raise ConfigurationError(
+            f"--corners must go around the rectangle clockwise from its top left; given: {corners}"
+        )
+    points = np.array([[0, 0], [width, 0], [width, height], [0, height]])
+    return View(name="--corners", points=points, pixels=pixels, shape=shape)
+
+
+def calibrate_camera(
+    stated: FrameSettings,
+    target: Target | None,
+    *,
+    views: str | None = None,
+    plane: str | None = None,
+    lens: CameraCalibration | None = None,
+    corners: tuple[str, str, float] | None = None,
+) -> CameraEstimate:
+    """Calibrate lens and plane, or either, from capture files.
+
+    Parameters
+    ----------
+    stated
+        What is stated of the files.
+    target
+        The target; None where only `corners` are given.
+    views
+        Pattern of the photographs of the lens.
+    plane
+        Pattern of the photograph of the target on the specimen's plane; of several the points are averaged.
+    lens
+        An earlier calibration, for its lens.
+    corners
+        In place of `plane`: arguments of `read_corners`.
+
+    Raises
+    ------
+    CalibrationError
+        The photographs do not allow it.
+    ConfigurationError
+        Neither views nor a plane are given, or both of what excludes one another.
+    """
+    if (views or plane) and target is None:
+        raise ConfigurationError("--views and --plane need --target, what the photographs show")
+    if not (views or plane or corners):
+        raise ConfigurationError("nothing to calibrate: state --views, --plane or --corners")
+    if views and lens is not None:
+        raise ConfigurationError("--views calibrate a lens, --lens takes one from a file: state one of them")
+    if plane and corners:
+        raise ConfigurationError("--plane and --corners both state the plane: state one of them")
+    details: dict[str, Any] = {} if lens is None else {"lens": dict(lens.details).get("lens")}
+    groups, found, estimate = list[CaptureFiles](), list[View](), None
+    warnings: tuple[str, ...] = ()
+    camera = None
+    if lens is not None:  # that of an earlier plane left out
+        camera = replace(lens, homography=None, covariance=np.pad(lens.covariance[:8, :8], (0, 8)))
+    if views and target:
+        groups.append(CaptureFiles.find("views", views, stated))
+        found, reasons = find_views(groups[-1], target)
+        estimate = estimate_lens(found, reasons)
+        warnings = estimate.warnings
+        camera = CameraCalibration(
+            shape=found[0].shape, lens=estimate.lens, covariance=np.pad(estimate.covariance, (0, 8))
+        )
+        details["lens"] = {
+            "views": [view.name for view in found],
+            "rms_px": estimate.rms,
+            "largest_angle_deg": estimate.angle,
+            "covered": estimate.covered,
+            "p_values": estimate.tests,
+        }
+    view, fitted = None, None
+    if plane and target:
+        groups.append(CaptureFiles.find("plane", plane, stated))
+        view = _mean_view(groups[-1], target)
+    elif corners:
+        if camera is None and stated.shape is None:
+            raise ConfigurationError("--corners need the frames' size: --shape ROWSxCOLUMNS, or --lens")
+        shape = camera.shape if camera is not None else stated.shape
+        assert shape is not None
+        view = read_corners(*corners, shape)
+    if view is not None:
+        camera = camera or CameraCalibration(shape=view.shape)
+        fitted = estimate_plane(view, camera, corners[2] if corners else None)
+        camera = fitted.camera
+        details["plane"] = {"photograph": view.name, "rms_px": fitted.rms, **_plane_details(camera)}
+        hull = cv2.contourArea(cv2.convexHull(view.pixels.astype(np.float32))) / np.prod(view.shape)
+        if hull < COVERED / 2:
+            beyond = f"the target covers {hull:.0%} of the frame on the plane: beyond it the plane is extrapolated"
+            warnings = (*warnings, beyond)
+    assert camera is not None
+    details |= {"warnings": list(warnings), "provenance": provenance("camera", groups, {})}
+    return CameraEstimate(
+        camera=replace(camera, details=details),
+        views=tuple(found),
+        lens=estimate,
+        plane_view=view,
+        plane=fitted,
+        warnings=warnings,
+    )
+
+
+def _mean_view(files: CaptureFiles, target: Target) -> View:
+    """Return the points of the target, averaged over the photographs of one plane."""
+    shots, reasons = find_views(files, target)
+    if reasons:
+        raise CalibrationError("; ".join(reasons))
+    for shot in shots[1:]:
+        if not np.array_equal(shot.points, shots[0].points):
+            raise CalibrationError("--plane: the photographs show different points of the target: state one of them")
+        if (moved := float(np.abs(shot.pixels - shots[0].pixels).max())) > LARGEST_RESIDUAL:
+            raise CalibrationError(
+                f"--plane: from {shots[0].name} to {shot.name} the target moved by up to {moved:.2f} px, at most "
+                f"{LARGEST_RESIDUAL:g} may be: state photographs of one plane"
+            )
+    return replace(shots[0], pixels=np.mean([shot.pixels for shot in shots], axis=0))
+
+
+def _plane_details(camera: CameraCalibration) -> dict[str, float]:
+    """Return scale and tilt of the plane with their standard uncertainties, as far as they are known."""
+    (scale, scale_std), (tilt, tilt_std) = camera.scale(camera.centre), camera.tilt_deg
+    names = ("mm_per_pixel", "mm_per_pixel_std", "tilt_deg", "tilt_std_deg")
+    return {
+        name: value for name, value in zip(names, (scale, scale_std, tilt, tilt_std), strict=True) if np.isfinite(value)
+    }
 
 
 def merge_files(paths: Sequence[Path]) -> Calibration:

@@ -9,6 +9,7 @@ from typing import Any, Self
 import cv2
 import numpy as np
 from scipy import special
+from scipy.spatial import cKDTree
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
@@ -19,17 +20,18 @@ __all__ = ["Target", "View", "find_view", "find_views", "photograph", "refined_c
 
 _KINDS = ("chessboard", "charuco", "circles", "acircles")
 _FORM = re.compile(rf"({'|'.join(_KINDS)}):(\d+)x(\d+):([\d.]+)mm(?::([\d.]+)mm)?(?::(DICT_\w+))?")
-CLIPPED = 0.005
-"""Fraction of saturated samples within the target above which a photograph is refused: chosen; glare on one square of
-a board of 54 is 1.9 %."""
+CLIPPED = 0.05
+"""Fraction of saturated samples within the target above which a photograph is refused. In OpenCV's own pictures up to
+2.9 % lie in white squares and leave the residual of the corners as it is (benchmarks/camera.py); of a board that is
+overexposed it is half."""
 BLURRED = 0.25
 """Blur of the target's edges (10 to 90 %), over the square's side, above which a photograph is refused: beyond it the
 blur of one edge reaches the next corner's window (chosen)."""
 _WINDOW, _LEAST_WINDOW = 15.0, 4
 """Largest and smallest half width (px) of the window around a corner: beyond 15 px nothing is gained, below 4 px there
 are hardly more samples than unknowns."""
-_TURNS = 12
-"""Gauss-Newton iterations of a corner: after 8 no corner moves by 1e-4 px (measured)."""
+_TURNS, _STILL = 12, 1e-4
+"""Most Gauss-Newton iterations of a corner, and the step (px) below which none is needed: after 8 (measured)."""
 _LARGEST_CHANGE = np.array([1.0, 1.0, 0.2, 0.2, 0.5, np.inf, np.inf])
 """Largest step of position (px), angles, and logarithm of the width; the grey levels are linear."""
 
@@ -150,7 +152,7 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
     Returns
     -------
     ndarray, shape (m, 2)
-        px; where the fit leaves the corner's window, what was found before.
+        px; where the fit moves a corner by more than a quarter of its window, what was found before.
     """
     homography = np.asarray(cv2.findHomography(points, pixels)[0], dtype=np.float64)
 
@@ -171,31 +173,49 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
     angles = [np.arctan2(edge[:, 1], edge[:, 0]) for edge in edges]
     low, high = np.percentile(values, (5, 95), axis=1)
 
-    def model(state: FloatArray) -> FloatArray:
+    def model(state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Grey levels (m, p) and their derivatives (m, p, 7)."""
         dx, dy = x - state[:, :1], y - state[:, 1:2]
-        distance = [dy * np.cos(angle) - dx * np.sin(angle) for angle in (state[:, 2:3], state[:, 3:4])]
-        width = np.exp(state[:, 4:5])
-        return np.asarray(
-            state[:, 5:6] + state[:, 6:7] * special.erf(distance[0] / width) * special.erf(distance[1] / width)
+        width, step = np.exp(state[:, 4:5]), state[:, 6:7]
+        (e, f), (de, df), (along_e, along_f), (across_e, across_f) = zip(
+            *(_edge(dx, dy, state[:, 2 + edge : 3 + edge], width) for edge in (0, 1)), strict=True
         )
+        sines, cosines = np.sin(state[:, 2:4, None]), np.cos(state[:, 2:4, None])
+        left, right = step * de * f, step * e * df
+        slopes = (
+            left * sines[:, 0] + right * sines[:, 1],
+            -left * cosines[:, 0] - right * cosines[:, 1],
+            -left * along_e,
+            -right * along_f,
+            -left * across_e - right * across_f,
+            np.ones_like(e),
+            e * f,
+        )
+        return state[:, 5:6] + step * e * f, np.stack(slopes, axis=2)
 
     state = np.column_stack([pixels - corner, *angles, np.zeros(len(pixels)), (low + high) / 2, (high - low) / 2])
-    signs = np.einsum("mp,mp->m", model(state) - state[:, 5:6], values - values.mean(axis=1, keepdims=True))
+    signs = np.einsum("mp,mp->m", model(state)[0] - state[:, 5:6], values - values.mean(axis=1, keepdims=True))
     state[:, 6] *= np.where(signs < 0, -1, 1)
-    steps = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-4, 1.0, 1.0])
     for _ in range(_TURNS):
-        slopes = np.stack(
-            [(model(state + step) - model(state - step)) / (2 * step.sum()) for step in np.diag(steps)], axis=2
-        )
+        levels, slopes = model(state)
         normal = slopes.transpose(0, 2, 1) @ slopes
         scale = 1 / np.sqrt(np.maximum(np.einsum("maa->ma", normal), 1e-12))
         normal = normal * scale[:, :, None] * scale[:, None] + 1e-9 * np.eye(7)
-        right = np.einsum("mpa,mp->ma", slopes, values - model(state)) * scale
-        change = np.linalg.solve(normal, right[..., None])[..., 0] * scale
+        right_side = np.einsum("mpa,mp->ma", slopes, values - levels) * scale
+        change = np.linalg.solve(normal, right_side[..., None])[..., 0] * scale
         state += np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE)
+        if not (np.abs(change[:, :2]) > _STILL).any():
+            break
     found = corner + state[:, :2]
-    sure = inside & (np.abs(found - pixels) < 1).all(axis=1) & np.isfinite(state).all(axis=1)
+    sure = inside & (np.abs(found - pixels) < half / 2).all(axis=1) & np.isfinite(state).all(axis=1)
     return np.where(sure[:, None], found, pixels)
+
+
+def _edge(dx: FloatArray, dy: FloatArray, angle: FloatArray, width: FloatArray) -> tuple[FloatArray, ...]:
+    """Profile of a blurred edge, its derivative by the distance, and the coordinates along and across the edge."""
+    along, across = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
+    slope = 2 / np.sqrt(np.pi) * np.exp(-((across / width) ** 2)) / width
+    return special.erf(across / width), slope, along, across
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,12 +232,16 @@ class View:
         Where they are in the frame, px.
     shape : tuple of int
         Rows and columns of the frame.
+    radius : float
+        Of the circles that the points are the centres of, mm; `pixels` are then the centroids of their images. 0:
+        corners.
     """
 
     name: str
     points: FloatArray
     pixels: FloatArray
     shape: tuple[int, int]
+    radius: float = 0.0
 
 
 def photograph(frame: Mosaic | ChannelFrame) -> tuple[FloatImage, BoolArray]:
@@ -268,7 +292,20 @@ def find_view(frame: Mosaic | ChannelFrame, target: Target, name: str) -> View:
     if target.kind in ("chessboard", "charuco"):
         reach = target.spacing if target.kind == "chessboard" else (target.spacing - target.marker) / 2
         pixels = refined_corners(image, points, pixels, 0.8 * reach)
-    return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]))
+        return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]))
+    radius = _radius(grey, points, pixels)
+    return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]), radius=radius)
+
+
+def _radius(image: Any, points: FloatArray, pixels: FloatArray) -> float:
+    """Radius of a grid's circles, mm: the median of the blobs that OpenCV finds at the points (m, 2), mm and px."""
+    blobs = cv2.SimpleBlobDetector.create().detect(image)
+    places, sizes = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
+    away, nearest = cKDTree(places).query(pixels)
+    homography = np.asarray(cv2.findHomography(points, pixels)[0], dtype=np.float64)
+    w = homography[2, :2] @ points.T + 1
+    scale = np.sqrt(np.abs(np.linalg.det(homography)) / np.abs(w) ** 3)  # px per mm, by the determinant of the map
+    return float(np.median((sizes[nearest] / 2 / scale)[away < 1]))
 
 
 def find_views(files: CaptureFiles, target: Target) -> tuple[list[View], tuple[str, ...]]:

@@ -10,8 +10,9 @@ pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -189,6 +190,22 @@ class CameraCalibration:
         parts = [(function(values + step) - function(values - step)) / 2 for step in steps]
         return np.stack(parts, axis=-1)
 
+    def in_image_axes(self) -> tuple[Self, FloatArray]:
+        """Return the camera with the plane in the axes of the image, and the motion (3, 3) of its points to there.
+
+        The top left pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
+        """
+        assert self.homography is not None
+        homography = self.homography / self.homography[2, 2]
+        slope = homography[:2, :2] - np.outer(homography[:2, 2], homography[2, :2])
+        x, y = slope[:, 0] / np.linalg.norm(slope[:, 0])
+        motion = np.eye(3)
+        motion[:2, :2] = [[x, y], [-y, x]]
+        motion[1] *= np.sign(np.linalg.det(slope))
+        motion[:2, 2] = -replace(self, homography=motion @ homography).to_mm(np.zeros((1, 2)))[0]
+        moved = motion @ homography
+        return replace(self, homography=moved / moved[2, 2]), motion
+
     @property
     def correlation(self) -> FloatArray:
         """Correlation coefficients (16, 16) of the parameters; 0 where one is not known or held."""
@@ -263,6 +280,14 @@ class CameraCalibration:
         slopes = [(self.sensitivity(points + step) - self.sensitivity(points - step)) / (2 * _SPAN) for step in steps]
         total = sum(np.einsum("nip,pq,niq->n", slope, self.correlation, slope) for slope in slopes)
         return np.asarray(np.sqrt(total / 2))
+
+    @classmethod
+    def is_in(cls, path: Path) -> bool:
+        """Whether a file is one that `read` reads, if not damaged."""
+        try:
+            return bool(json.loads(path.read_text(encoding="utf-8"))["schema"] == _SCHEMA)
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
 
     @classmethod
     def read(cls, path: Path | str) -> Self:

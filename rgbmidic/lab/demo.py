@@ -11,25 +11,29 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from scipy.special import erf
 
 from rgbmidic._kernels import are_compiled
 from rgbmidic.errors import ResultError
-from rgbmidic.fields import at_nodes, field_rms
+from rgbmidic.fields import CameraCalibration, at_nodes, field_rms
+from rgbmidic.fields.plane import undistorted
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.unmixing import align
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, correlate, measure
 from rgbmidic.results import Result
-from rgbmidic.settings import TestSettings, read_test
+from rgbmidic.results.physical import Physical
+from rgbmidic.settings import ScaleSettings, TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["DemoRow", "run_demo"]
+__all__ = ["DemoRow", "PlateRow", "run_demo", "run_plate", "write_plate"]
 
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
@@ -55,6 +59,39 @@ path = "*.dng"
 file = "calibration.json"
 [region]
 rectangle = {list(_REGION)}
+"""
+
+
+PLATE_MOTIONS = {"shifted by 1.22 mm": ((1.0, -0.7), 0.0), "and stretched by 1 %": ((0.5, 0.3), 0.01)}
+"""Motions of the tilted plate: shift (x, y) in mm, strain along x."""
+_PLATE_SHAPE, _LENS = (480, 640), (2400.0, 327.0, 232.0, -0.72, 0.0, 0.0, 0.0, 0.0)
+"""Its frames, px, and `rgbmidic.fields.plane.LENS_PARAMETERS`: a barrel of 2 % in the corners."""
+_FAR, _TILT = 225.0, (4.0, 3.0)
+"""mm to the plate, at which the frame is 60 mm wide, and its tilt about x and y, degrees."""
+_BOARD, _SQUARE = (9, 7), 5.0
+"""Inner corners of the chessboard, and its squares' side, mm."""
+_VIEWS = (
+    ((20.0, 0.0, 0.0), (-7.0, -4.0)),
+    ((-20.0, 5.0, 4.0), (7.0, -4.0)),
+    ((5.0, 22.0, 8.0), (-6.0, 4.0)),
+    ((0.0, -22.0, 12.0), (6.0, 4.0)),
+    ((15.0, 15.0, 16.0), (0.0, 0.0)),
+    ((-14.0, -16.0, 20.0), (0.0, 0.0)),
+)
+"""Turns of the chessboard about x, y and z, degrees, and its place beside the axis, mm."""
+_WAVES = 36
+"""Of the speckle: a sum of cosines whose contrast is then cut off."""
+_PLATE_SETTINGS = """\
+# A flat specimen tilted by 5 degrees behind a lens that distorts by 2 % in the corners.
+[frames]
+path = "plate/*.png"
+kind = "monochrome"
+black_level = 0
+white_level = 65535
+[region]
+rectangle = [60, 60, 580, 420]
+[scale]
+camera = "camera.json"
 """
 
 
@@ -130,16 +167,16 @@ def run_demo(
     out.mkdir(parents=True, exist_ok=True)
     states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
     scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")
-    report(f"1 of 5: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
+    report(f"1 of 7: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
     with kernels_compiled_meanwhile():
         settings_file = write_dataset(scene, test, progress)
         (test / "calibration.json").rename(test / "true_calibration.json")
-        report("2 of 5: calibration, 1 s, as rgbmidic-calibrate crosstalk does from captures with one light at a time")
+        report("2 of 7: calibration, 1 s, as rgbmidic-calibrate crosstalk does from captures with one light at a time")
         calibrate(test)
     settings = read_test(settings_file)
-    report(f"3 of 5: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")
+    report(f"3 of 7: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")
     result = measure(settings, out / "result", progress=progress)
-    report("4 of 5: the same with each colour alone, for comparison, some 5 s")
+    report("4 of 7: the same with each colour alone, for comparison, some 5 s")
     return _compare(settings, result)
 
 
@@ -172,6 +209,114 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
             )
         )
     return rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlateRow:
+    """One motion of the tilted plate: root mean square errors against the exact truth, and what the result states.
+
+    Attributes
+    ----------
+    motion
+        What it does.
+    displacement_mm
+        Error by lens and plane, and by one scale for all of the frame.
+    strain
+        Error of the Green-Lagrange strains exx, eyy and exy, likewise.
+    stated_mm, stated_strain
+        Standard uncertainty that the result states of its noise, by lens and plane.
+    """
+
+    motion: str
+    displacement_mm: tuple[float, float]
+    strain: tuple[float, float]
+    stated_mm: float
+    stated_strain: float
+
+
+def write_plate(test: Path) -> CameraCalibration:
+    """Write photographs of a chessboard, and of a speckled plate that moves, behind a lens that distorts.
+
+    Six views of the chessboard in `test`/target, one on the plate in `test`/plane, the plate at rest and after each of
+    `PLATE_MOTIONS` in `test`/plate, and plate.toml for `rgbmidic run`. Every pixel is traced to its place on the plane.
+
+    Returns
+    -------
+    CameraCalibration
+        The true lens and plane, in the axes of the image.
+    """
+    random = np.random.default_rng(2026)
+    rows, columns = _PLATE_SHAPE
+    y, x = np.mgrid[:rows, :columns]
+
+    straight = undistorted(np.array(_LENS), np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64))
+
+    def photograph(name: str, values: FloatArray) -> None:
+        """Values of 0 to 1 as grey levels, with noise of .25 % of the full scale."""
+        (test / name).parent.mkdir(exist_ok=True)
+        levels = 65535 * (0.05 + 0.8 * values + random.normal(0, 0.0025, values.shape))
+        if not cv2.imwrite(str(test / name), np.round(levels).clip(0, 65535).astype(np.uint16).reshape(_PLATE_SHAPE)):
+            raise ResultError(f"cannot write {test / name}")
+
+    def board(name: str, turns: Sequence[float], place: tuple[float, float, float]) -> None:
+        places = replace(_posed(turns, place), lens=None).to_mm(straight)
+        waves = []
+        for along, count in zip(places.T, _BOARD, strict=True):
+            line = np.clip(np.round(along / _SQUARE + (count - 1) / 2), -1, count) - (count - 1) / 2
+            sign = np.where((line - (count - 1) / 2) % 2 == 0, 1, -1)
+            waves.append(sign * erf((along - line * _SQUARE) / (0.1 * place[2] / _FAR)))
+        on_board = (np.abs(places) < (np.array(_BOARD) + 1) / 2 * _SQUARE).all(axis=1)
+        photograph(name, np.where(on_board, 0.5 - 0.5 * waves[0] * waves[1], 1.0))
+
+    for number, (turns, beside) in enumerate(_VIEWS):
+        board(f"target/view_{number}.png", turns, (*beside, 1.15 * _FAR))
+    board("plane/plane.png", (*_TILT, 0.0), (0.0, 0.0, _FAR))
+    camera, _ = _posed((*_TILT, 0.0), (0.0, 0.0, _FAR)).in_image_axes()
+    places = replace(camera, lens=None).to_mm(straight)
+    directions, lengths = random.uniform(0, np.pi, _WAVES), random.uniform(0.6, 1.5, _WAVES)
+    waves = 2 * np.pi * np.stack([np.cos(directions), np.sin(directions)]) / lengths  # per mm: of 6 to 16 px
+    phases = random.uniform(0, 2 * np.pi, _WAVES)
+    for number, (shift, stretch) in enumerate([((0.0, 0.0), 0.0), *PLATE_MOTIONS.values()]):
+        material = (places - np.array(shift)) / np.array([1 + stretch, 1.0])
+        paint = sum(np.cos(material @ wave + phase) for wave, phase in zip(waves.T, phases, strict=True))
+        photograph(f"plate/frame_{number}.png", 0.5 + 0.5 * np.tanh(2 / np.sqrt(_WAVES) * np.asarray(paint)))
+    (test / "plate.toml").write_text(_PLATE_SETTINGS, encoding="utf-8")
+    return camera
+
+
+def run_plate(test: Path, truth: CameraCalibration) -> list[PlateRow]:
+    """Measure the plate of `write_plate` by `test`/camera.json and plate.toml, and compare with the `truth`."""
+    result = measure(read_test(test / "plate.toml"), test.parent / "plate_result")
+    places, scale = truth.to_mm(result.nodes), truth.scale(truth.centre)[0]
+    ways = (Physical.of(result), Physical.of(result, ScaleSettings(mm_per_pixel=scale)))
+    rows = []
+    for index, (name, (shift, stretch)) in enumerate(PLATE_MOTIONS.items(), start=1):
+        exact = places * np.array([stretch, 0.0]) + np.array(shift)
+        fields = [way.frame(index) for way in ways]
+        errors = [np.stack([field["u"], field["v"]], axis=1) - exact for field in fields]
+        known = {"exx": stretch + stretch**2 / 2, "eyy": 0.0, "exy": 0.0}
+        strains = [np.stack([field[name] - value for name, value in known.items()]) for field in fields]
+        rows.append(
+            PlateRow(
+                motion=name,
+                displacement_mm=(_rms(errors[0]), _rms(errors[1])),
+                strain=(_rms(strains[0]), _rms(strains[1])),
+                stated_mm=_rms(np.stack([fields[0]["u_std"], fields[0]["v_std"]])),
+                stated_strain=_rms(np.stack([fields[0][f"{name}_std"] for name in known])),
+            )
+        )
+    return rows
+
+
+def _posed(turns: Sequence[float], place: tuple[float, float, float]) -> CameraCalibration:
+    """Return the virtual camera before a plane turned about x, y and z (degrees), its middle at a place (mm)."""
+    rows, columns = _PLATE_SHAPE
+    focal, cx, cy = _LENS[:3]
+    offset = np.array([cx - (columns - 1) / 2, cy - (rows - 1) / 2])
+    matrix = np.array([[focal, 0, offset[0]], [0, focal, offset[1]], [0, 0, 1.0]])
+    turn = np.asarray(cv2.Rodrigues(np.radians(turns))[0])
+    homography = np.linalg.inv(matrix @ np.c_[turn[:, :2], place])
+    return CameraCalibration(shape=_PLATE_SHAPE, lens=np.array(_LENS), homography=homography / homography[2, 2])
 
 
 def _rms(values: FloatArray) -> float:

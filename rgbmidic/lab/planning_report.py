@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic._version import __version__
+from rgbmidic.errors import InputError
 from rgbmidic.lab import check_folder, number_or_none, write_findings
 from rgbmidic.lab.planning import Outlook, Plan, Proposal
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
@@ -26,6 +27,7 @@ __all__ = [
     "UNCERTAINTY_WORDS",
     "ZONE_WORDS",
     "lamp_rows",
+    "out_of_plane",
     "plan_document",
     "plan_figure",
     "summary",
@@ -38,7 +40,9 @@ FILES = ("plan.json", "plan.png")
 """What `write_plan` writes."""
 
 
-def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwrite: bool = False) -> None:
+def write_plan(
+    plan: Plan, proposals: dict[str, Proposal], out: Path, *, distance: float | None = None, overwrite: bool = False
+) -> None:
     """Write plan.json and plan.png.
 
     Parameters
@@ -49,6 +53,8 @@ def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwri
         Name to better lamps.
     out
         Folder; made where it does not exist.
+    distance
+        Stand-off distance, mm; None: that of the scene.
     overwrite
         Whether a plan in the folder is replaced.
 
@@ -58,7 +64,7 @@ def write_plan(plan: Plan, proposals: dict[str, Proposal], out: Path, *, overwri
         A plan is already there, or the folder cannot be written.
     """
     check_folder(out, FILES, overwrite=overwrite)
-    write_findings(out, "plan", plan_document(plan, proposals), plan_figure(plan, proposals))
+    write_findings(out, "plan", plan_document(plan, proposals, distance), plan_figure(plan, proposals))
 
 
 def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
@@ -119,7 +125,38 @@ def summary(plan: Plan) -> str:
     return f"reflections overlap on up to {overlap:.1%} of the field; u_std {std}"
 
 
-def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
+def out_of_plane(plan: Plan, distance: float | None = None) -> dict[str, Any]:
+    """What a motion towards the camera feigns, which no single camera tells from a strain: dz / D of all lengths.
+
+    Parameters
+    ----------
+    plan
+        The scene as it is.
+    distance
+        Stand-off distance D from the camera's entrance pupil to the specimen, mm; None: that of the scene.
+
+    Returns
+    -------
+    dict
+        ``stand_off_mm``; ``strain_per_mm``, 1 / D; ``edge_px_per_mm``, the displacement of the point of the field
+        farthest from the optical axis; ``unseen_mm``, the motion that moves this point by the uncertainty to expect.
+
+    Raises
+    ------
+    InputError
+        The distance is not positive.
+    """
+    distance = plan.scene.body.front[2] if distance is None else distance
+    if not (distance > 0 and math.isfinite(distance)):
+        raise InputError(f"--distance, from camera to specimen, must be positive and finite, not {distance:g} mm")
+    x0, y0, x1, y1 = plan.field
+    x, y = plan.scene.camera.centre
+    edge = math.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y)) / distance
+    unseen = number_or_none(plan.std / edge)
+    return {"stand_off_mm": distance, "strain_per_mm": 1 / distance, "edge_px_per_mm": edge, "unseen_mm": unseen}
+
+
+def plan_document(plan: Plan, proposals: dict[str, Proposal], distance: float | None = None) -> dict[str, Any]:
     """Return the plan as plain values, for plan.json; fractions are of the field, an unknown number is null."""
     return {
         "schema": "rgbmidic-plan",
@@ -127,6 +164,7 @@ def plan_document(plan: Plan, proposals: dict[str, Proposal]) -> dict[str, Any]:
         "field_px": list(plan.field),
         "element_size_px": plan.instrument.element_size,
         "reflects_from_specular_fraction": REFLECTS,
+        "out_of_plane": out_of_plane(plan, distance),
         **_arrangement(plan),
         "proposals": {
             name: {"gain": proposal.gain, **_arrangement(proposal.plan)} for name, proposal in proposals.items()

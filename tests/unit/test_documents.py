@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from rgbmidic import NodeStatus, Status, TestSettings, cli
+from rgbmidic import CameraCalibration, NodeStatus, Status, TestSettings, cli
 from rgbmidic.command import execute
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.demo import run_demo
+from rgbmidic.lab.demo import run_demo, run_plate, write_plate
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
 from rgbmidic.settings import _place, _sections
@@ -160,6 +160,11 @@ def demo(tmp_path_factory):
     assert [row.angle_deg for row in rows] == [0.33, 1.0, 2.0, 4.0]
     assert all(row.rms_px < min(row.single_px) for row in rows)
     assert len(lines) == 4
+    truth = write_plate(out / "test")
+    cli._calibrate_demo_camera(out / "test")
+    plate = run_plate(out / "test", truth)
+    assert all(row.strain[0] < 1.5 * row.stated_strain < 0.1 * row.strain[1] for row in plate)
+    assert all(row.displacement_mm[0] < 1.5 * row.stated_mm < 0.1 * row.displacement_mm[1] for row in plate)
     return out / "test"
 
 
@@ -182,6 +187,10 @@ def test_the_commands_of_a_page_run_on_the_demo_s_files_as_written(page, demo, m
     if page.parent.name == "calibration":
         noise = Calibration.read("noise.json").camera_noise
         assert (noise.linearity_error.value < 0.05).all()  # of a camera that is linear
+        made = [CameraCalibration.read(name) for name in ("lens_and_plane.json", "new_plane.json", "by_corners.json")]
+        scales = [camera.scale(camera.centre)[0] for camera in made]
+        assert scales[:2] == pytest.approx([0.0939855] * 2, rel=3e-5)
+        assert scales[2] == pytest.approx(0.0939855, rel=0.01)
 
 
 def test_the_python_of_the_readme_runs_on_the_demo_s_files_as_written(demo, monkeypatch):

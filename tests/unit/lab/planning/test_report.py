@@ -10,10 +10,19 @@ import pytest
 
 from rgbmidic import cli
 from rgbmidic.command import execute
-from rgbmidic.errors import ResultError
+from rgbmidic.errors import InputError, ResultError
 from rgbmidic.lab.planning import make_plan, propose_lamps
-from rgbmidic.lab.planning_report import lamp_rows, plan_document, plan_figure, uncertainty_rows, write_plan, zone_rows
-from rgbmidic.scene.scene import read_scene
+from rgbmidic.lab.planning_report import (
+    lamp_rows,
+    out_of_plane,
+    plan_document,
+    plan_figure,
+    uncertainty_rows,
+    write_plan,
+    zone_rows,
+)
+from rgbmidic.scene.scene import State, read_scene
+from rgbmidic.scene.zones import truth
 
 SCENE = """
 [body]
@@ -104,3 +113,22 @@ def test_the_command_prints_the_tables_and_writes_the_files(made, tmp_path: Path
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["plan.json", "plan.png"]
     assert execute(cli.app, ["plan", str(scene), "--out", str(tmp_path / "out")], debug=False) == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_a_motion_towards_the_camera_is_what_the_renderer_shows(made):
+    _, plan, _ = made
+    told = out_of_plane(plan)
+    x0, y0, x1, y1 = plan.field
+    corners = np.array([[x0, x1, x0, x1], [y0, y0, y1, y1]])
+    motion = truth(plan.scene, State(translation=(0.0, 0.0, -0.01)), None, tuple(corners))
+    there = np.linalg.norm(corners - np.reshape(plan.scene.camera.centre, (2, 1)), axis=0)
+    strain = np.linalg.norm(motion, axis=0) / there  # of the lines from the optical axis
+    depth = plan.scene.body.front[2]
+    assert strain == pytest.approx(0.01 * told["strain_per_mm"], rel=0.03)  # the plate or sphere is not at one distance
+    assert told["edge_px_per_mm"] * 0.01 == pytest.approx(np.linalg.norm(motion, axis=0).max(), rel=0.03)
+    assert told["unseen_mm"] * told["edge_px_per_mm"] == pytest.approx(plan.std)
+    assert out_of_plane(plan, 2 * depth)["strain_per_mm"] == pytest.approx(told["strain_per_mm"] / 2)
+    assert plan_document(plan, {}, 500.0)["out_of_plane"]["stand_off_mm"] == 500
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="--distance"):
+            out_of_plane(plan, wrong)
