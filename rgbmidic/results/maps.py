@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import (
+    MEASURES,
     NodalCovariance,
     RigidMotion,
     Strain,
@@ -234,17 +235,31 @@ class Maps:
         InputError
             There is no such frame or measure, the gauge is too short, or the window holds fewer than 4 frames.
         """
-        if since is not None and not 0 <= since < len(result):
-            raise InputError(f"there is no frame {since} in a result of {len(result)} frames (0 to {len(result) - 1})")
-        window = window or int(result.setting("probes", "window", 0)) or WINDOW
+        plain = cls(result=result, physical=Physical.untimed(result, scale))
+        return plain.chosen(gauge=gauge, measure=measure, since=since, rigid_removed=rigid_removed, window=window)
+
+    def chosen(
+        self,
+        *,
+        gauge: float | None = None,
+        measure: str | None = None,
+        since: int | None = None,
+        rigid_removed: bool = False,
+        window: int | None = None,
+    ) -> Self:
+        """Choose anew how fields are derived; parameters and errors as `of`."""
+        frames = len(self.result)
+        if since is not None and not 0 <= since < frames:
+            raise InputError(f"there is no frame {since} in a result of {frames} frames (0 to {frames - 1})")
+        window = window or int(self.result.setting("probes", "window", 0)) or WINDOW
         if window < _FEWEST:
             raise InputError(f"rates are taken over a window of {_FEWEST} frames or more, not {window}")
-        physical = Physical.untimed(result, scale)
-        physical = replace(physical, gauge=gauge, measure=measure or physical.measure)
-        strain_of_gradient(np.zeros((1, 2, 2)), np.zeros((1, 4, 4)), physical.measure)
-        if gauge is not None:
-            _ = physical.gauges
-        return cls(result=result, physical=physical, since=since, rigid_removed=rigid_removed, window=window)
+        physical, measure = self.physical, measure or MEASURES[0]
+        if (gauge, measure) != (physical.gauge, physical.measure):
+            physical = replace(physical, gauge=gauge, measure=measure)
+            strain_of_gradient(np.zeros((1, 2, 2)), np.zeros((1, 4, 4)), measure)
+            _ = gauge is not None and physical.gauges
+        return replace(self, physical=physical, since=since, rigid_removed=rigid_removed, window=window)
 
     @cached_property
     def all(self) -> dict[str, MapField]:

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from bokeh.document import Document
 
-from rgbmidic.errors import RgbmidicError
+from rgbmidic.errors import InputError, RgbmidicError
+from rgbmidic.fields import MEASURES, Mean, make_probe
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import spread
 from rgbmidic.report.style import colour_range, ordinary_values, time_text
@@ -27,9 +28,11 @@ __all__ = [
     "Background",
     "Pictures",
     "every",
+    "extremes",
     "frame_text",
     "guarded",
     "pointer_text",
+    "probe_text",
     "range_of_test",
     "robust_range",
     "warning",
@@ -44,6 +47,10 @@ _SPREAD = 24
 """Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second."""
 _KEPT = 8
 """Raw frames that are kept as pictures: those around the one in view."""
+_REASON = 90
+"""Letters of a frame's reason that are shown at once: two lines of the column."""
+_REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
+"""What a node's status means, under the pointer."""
 _FAILED = QUANTITIES["status"].codes.index("failed")
 
 
@@ -154,8 +161,9 @@ class Background:
         task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
 
 
-def frame_text(result: Result, place: int, field: MapField, values: MapValues, remark: str) -> str:
-    """Describe what is in view, as HTML: the frame, how it ended, the field and a remark."""
+def frame_text(maps: Maps, place: int, field: MapField, values: MapValues, remark: str) -> str:
+    """Describe what is in view, as HTML: the frame, how it ended, the field with its extremes, and a remark."""
+    result = maps.result
     read = next(result.table.each(["status", "reason", "iterations", "node_status", "time_ns"], [place]))
     missing = float(np.mean(read["node_status"] != 0))
     measured = bool(result.finished[place])
@@ -165,21 +173,69 @@ def frame_text(result: Result, place: int, field: MapField, values: MapValues, r
     without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
     lines = [f"Frame {place} of {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{without}"]
     if read["reason"] and measured:
-        lines[1] = warning(f"{end}: {read['reason']}")
-    if not np.isfinite(values.values).any():
-        lines.append("Nothing is measured here: choose another frame below.")
+        first, rest = read["reason"][:_REASON], read["reason"][_REASON:]
+        lines[1] = warning(f"{end}: {first}")
+        if rest:
+            lines[1] = f"<details><summary>{lines[1]} … more</summary>… {html.escape(rest)}</details>"
     lines.append(f"<b>{html.escape(field.label)}</b>: {html.escape(field.meaning.partition(':')[0])}")
+    found = extremes(field, values)
+    if found:
+        ends = [
+            f"{name} {field.text(values.values[node])} at ({result.nodes[node, 0]:.0f}, {result.nodes[node, 1]:.0f}) px"
+            for name, node in zip(("smallest", "largest"), found, strict=True)
+        ]
+        lines.append(html.escape(", ".join(ends)))
+    elif not np.isfinite(values.values).any():
+        lines.append("Nothing is measured here: choose another frame below.")
+    base = maps.all.get(field.name.removesuffix("_std"), field)
+    lines += [html.escape(text) for text in [maps.how.get(base.group, "")] if text]
     return "<br>".join([*lines, *([html.escape(remark)] if remark else [])])
+
+
+def extremes(field: MapField, values: MapValues) -> tuple[int, ...]:
+    """Return the nodes with the smallest and the largest value; none where nothing is measured, or of a status."""
+    if field.codes or not np.isfinite(values.values).any():
+        return ()
+    return int(np.nanargmin(values.values)), int(np.nanargmax(values.values))
 
 
 def pointer_text(
     field: MapField, values: MapValues, nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
 ) -> str:
-    """Return the value at a place of the image, as HTML."""
+    """Return the value at a place of the image, as HTML; where there is none, why."""
     found = element_at(nodes, elements, x, y)
     if found is None:
         return f"x {x:.1f}, y {y:.1f} px: outside the mesh"
     corners, weights = found
     weights = np.eye(3)[weights.argmax()] if field.stepped else weights
     value, std = (float(weights @ part[corners]) for part in (values.values, values.std))
-    return f"x {x:.1f}, y {y:.1f} px: <b>{html.escape(f'{field.name} = {field.text(value, std)}')}</b>"
+    text = f"{field.name} = {field.text(value, std)}"
+    blank = values.status[corners].max()
+    if not np.isfinite(value):
+        text += f" ({_REASONS[blank] if blank else 'a node beside it has no data'})"
+    return f"x {x:.1f}, y {y:.1f} px: <b>{html.escape(text)}</b>"
+
+
+def probe_text(maps: Maps, field: MapField, values: MapValues, kind: str, place: tuple[float, ...]) -> str:
+    """Return the value of a field at a point, or its mean along a line or over an area, with its uncertainty.
+
+    That of a mean of u or v, or of their rates, is exact; of others it is the most that it can be.
+    """
+    if kind == "gauge" or (field.stepped and kind != "point"):
+        return ""
+    try:
+        kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
+        probe = make_probe(maps.physical.covariance, kind, 1, maps.physical.rectified.place(place), MEASURES[0])
+    except InputError:
+        return ""
+    assert isinstance(probe, Mean)
+    if field.stepped:
+        return f": {field.text(float(values.values[probe.nodes[probe.weights.argmax()]]))}"
+    read = np.stack([values.values, values.std])[:, None, probe.nodes]
+    stated = bool(np.isfinite(read[1]).any())
+    alike = field.name.partition("_")[0] not in ("u", "v") and len(probe.nodes) > 3
+    known = np.isfinite(read[0] + (read[1] if stated else 0))
+    (value,), (std,) = probe.average(read[0], read[1], known, alike=alike)
+    most = " at most" if stated and alike and np.isfinite(value) else ""
+    mean = " mean" if kind != "point" else ""
+    return f"{mean}: {field.text(float(value), float(std) if stated else float('nan'))}{most}"

@@ -250,7 +250,7 @@ def test_curves_go_over_the_time_in_the_unit_that_suits_it(tmp_path):
     x, name = time_axis(histories.times, histories.frames)
     assert name == "time (µs)"
     np.testing.assert_allclose(x, [0, 20, 40, 60])
-    words = frame_text(result, 3, Maps.of(result).all["u"], Maps.of(result).read("u", 3), "")
+    words = frame_text(Maps.of(result), 3, Maps.of(result).all["u"], Maps.of(result).read("u", 3), "")
     assert "frame 3, 60 µs" in words
 
 
@@ -286,11 +286,11 @@ class Walk:
             page.state.asked = choose.randrange(8)
         elif what == "field":
             still = [name for name in page.fields.all if not any(word in name for word in TIMED)]
-            parts.field.value = choose.choice(still)
+            parts.of["field"].value = choose.choice(still)
         elif what == "over":
             parts.over.active = choose.randrange(2)
         elif what == "range":
-            parts.range.value = choose.choice(["frame", "test"])
+            parts.of["range"].value = choose.choice(["frame", "test"])
         else:
             self.store.write_frame(choose.randrange(8), smooth_record(choose.randrange(1, 9)))
             page._grow()
@@ -306,7 +306,7 @@ class Walk:
         told = "" if pointer is None else pointer_text(field, values, nodes, result.elements, *pointer)
         assert page.parts.under.text == told
         remark = page.pictures.frame(view.frame)[1] if view.over == "deformed" else ""
-        assert page.parts.description.text == frame_text(result, view.frame, field, values, remark)
+        assert page.parts.description.text == frame_text(fields, view.frame, field, values, remark)
         assert page.canvas.plot.title.text == field.label
         if field.ends is None:
             whole = range_of_test(fields, view.field)
@@ -361,10 +361,13 @@ def test_curves_that_are_being_read_are_not_saved(tmp_path):
 
 def test_a_range_by_hand_that_makes_no_sense_is_told(tmp_path):
     page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
-    page.parts.range.value = "hand"
-    page.parts.low.value = 5.0
-    assert "The colours go from -1 to 1" in page.parts.description.text
-    page.parts.high.value = 9.0
+    page.show()
+    present = page.canvas.colours.low, page.canvas.colours.high
+    page.parts.of["range"].value = "hand"
+    assert (page.view.low, page.view.high) == present
+    page.parts.of["low"].value = 5.0
+    assert f"The colours go from {present[0]:g} to {present[1]:g}" in page.parts.description.text
+    page.parts.of["high"].value = 9.0
     assert "The colours go" not in page.parts.description.text
     assert (page.canvas.colours.low, page.canvas.colours.high) == (5, 9)
 
