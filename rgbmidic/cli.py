@@ -240,14 +240,38 @@ def figures(
         Path | None, typer.Option("--out", help="Folder for the pictures; by default RESULT/figures.")
     ] = None,
     frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10; by default three frames.")] = "",
+    fields: Annotated[
+        str, typer.Option("--field", help="Fields to map, with their uncertainty, such as exx,velocity,magnitude.")
+    ] = "",
+    gauge: Annotated[
+        float | None,
+        typer.Option("--gauge", help="Length of the virtual strain gauge in px; by default the shortest."),
+    ] = None,
+    measure: Annotated[str | None, typer.Option("--measure", help="Strain measure, such as hencky.")] = None,
+    since: Annotated[int | None, typer.Option("--since", help="Frame that displacement and strain count from.")] = None,
+    rigid: Annotated[bool, typer.Option("--remove-rigid", help="Remove shift and rotation of the whole.")] = False,
+    window: Annotated[int | None, typer.Option("--window", help="Frames that rates are taken over.")] = None,
+    hatch: Annotated[bool, typer.Option("--hatch", help="Hatch what is within 2 standard uncertainties of 0.")] = False,
+    test: Reading = None,
     partial: Partial = False,
 ) -> None:
-    """Draw a result: maps, masks and reflections of some frames, and what happened over all of them."""
+    """Draw a result: maps, masks and reflections of some frames, and what happened over all of them; or any fields."""
     from rgbmidic._kernels.threads import threads
-    from rgbmidic.report import write_figures
-    from rgbmidic.results import Result
+    from rgbmidic.report import write_figures, write_maps
+    from rgbmidic.results import Maps, Result
 
-    chosen, folder = _frames(frames), out or result / "figures"
+    chosen, folder, settings = _frames(frames), out or result / "figures", _settings(test)
+    if fields:
+        maps = Maps.of(
+            Result.open(result, partial=partial), None if settings is None else settings.scale, gauge=gauge,
+            measure=measure or (None if settings is None else settings.probes.measure),
+            since=since, rigid_removed=rigid, window=window,
+        )  # fmt: skip
+        for file in write_maps(maps, [name.strip() for name in fields.split(",")], folder, chosen, hatched=hatch):
+            print(file)
+        return
+    if hatch or rigid or test or any(option is not None for option in (gauge, measure, since, window)):
+        raise InputError("--gauge, --measure, --since, --remove-rigid, --window, --hatch and --test need a --field")
     for file in write_figures(Result.open(result, partial=partial), folder, chosen, processes=threads()):
         print(file)
 

@@ -18,7 +18,7 @@ from rgbmidic.fields.history import History, Nodal, Probe
 from rgbmidic.fields.measures import MEASURES, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.strain import StrainGauges
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["PROBES", "Gauge", "Mean", "StrainGauge", "make_probe"]
 
@@ -80,16 +80,24 @@ class Mean:
     def read(self, nodal: Nodal) -> list[tuple[FloatArray, FloatArray]]:
         """Average u and v, each (T,), with their standard uncertainty."""
         known = np.isfinite(nodal.u + nodal.v + nodal.u_std + nodal.v_std)
+        return [self.average(*pair, known) for pair in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))]
+
+    def average(
+        self, values: FloatArray, std: FloatArray, known: BoolArray, *, alike: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Average a quantity (T, m) of the nodes where it is known, with its standard uncertainty, each (T,).
+
+        The errors are correlated between nodes as those of a displacement, or where they are `alike` the same at all
+        nodes, which is the most that they can add up to.
+        """
         measured = known @ self.weights
         enough = measured >= self.least
         weights = np.where(known, self.weights, 0) / np.where(enough, measured, 1)[:, None]
-        found = []
-        for values, std in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std)):
-            mean = (weights * np.where(known, values, 0)).sum(axis=1)
-            parts = weights * np.where(known, std, 0)
-            spread = np.sqrt(np.maximum(np.einsum("tm,tm->t", parts @ self.correlation, parts), 0))
-            found.append((np.where(enough, mean, np.nan), np.where(enough, spread, np.nan)))
-        return found
+        mean = (weights * np.where(known, values, 0)).sum(axis=1)
+        parts = weights * np.where(known, std, 0)
+        square = parts.sum(axis=1) ** 2 if alike else np.einsum("tm,tm->t", parts @ self.correlation, parts)
+        spread = np.sqrt(np.maximum(square, 0))
+        return np.where(enough, mean, np.nan), np.where(enough, spread, np.nan)
 
 
 def _line(x0: float, y0: float, x1: float, y1: float) -> FloatArray:

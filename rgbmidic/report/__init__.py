@@ -12,7 +12,7 @@ from rgbmidic.report.figures import (
     reflection_figure,
     residual_figure,
 )
-from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures
+from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures, write_maps
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [
@@ -33,5 +33,6 @@ __all__ = [
     "residual_figure",
     "save_figure",
     "write_figures",
+    "write_maps",
     "write_report",
 ]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.report import style
-from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Result
+from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Maps, Result
 from rgbmidic.results.physical import Physical
 from rgbmidic.typing import FloatArray
 
@@ -324,8 +324,53 @@ class MapDrawer:
         maps = {}
         for label, (values, std) in fields.items():
             ordinary = style.ordinary_values(values, std)
-            maps[label] = values, style.colour_scale(ordinary, positive=positive) if ordinary.size else None
-        return self._draw(frame, maps, "plasma" if positive else "viridis")
+            norm = style.colour_scale(ordinary, positive=positive) if ordinary.size else None
+            maps[label] = values, norm, "plasma" if positive else "viridis"
+        return self._draw(frame, maps)
+
+    def of_field(self, maps: Maps, name: str, frame: int, *, hatched: bool = False) -> Figure:
+        """Draw a field of `maps` in a frame, and its standard uncertainty beside it where it has one.
+
+        Parameters
+        ----------
+        maps
+            Fields of the same result.
+        name
+            Name of the field.
+        frame
+            Index of the frame.
+        hatched
+            Whether values within two standard uncertainties of 0 are hatched.
+
+        Returns
+        -------
+        Figure
+            The figure, one or two panels.
+
+        Raises
+        ------
+        InputError, ResultError
+            As `Maps.read`.
+        """
+        from matplotlib.colors import Normalize
+
+        field, read = maps.field(name), maps.read(name, frame)
+        ordinary = style.ordinary_values(read.values, read.std)
+        ends = field.ends or (style.colour_range(ordinary) if ordinary.size else None)
+        colours = {"positive": "plasma", "fraction": "cividis", "angle": "twilight", "codes": "tab10"}
+        norm, unit = Normalize(*ends) if ends else None, f" ({field.unit})" if field.unit else ""
+        panels = {f"{field.symbol}{unit}": (read.values, norm, colours.get(field.kind, "viridis"))}
+        spread = read.std[np.isfinite(read.std)]
+        if spread.size:
+            panels[f"σ({field.symbol}){unit}"] = read.std, style.colour_scale(spread, positive=True), "plasma"
+        codes = ", ".join(f"{code}: {text}" for code, text in enumerate(field.codes))
+        figure = self._draw(frame, panels, codes or maps.how.get(field.group, ""), stepped=field.stepped)
+        if hatched and spread.size:
+            beyond = self._raster(np.abs(read.values) - 2 * read.std)
+            with np.errstate(invalid="ignore"):
+                axis = figure.axes[0]
+                axis.contourf(*self._places, beyond, levels=[-np.inf, 0], hatches=["////"], colors="none")
+        return figure
 
     def fractions(self, frame: int) -> Figure:
         """Draw the fraction of each light in what determines the nodes of a frame, as `fraction_figure` does."""
@@ -334,8 +379,8 @@ class MapDrawer:
         fractions = self.result.frame(frame).light_fraction
         fractions = np.where(fractions.sum(axis=1, keepdims=True) > 0, fractions, np.nan)
         titles = [style.literal(f"fraction of {light}") for light in self.result.lights]
-        maps = {title: (part, Normalize(0, 1)) for title, part in zip(titles, fractions.T, strict=True)}
-        return self._draw(frame, maps, "cividis")
+        maps = {title: (part, Normalize(0, 1), "cividis") for title, part in zip(titles, fractions.T, strict=True)}
+        return self._draw(frame, maps)
 
     def strip(self, maps: Sequence[tuple[str, FloatArray]], label: str) -> Figure:
         """Draw small maps of one nodal field in several frames, side by side, in the same colours.
@@ -357,7 +402,7 @@ class MapDrawer:
 
         def draw(axes: list[Axes]) -> None:
             for axis, (title, values) in zip(axes, maps, strict=False):
-                self._show(axis, values, norm, "viridis", bar=axis is axes[-2])
+                self._show(axis, self._raster(values), values, norm, "viridis", bar=axis is axes[-2])
                 axis.set_title(title)
                 style.finish_picture(axis, x, y, first=axis is axes[0])
             axes[-1].set_axis_off()  # room for the colour bar
@@ -365,19 +410,28 @@ class MapDrawer:
         aspect = np.ptp(y) / np.ptp(x)
         return style.draw_figure(draw, count=len(maps) + 1, aspect=max(aspect, 0.5), beside=style.GAP, title=label)
 
-    def _draw(self, frame: int, maps: Mapping[str, tuple[FloatArray, Normalize | None]], colours: str) -> Figure:
-        """Draw one map per nodal field, over the reference where there is one."""
+    def _draw(
+        self,
+        frame: int,
+        maps: Mapping[str, tuple[FloatArray, Normalize | None, str]],
+        how: str = "",
+        *,
+        stepped: bool = False,
+    ) -> Figure:
+        """Draw one map per nodal field, of its values, range and colours, over the reference where there is one."""
         import matplotlib as mpl
 
         if len(maps) not in self._figures:
             self._figures[len(maps)] = self._panels(len(maps))
         figure, kept = self._figures[len(maps)], int(self._dpi is None and self.result.reference is not None)
-        figure.texts[0].set_text(_frame_title(self.result, frame, self.result.frame(frame)))
+        title = _frame_title(self.result, frame, self.result.frame(frame))
+        figure.texts[0].update({"text": f"{title}\n{how}" if how else title, "fontsize": 8 if how else 10})
         with mpl.rc_context(style.STYLE):
-            for axis, (label, (values, norm)) in zip(figure.axes, maps.items(), strict=True):
-                for artist in (*axis.images[kept:], *axis.lines, *axis.patches, *axis.texts, *axis.artists):
+            for axis, (label, (values, norm, colours)) in zip(figure.axes, maps.items(), strict=True):
+                drawn = (*axis.lines, *axis.patches, *axis.texts, *axis.artists, *axis.collections)
+                for artist in (*axis.images[kept:], *drawn):
                     artist.remove()
-                self._show(axis, values, norm, colours)
+                self._show(axis, self._raster(values, stepped=stepped), values, norm, colours)
                 axis.set_title(label)
         return figure
 
@@ -397,15 +451,36 @@ class MapDrawer:
             style.freeze_axes(figure, self._dpi)
         return figure
 
-    def _show(self, axis: Axes, values: FloatArray, norm: Normalize | None, colours: str, *, bar: bool = True) -> None:
-        """Show a nodal field, linear in each element as in the solve; blank where one of its nodes has no data."""
+    def _raster(self, values: FloatArray, *, stepped: bool = False) -> FloatArray:
+        """Interpolate a nodal field, linear in each element as in the solve; NaN where one of its nodes has no data.
+
+        Where values between nodes mean nothing it is that of the nearest one.
+        """
+        from scipy.spatial import cKDTree
+
+        gradients = self._mesh.calculate_plane_coefficients(values)
+        x, y, constant = np.concatenate([gradients, np.full((1, 3), np.nan)])[self._element].transpose(2, 0, 1)
+        picture = x * self._places[0] + y * self._places[1] + constant  # of no element, -1: NaN, the last row
+        if stepped:
+            points = np.stack(self._places, axis=-1)
+            picture = np.where(np.isfinite(picture), values[cKDTree(self.result.nodes).query(points)[1]], np.nan)
+        return np.asarray(picture)
+
+    def _show(
+        self,
+        axis: Axes,
+        picture: FloatArray,
+        values: FloatArray,
+        norm: Normalize | None,
+        colours: str,
+        *,
+        bar: bool = True,
+    ) -> None:
+        """Show a picture of nodal values and their colour bar."""
         if norm is None or not np.isfinite(values).any():
             box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
             axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
             return
-        planes = self._mesh.calculate_plane_coefficients(values)
-        x, y, constant = np.concatenate([planes, np.full((1, 3), np.nan)])[self._element].transpose(2, 0, 1)
-        picture = x * self._places[0] + y * self._places[1] + constant  # of no element, -1: NaN, the last row
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
         if not bar:
             return

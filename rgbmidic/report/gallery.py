@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from rgbmidic.errors import ResultError
 from rgbmidic.report import figures
 from rgbmidic.report.style import DPI, save_figure
-from rgbmidic.results import Result
+from rgbmidic.results import Maps, Result
 from rgbmidic.results.files import writing
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ _OF_FRAME: Mapping[str, Callable[[figures.MapDrawer, int], Figure | None]] = {
     "masks": lambda maps, frame: figures.mask_figure(maps.result, frame),
     "reflections": lambda maps, frame: figures.reflection_figure(maps.result, frame),
 }
-_NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)})_[0-9]{{6,}})\.png")
+_NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)}|map_.+)_[0-9]{{6,}})\.png")
 _FEW = 20
 """Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.15 s."""
 
@@ -97,6 +97,49 @@ def write_figures(
                 f"a process that drew pictures into {folder} was ended; draw them anew: rgbmidic figures {result.path}"
             ) from None
     return tuple(file for picture in pictures if (file := _file(folder, *picture)) in drawn)
+
+
+def write_maps(
+    maps: Maps, names: Sequence[str], folder: Path | str, frames: Sequence[int] | None = None, *, hatched: bool = False
+) -> tuple[Path, ...]:
+    """Write a picture of each field in each frame, its standard uncertainty beside it: ``map_exx_000005.png``.
+
+    Parameters
+    ----------
+    maps
+        The fields of a result.
+    names
+        Names of fields.
+    folder, frames
+        As `write_figures`.
+    hatched
+        Whether values within two standard uncertainties of 0 are hatched.
+
+    Returns
+    -------
+    tuple of Path
+        The files written.
+
+    Raises
+    ------
+    InputError
+        There is no such field or frame, or rates need more frames.
+    ResultError
+        The result is damaged, or the folder cannot be written.
+    """
+    folder, drawer = Path(folder), figures.MapDrawer(maps.result, DPI)
+    chosen = figures.spread(figures.measured_frames(maps.result), _FRAMES) if frames is None else frames
+    for name in names:
+        for frame in chosen:
+            maps.read(name, frame)  # an error of one is raised before the first picture
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name in names:
+        for frame in chosen:
+            files.append(_file(folder, f"map_{name.replace(' ', '_')}", frame))
+            save_figure(drawer.of_field(maps, name, frame, hatched=hatched), files[-1])
+    return tuple(files)
 
 
 def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:

@@ -9,14 +9,26 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 from urllib.parse import urlencode
 
-__all__ = ["KINDS", "OVER", "Mark", "ViewState", "probe_marks"]
+from rgbmidic.fields import MEASURES
 
-KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1}
+__all__ = ["BESIDE", "KINDS", "OVER", "PALETTES", "UNCERTAINTY", "Mark", "ViewState", "probe_marks", "probe_place"]
+
+KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "circle": 2}
 """Probes that can be set with the pointer, and how many places each takes."""
 OVER = ("reference", "deformed")
+_LEAST, _LARGEST = {"levels": 2}, 10**9
 _MOST_MARKS = 200
 """Marks that an address may set: it has 8 kB at most, of some 25 a mark."""
-_CHOICES = {"over": OVER, "range": ("frame", "test", "hand"), "theme": ("light", "dark")}
+BESIDE = ("second", "third", "fourth")
+"""Entries of the view that name fields beside the first."""
+UNCERTAINTY = "uncertainty"
+"""Name of the field beside the first that is its standard uncertainty, whatever that is."""
+PALETTES = ("viridis", "cividis", "plasma", "inferno", "RdBu_r", "PuOr_r", "twilight")
+"""Colours that can be chosen, safe for the colour-blind: perceptually uniform ones, diverging ones, a cyclic one."""
+_CHOICES = {
+    "over": OVER, "range": ("frame", "test", "hand"), "theme": ("light", "dark"), "palette": PALETTES,
+    "measure": MEASURES,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +57,16 @@ def probe_marks(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
     return found
 
 
+def probe_place(marks: Sequence[Mark], gauge: float) -> tuple[float, ...]:
+    """Return the numbers that place the probe of some marks, as ``[probes]`` has them; strain gauges of a length."""
+    places = [coordinate for mark in marks for coordinate in (mark.x, mark.y)]
+    if marks[0].kind == "strain_gauge":
+        return (*places, gauge)
+    if marks[0].kind == "circle":
+        return (*places[:2], math.dist(places[:2], places[2:]))
+    return tuple(places)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewState:
     """Frame, field, colours, part of the image and probes in view.
@@ -67,6 +89,21 @@ class ViewState:
         Whether principal directions are drawn.
     opacity
         Opacity of the field, from 0 to 1.
+    second, third, fourth
+        Names of fields beside it; ``"uncertainty"``: that of the first; empty: none.
+    palette, levels
+        Name of the colours, empty: those that suit the field; and their number.
+    hatched
+        Whether what lies within two standard uncertainties of 0 is hatched.
+    vectors, longer
+        Whether displacements are drawn as arrows, and so many times their length; 0: as long as there is room.
+    contours, extremes, blank
+        Whether lines between the colours, the places of the smallest and the largest value, and the nodes without data
+        are drawn.
+    gauge, measure
+        Length of the virtual strain gauges in px, 0: the shortest; and the strain measure.
+    since, rigid, rate_window
+        As `Maps` has them; -1: the test's reference, 0: the usual window.
     curve
         Quantity of the probes whose curve is shown; empty: the first.
     theme
@@ -86,6 +123,22 @@ class ViewState:
     symmetric: bool = False
     directions: bool = False
     opacity: float = 0.85
+    second: str = ""
+    third: str = ""
+    fourth: str = ""
+    palette: str = ""
+    levels: int = 256
+    hatched: bool = False
+    vectors: bool = False
+    longer: float = 0.0
+    contours: bool = False
+    extremes: bool = False
+    blank: bool = False
+    gauge: float = 0.0
+    measure: str = MEASURES[0]
+    since: int = -1
+    rigid: bool = False
+    rate_window: int = 0
     curve: str = ""
     theme: str = ""
     window: tuple[float, ...] = ()
@@ -137,13 +190,14 @@ def _text(value: object) -> str:
 def _value(name: str, text: str, names: Sequence[str]) -> object:
     """Return the value that a text states for an entry; None where it is invalid."""
     try:
-        if name == "frame":
-            return int(text)
-        if name in ("low", "high", "opacity"):
+        plain = getattr(ViewState(), name)
+        if isinstance(plain, bool):
+            return bool(int(text))
+        if isinstance(plain, int):
+            return min(max(int(text), _LEAST.get(name, -1)), _LARGEST)
+        if isinstance(plain, float):
             number = _number(text)
             return min(max(number, 0.0), 1.0) if name == "opacity" else number
-        if name in ("symmetric", "directions"):
-            return bool(int(text))
         if name == "window":
             left, top, right, bottom = map(_number, text.split(","))
             return (left, top, right, bottom) if left < right and top < bottom else None
@@ -153,8 +207,8 @@ def _value(name: str, text: str, names: Sequence[str]) -> object:
             return marks if all(mark.kind in KINDS for mark in marks) else None
     except ValueError:
         return None
-    if name == "field":
-        return text if text in names else None
+    if name in ("field", *BESIDE):
+        return text if text in names or (text == UNCERTAINTY and name in BESIDE) else None
     if name in _CHOICES:
         return text if text in _CHOICES[name] else None
     return text[:100]

@@ -20,7 +20,8 @@ from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.address import Mark
 from rgbmidic.view.picture import Window
 
-__all__ = ["Canvas", "DirectionLayer", "Tiles", "columns", "plain_plot"]
+__all__ = ["LETTERS", "Canvas", "LabelLayer", "LineLayer", "Tiles", "arrow_lines", "columns", "contour_lines"]
+__all__ += ["direction_lines", "plain_plot"]
 
 _IMAGE = "image x y dw dh"
 _BAR = 80
@@ -57,6 +58,8 @@ class Canvas:
         Edges (left, top, right, bottom) of the view at first, px.
     redraw
         Called when another part, or another size, is in view.
+    like
+        Canvas beside it, whose part of the image it shows too.
 
     Attributes
     ----------
@@ -69,14 +72,20 @@ class Canvas:
     """
 
     def __init__(
-        self, document: Document, kinds: Sequence[str], edges: Sequence[float], redraw: Callable[[], None]
+        self,
+        document: Document,
+        kinds: Sequence[str],
+        edges: Sequence[float],
+        redraw: Callable[[], None],
+        like: Canvas | None = None,
     ) -> None:
         left, top, right, bottom = self.wanted = tuple(map(float, edges))
+        self.plot: Any
         self.window = Window(left=left, top=top, right=right, bottom=bottom, width=800, height=600).fitted()
         self._document, self._redraw, self._coming = document, redraw, False
         self.plot = plain_plot(
-            x_range=bk.Range1d(self.window.left, self.window.right),
-            y_range=bk.Range1d(self.window.bottom, self.window.top),
+            x_range=like.plot.x_range if like else bk.Range1d(self.window.left, self.window.right),
+            y_range=like.plot.y_range if like else bk.Range1d(self.window.bottom, self.window.top),
             title=" ",
             min_border_right=_BAR,
             x_axis_label="x (px)",
@@ -84,12 +93,14 @@ class Canvas:
             toolbar_location="above",
         )
         self.plot.grid.visible = False
-        self._image = bk.ColumnDataSource(columns(_IMAGE), name="image")
+        self._image = bk.ColumnDataSource(columns(_IMAGE), name="image" if like is None else None)
         self.plot.image_rgba(*_IMAGE.split(), source=self._image)
-        self.colours = bk.LinearColorMapper(palette=["#000000"], low=0, high=1, name="colours")
+        self.colours = bk.LinearColorMapper(
+            palette=["#000000"], low=0, high=1, name="colours" if like is None else None
+        )
         self.bar = bk.ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
         self.plot.add_layout(self.bar, "right")
-        self.marks = bk.ColumnDataSource(columns("x y kind"), name="marks")
+        self.marks = bk.ColumnDataSource(columns("x y kind"), name="marks" if like is None else None)
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
         dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
         pan, wheel = bk.PanTool(), bk.WheelZoomTool(zoom_on_axis=False)
@@ -99,6 +110,9 @@ class Canvas:
         box, reset, save = bk.BoxZoomTool(match_aspect=True), bk.ResetTool(), bk.SaveTool(filename="field")
         self.plot.add_tools(pan, wheel, box, reset, save, *draw)
         self.plot.toolbar.active_drag, self.plot.toolbar.active_scroll, self.plot.toolbar.logo = pan, wheel, None
+        if like:
+            return
+        self.plot.name = "plot"
         self.plot.on_event(RangesUpdate, self._moved)
         for name in ("inner_width", "inner_height"):
             self.plot.on_change(name, lambda attr, old, new: self.resize())
@@ -109,9 +123,9 @@ class Canvas:
         low, high = view_limits(points)
         return (*low.tolist(), *high.tolist())
 
-    def show(self, image: AnyArray) -> None:
-        """Show a picture (rows, columns), uint32, of the window."""
-        w = self.window
+    def show(self, image: AnyArray, window: Window | None = None) -> None:
+        """Show a picture (rows, columns), uint32, of the window, or of that of the canvas beside it."""
+        w = window or self.window
         self._image.data = columns(_IMAGE, [(image, w.left, w.top, w.right - w.left, w.bottom - w.top)])
 
     def clear(self) -> None:
@@ -173,39 +187,117 @@ class Canvas:
 
 _ACROSS = 24
 """Lines across the view: each then has some 30 px of a screen of 800, longer than wide and apart from the next."""
-_ENDS = "x0 y0 x1 y1"
+_ENDS, _LABEL = "x0 y0 x1 y1", "x y text colour"
+LETTERS = {
+    "x_offset": 8,
+    "y_offset": -4,
+    "background_fill_color": "#15181c",
+    "background_fill_alpha": 0.75,
+    "text_font_size": "12px",
+    "padding": 2,
+}
+"""Look of a text over the image."""
 
 
-class DirectionLayer:
-    """Lines along the larger principal strain on a canvas.
+class LineLayer:
+    """Lines on a canvas, light with a dark edge.
 
     Parameters
     ----------
     canvas
         Plot on which they are drawn.
+    name
+        Name of their data.
+    width
+        Of the light part, in pixels of the screen.
     """
 
-    def __init__(self, canvas: Canvas) -> None:
-        self._canvas, self._lines = canvas, bk.ColumnDataSource(columns(_ENDS), name="directions")
-        for colour, width in (("#15181c", 3.0), ("#ffffff", 1.4)):
-            canvas.plot.segment(*_ENDS.split(), source=self._lines, line_color=colour, line_width=width)
+    def __init__(self, canvas: Canvas, name: str, width: float = 1.4) -> None:
+        self._lines = bk.ColumnDataSource(columns(_ENDS), name=name)
+        for colour, wide in (("#15181c", width + 1.6), ("#ffffff", width)):
+            canvas.plot.segment(*_ENDS.split(), source=self._lines, line_color=colour, line_width=wide)
 
-    def hide(self) -> None:
-        """Show no lines."""
-        if len(self._lines.data["x0"]):
-            self._lines.data = columns(_ENDS)
+    def show(self, ends: FloatArray | None) -> None:
+        """Show lines (M, 4) from x0, y0 to x1, y1; None: none."""
+        if ends is not None or len(self._lines.data["x0"]):
+            self._lines.data = dict(zip(_ENDS.split(), (np.zeros((0, 4)) if ends is None else ends).T, strict=True))
 
-    def show(self, nodes: FloatArray, degrees: FloatArray) -> None:
-        """Show the directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
-        window = self._canvas.window
-        cell = max(window.right - window.left, window.bottom - window.top) / _ACROSS
-        measured = np.flatnonzero(np.isfinite(degrees) & np.isfinite(nodes).all(axis=1))
-        places = np.floor(nodes[measured] / cell).astype(int)
-        thinned = measured[np.unique(places, axis=0, return_index=True)[1]]
-        angle = np.radians(degrees[thinned])
-        half = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        ends = np.concatenate([nodes[thinned] - half, nodes[thinned] + half], axis=1)
-        self._lines.data = dict(zip(_ENDS.split(), ends.T, strict=True))
+
+class LabelLayer:
+    """Points with a text on a canvas.
+
+    Parameters
+    ----------
+    canvas
+        Plot on which they are drawn.
+    name
+        Name of their data.
+    """
+
+    def __init__(self, canvas: Canvas, name: str, **look: Any) -> None:
+        self._points = bk.ColumnDataSource(columns(_LABEL), name=name)
+        canvas.plot.scatter("x", "y", source=self._points, line_color="#15181c", fill_color="colour", **look)
+        canvas.plot.text("x", "y", "text", source=self._points, text_color="#ffffff", **LETTERS)
+
+    def show(self, points: Sequence[tuple[float, float, str, str]] = ()) -> None:
+        """Show points with their texts and colours."""
+        if points or len(self._points.data["x"]):
+            self._points.data = columns(_LABEL, points)
+
+
+def _thinned(window: Window, nodes: FloatArray, known: Any) -> tuple[npt.NDArray[np.int64], float]:
+    """Thin out the nodes (N, 2) that are known, evenly over the view; return their indices, and their distance."""
+    cell = max(window.right - window.left, window.bottom - window.top) / _ACROSS
+    kept = np.flatnonzero(known & np.isfinite(nodes).all(axis=1))
+    places = np.floor(nodes[kept] / cell).astype(int)
+    return kept[np.unique(places, axis=0, return_index=True)[1]], cell
+
+
+def direction_lines(window: Window, nodes: FloatArray, degrees: FloatArray) -> FloatArray:
+    """Lines (M, 4) along directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
+    thinned, cell = _thinned(window, nodes, np.isfinite(degrees))
+    angle = np.radians(degrees[thinned])
+    half = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([nodes[thinned] - half, nodes[thinned] + half], axis=1)
+
+
+def arrow_lines(window: Window, nodes: FloatArray, moved: FloatArray, longer: float) -> tuple[FloatArray, float]:
+    """Lines (M, 4) of arrows along displacements (N, 2) at nodes (N, 2), thinned out, and how much longer they are.
+
+    With `longer` 0 the longest reaches to the next arrow.
+    """
+    thinned, cell = _thinned(window, nodes, np.isfinite(moved).all(axis=1))
+    start, along = nodes[thinned], moved[thinned]
+    reach = np.hypot(*along.T).max(initial=0)
+    longer = longer or (0.9 * cell / reach if reach > 0 else 1.0)
+    end = start + longer * along
+    parts = [np.concatenate([start, end], axis=1)]
+    for turn in (2.6, -2.6):  # rad from the arrow to the sides of its point
+        c, s = 0.3 * np.cos(turn), 0.3 * np.sin(turn)
+        parts.append(np.concatenate([end, end + longer * along @ np.array([[c, s], [-s, c]])], axis=1))
+    return np.concatenate(parts), float(longer)
+
+
+def contour_lines(
+    nodes: FloatArray, elements: npt.NDArray[np.int32], values: FloatArray, levels: Sequence[float]
+) -> FloatArray:
+    """Lines (M, 4) on which a field, linear in each element, has one of the levels; none beside nodes without data."""
+    whole = elements[np.isfinite(values[elements] + nodes[elements].sum(axis=2)).all(axis=1)]
+    lines = []
+    for level in levels:
+        above = values[whole] > level
+        cut = whole[above.any(axis=1) & ~above.all(axis=1)]
+        ends = []
+        # the corner that is alone on its side: from it, the line cuts both edges
+        side = values[cut] > level
+        alone = np.where(side.sum(axis=1) == 1, side.argmax(axis=1), side.argmin(axis=1))
+        row = np.arange(len(cut))
+        for step in (1, 2):
+            a, b = cut[row, alone], cut[row, (alone + step) % 3]
+            part = ((level - values[a]) / (values[b] - values[a]))[:, None]
+            ends.append(nodes[a] + part * (nodes[b] - nodes[a]))
+        lines.append(np.concatenate(ends, axis=1))
+    return np.concatenate(lines) if lines else np.zeros((0, 4))
 
 
 _WIDE = 260

@@ -19,28 +19,27 @@ from rgbmidic.results import Histories, HistoryColumn, Result, probes_of
 from rgbmidic.results.histories import history_csv, read_histories
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import KINDS, Mark, probe_marks
+from rgbmidic.view.address import KINDS, Mark, probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.fields import Background
 
 __all__ = ["CurvePanel", "Progress", "TimeLine", "as_csv", "band", "groups", "places", "probes", "read"]
 
 
-def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings) -> ProbeSettings:
+def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings, measure: Any = None) -> ProbeSettings:
     """Return the probes that marks make, each kind in the order set; a last mark without its pair waits for it.
 
-    Strain gauges have the length `gauge` (px); strain measure and window are those `stated`.
+    Strain gauges have the length `gauge` (px); window and, unless it is chosen, strain measure are those `stated`.
     """
     places: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
     for pair in probe_marks(marks).values():
-        place = tuple(coordinate for mark in pair for coordinate in (mark.x, mark.y))
-        places[f"{pair[0].kind}s"] += ((*place, gauge) if pair[0].kind == "strain_gauge" else place,)
-    return ProbeSettings(measure=stated.measure, window=stated.window, **places)
+        places[f"{pair[0].kind}s"] += (probe_place(pair, gauge),)
+    return ProbeSettings(measure=measure or stated.measure, window=stated.window, **places)
 
 
-def read(result: Result, marks: Sequence[Mark], gauge: float) -> Histories | None:
+def read(result: Result, marks: Sequence[Mark], gauge: float, measure: str | None = None) -> Histories | None:
     """Read the probes that marks make off a result, as `read_histories`; None where they make none."""
-    made = probes(marks, gauge, probes_of(result))
+    made = probes(marks, gauge, probes_of(result), measure)
     return read_histories(result, made) if made.places else None
 
 
@@ -239,12 +238,14 @@ class CurvePanel:
         plot.add_layout(plot.legend[0], "below")
         return plot
 
-    def read(self, result: Result, marks: Sequence[Mark], gauge: float, shown: Callable[[], None]) -> None:
+    def read(
+        self, result: Result, marks: Sequence[Mark], gauge: float, measure: str | None, shown: Callable[[], None]
+    ) -> None:
         """Read the probes off all frames in another thread, then call `shown`; only the last request counts."""
         self.reading = bool(marks)
         if marks:
             self._message.text = "reading all frames …"
-            self._reader.ask(partial(read, result, tuple(marks), gauge), partial(self._have, shown))
+            self._reader.ask(partial(read, result, tuple(marks), gauge, measure), partial(self._have, shown))
         else:
             self._reader.drop()
             self._have(shown, lambda: None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -10,16 +10,17 @@ import bokeh.models as bk
 import numpy as np
 import numpy.typing as npt
 from bokeh.core.properties import Int, String
-from bokeh.layouts import row
+from bokeh.layouts import column, row
 from bokeh.model import DataModel
 
+from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import Mark, probe_marks
-from rgbmidic.view.canvas import Canvas, columns
+from rgbmidic.view.address import PALETTES, Mark, probe_marks
+from rgbmidic.view.canvas import LETTERS, Canvas, columns
 from rgbmidic.view.picture import element_at
 
-__all__ = ["Controls", "MarkLayer", "ResultControls", "SharedState", "page_file", "script"]
+__all__ = ["CONTROLS", "Controls", "MarkLayer", "ResultControls", "SharedState", "page_file", "script"]
 
 _SHORT = 150
 """Smallest number of ms between two frames that are played: 6 to 7 a second, which the eye can follow."""
@@ -88,25 +89,78 @@ class Controls:
         state.js_on_change("shown", asks)
 
 
+SECTIONS = ("Field", "Colours", "Layers", "Derived", "Probes")
+"""Headings of the controls of a result: one section is shown at a time, and fits a screen of 720 rows."""
+MODES = ("Move", "Point", "Gauge", "Line", "Strain", "Box", "Circle")
+_ENDS = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
+_NUMBER = {"mode": "float"}
+CONTROLS: tuple[tuple[str, str, type[bk.Widget], str, dict[str, Any]], ...] = (
+    ("field", "Field", bk.Select, "Field", {}),
+    ("second", "Field", bk.Select, "Second field", {}),
+    ("third", "Field", bk.Select, "Third field", {}),
+    ("fourth", "Field", bk.Select, "Fourth field", {}),
+    ("opacity", "Field", bk.Slider, "Opacity", {"start": 0, "end": 1, "step": 0.05, "value": 1}),
+    ("range", "Colours", bk.Select, "Colours from", {"options": _ENDS}),
+    ("low", "Colours", bk.NumericInput, "lowest", _NUMBER),
+    ("high", "Colours", bk.NumericInput, "highest", _NUMBER),
+    ("symmetric", "Colours", bk.Checkbox, "symmetric about 0", {}),
+    ("palette", "Colours", bk.Select, "Palette", {"options": [("", "as suits the field"), *PALETTES]}),
+    ("levels", "Colours", bk.Spinner, "Number of colours", {"low": 2, "high": 256}),
+    ("hatched", "Colours", bk.Checkbox, "hatch what is within 2 σ of 0", {}),
+    ("directions", "Layers", bk.Checkbox, "principal directions", {}),
+    ("contours", "Layers", bk.Checkbox, "contour lines", {}),
+    ("extremes", "Layers", bk.Checkbox, "smallest and largest value", {}),
+    ("blank", "Layers", bk.Checkbox, "nodes without data", {}),
+    ("vectors", "Layers", bk.Checkbox, "displacement as arrows", {}),
+    ("longer", "Layers", bk.NumericInput, "times their length (0: as there is room)", {**_NUMBER, "low": 0}),
+    ("gauge", "Derived", bk.NumericInput, "Strain gauge length, px (0: shortest)", {**_NUMBER, "low": 0}),
+    ("measure", "Derived", bk.Select, "Strain measure", {"options": list(MEASURES)}),
+    ("since", "Derived", bk.Spinner, "Since frame (-1: the reference)", {"low": -1}),
+    ("rigid", "Derived", bk.Checkbox, "rigid motion removed", {}),
+    ("rate_window", "Derived", bk.Spinner, "Rates over frames (0: as stated, or 9)", {"low": 0}),
+)
+"""Every control that sets an entry of the view: entry, section, kind, text and options."""
+
+
 class ResultControls(Controls):
-    """Controls of the page of a result, with nothing chosen yet; parameters as `Controls`."""
+    """Controls of the page of a result, with nothing chosen yet; parameters as `Controls`.
+
+    Attributes
+    ----------
+    of : dict
+        The control of each entry of the view.
+    """
 
     def __init__(self, last: int, frame: int, *, dark: bool) -> None:
         super().__init__(last, frame, dark=dark)
-        wide, ends = self.wide, [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
-        self.field = bk.Select(title="Field", name="quantity", **wide)
+        wide, self.of = self.wide, dict[str, Any]()
+        for entry, _, kind, text, options in CONTROLS:
+            name = {"field": "quantity"}.get(entry, entry)
+            told, look = ("label", self.small) if kind is bk.Checkbox else ("title", wide)
+            self.of[entry] = kind(name=name, **{told: text}, **options, **look)
         self.over = bk.RadioButtonGroup(labels=["over the reference", "over the frame"], name="over", **wide)
-        self.opacity = bk.Slider(title="Opacity", start=0, end=1, step=0.05, value=1, **wide)
-        self.range = bk.Select(title="Colours from", name="range", options=ends, **wide)
-        self.low = bk.NumericInput(title="lowest", name="low", mode="float", **wide)
-        self.high = bk.NumericInput(title="highest", name="high", mode="float", **wide)
-        self.symmetric = bk.Checkbox(label="symmetric about 0", name="symmetric", **self.small)
-        self.directions = bk.Checkbox(label="principal directions", name="directions", **self.small)
         self.under = bk.Div(name="under", **wide)
-        modes = ["Move", "Point", "Gauge", "Line", "Strain"]
-        self.mode = bk.RadioButtonGroup(labels=modes, active=0, name="mode", **wide)
+        self.section = bk.RadioButtonGroup(labels=list(SECTIONS), active=0, name="section", **wide)
+        self.mode = bk.RadioButtonGroup(labels=list(MODES), active=0, name="mode", **wide)
         self.curve = bk.Select(title="Curve", name="curve", **wide)
-        self.clear, self.csv, self.png = (bk.Button(label=name, **wide) for name in ("Clear", "Save CSV", "Save PNG"))
+        self.lock, self.clear, self.csv, self.png = (
+            bk.Button(label=name, **wide) for name in ("Lock the range", "Clear", "Save CSV", "Save PNG")
+        )
+
+    @property
+    def side(self) -> Any:
+        """The column of all controls, of which one section is shown."""
+        flat = {"sizing_mode": "stretch_width"}
+        parts: dict[str, list[Any]] = {name: [] for name in SECTIONS}
+        for entry, section, *_ in CONTROLS:
+            parts[section].append(self.of[entry])
+        parts["Field"].insert(4, self.over)
+        low, high = (parts["Colours"].pop(1) for _ in "lh")
+        parts["Colours"][1:1] = [row(low, high, **flat), self.lock]
+        parts["Probes"] = [self.mode, self.curve, row(self.clear, self.csv, self.png, **flat), self.message]
+        shown = [column(*parts[name], visible=not place, **flat) for place, name in enumerate(SECTIONS)]
+        self.section.js_on_change("active", script("turnTo", group=self.section, sections=shown))
+        return column(self.description, self.section, *shown, self.theme, **flat)
 
     def wire(self, state: SharedState, tools: Sequence[Any], now: bk.Span, curves: Any) -> None:
         """Let the browser itself act; `now` marks the frame that is shown, `curves` is a plot."""
@@ -120,14 +174,19 @@ class ResultControls(Controls):
 
 _COLOURS = tuple(OKABE_ITO.values())
 _PROBE = "xs ys colour x y text"
-_LETTERS = {
-    "x_offset": 8,
-    "y_offset": -4,
-    "background_fill_color": "#15181c",
-    "background_fill_alpha": 0.75,
-    "text_font_size": "12px",
-    "padding": 2,
-}
+
+_TURN = np.linspace(0, 2 * np.pi, 49)
+
+
+def _outline(ends: Sequence[Mark], gauge: float) -> tuple[list[float], list[float]]:
+    """Return the x and y of the lines that show a probe."""
+    xs, ys = [mark.x for mark in ends], [mark.y for mark in ends]
+    if ends[0].kind == "region":
+        return [xs[0], xs[1], xs[1], xs[0], xs[0]], [ys[0], ys[0], ys[1], ys[1], ys[0]]
+    if ends[0].kind in ("circle", "strain_gauge"):
+        radius = gauge / 2 if len(ends) == 1 else float(np.hypot(xs[1] - xs[0], ys[1] - ys[0]))
+        return (xs[0] + radius * np.cos(_TURN)).tolist(), (ys[0] + radius * np.sin(_TURN)).tolist()
+    return xs, ys
 
 
 class MarkLayer:
@@ -149,22 +208,36 @@ class MarkLayer:
     def __init__(self, canvas: Canvas, elements: npt.NDArray[np.int32]) -> None:
         self.colours: dict[str, str] = {}
         self._canvas, self._elements, self._shown = canvas, elements, dict[Mark, Mark]()
+        self._drawn: object = None
         self._joined = bk.ColumnDataSource(columns(_PROBE))
         canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
-        canvas.plot.text("x", "y", "text", source=self._joined, text_color="colour", **_LETTERS)
+        canvas.plot.text("x", "y", "text", source=self._joined, text_color="colour", **LETTERS)
 
-    def place(self, marks: Sequence[Mark], reference: FloatArray, nodes: FloatArray) -> None:
-        """Draw marks, which lie on the `reference` (N, 2) of the nodes, where the nodes (N, 2) carry them."""
+    def place(
+        self,
+        marks: Sequence[Mark],
+        reference: FloatArray,
+        nodes: FloatArray,
+        values: Mapping[str, str],
+        gauge: float,
+    ) -> None:
+        """Draw marks, which lie on the `reference` (N, 2) of the nodes, where the nodes (N, 2) carry them.
+
+        Each probe shows its value of `values`; strain gauges are circles of the length `gauge` (px).
+        """
         at = [self._carried(mark, reference, nodes) for mark in marks]
         shown = dict(zip(at, marks, strict=True))
-        if shown == self._shown:
+        drawn = (shown, dict(values), gauge)
+        if drawn == self._drawn:
             return
-        self._shown = shown
+        self._shown, self._drawn = shown, drawn
         self._canvas.place(at)
         probes = probe_marks(at)
         self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
-        lines = [([mark.x for mark in ends], [mark.y for mark in ends]) for ends in probes.values()]
-        texts = [(xs[0], ys[0], name.replace("_", " ")) for name, (xs, ys) in zip(probes, lines, strict=True)]
+        lines = [_outline(ends, gauge) for ends in probes.values()]
+        texts = [
+            (ends[0].x, ends[0].y, f"{name.replace('_', ' ')}{values.get(name, '')}") for name, ends in probes.items()
+        ]
         parts = zip(lines, self.colours.values(), texts, strict=True)
         self._joined.data = columns(_PROBE, [(*line, colour, *text) for line, colour, text in parts])
 

@@ -29,6 +29,11 @@ const rgbmidic = {
     if (other) other.active = null;
   },
 
+  // Show one of the sections of the controls.
+  turnTo({group, sections}) {
+    sections.forEach((one, place) => { one.visible = place === group.active; });
+  },
+
   turn({theme}) {
     const address = new URL(location.href);
     address.searchParams.set("theme", theme);
@@ -68,6 +73,8 @@ document.addEventListener("keydown", (event) => {
     PageDown: slider.value + 10 * step, PageUp: slider.value - 10 * step,
     Home: slider.start, End: slider.end,
   }[event.key];
+  const section = page.get_model_by_name("section"), asked = Number(event.key) - 1;
+  if (section && section.labels[asked]) section.active = asked; else
   if (to !== undefined) slider.value = Math.min(Math.max(to, slider.start), slider.end);
   else if (event.key === " ") play.active = !play.active;
   else return;

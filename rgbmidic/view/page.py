@@ -7,38 +7,43 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
 
+import bokeh.models as bk
 import numpy as np
 from bokeh.document import Document
 from bokeh.events import DocumentReady, MouseMove, Tap
-from bokeh.layouts import column, row
 
+from rgbmidic.fields import MEASURES
 from rgbmidic.fields.strain import shortest_gauge
-from rgbmidic.results import Result
+from rgbmidic.results import MapField, Maps, MapValues, Result
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import KINDS, OVER, ViewState
-from rgbmidic.view.canvas import Canvas, DirectionLayer
+from rgbmidic.view.address import BESIDE, KINDS, OVER, UNCERTAINTY, ViewState, probe_marks, probe_place
+from rgbmidic.view.canvas import Canvas, LabelLayer, LineLayer, arrow_lines, contour_lines, direction_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, places
 from rgbmidic.view.fields import (
-    Fields,
     Pictures,
-    Values,
     every,
+    extremes,
     frame_text,
     guarded,
     pointer_text,
+    probe_text,
+    range_of_test,
     robust_range,
     warning,
 )
-from rgbmidic.view.models import MarkLayer, ResultControls, SharedState
-from rgbmidic.view.picture import AROUND, Overlay, paint, palette, palette_name
+from rgbmidic.view.models import CONTROLS, MarkLayer, ResultControls, SharedState
+from rgbmidic.view.picture import AROUND, Overlay, Picture, paint, palette, palette_name
 
 __all__ = ["ResultPage"]
 
 _TICK, _IDLE = 200, 1000
 """Ms between two parts of the time line; between two checks whether a result has grown, and pictures of that."""
+_CONTOURS = 10
+"""Steps between contour lines at most. Chosen; more cover the field."""
 _HELP = (
-    "Choose <b>Point</b>, <b>Gauge</b> (two clicks), <b>Line</b> (two) or <b>Strain</b>, then click on the field: its "
-    "curve appears beside it. Drag a mark to move it; Backspace removes a chosen one. Keys: ← → a frame, space plays."
+    "Choose a probe, then click on the field (Gauge, Line, Box and Circle: twice): its curve appears beside it, the "
+    "value, or mean, at it. Drag a mark to move it; Backspace removes a chosen one. Keys: ← → a frame, space plays, "
+    "1 to 5 the sections above."
 )
 
 
@@ -59,18 +64,23 @@ class ResultPage:
 
     def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
         self.document, self.result, self.view = document, result, view
-        self.fields, self.pictures, self.progress = Fields.of(result), Pictures(result=result), progress
-        self.values: Values | None = None
+        self.fields, self.pictures, self.progress = Maps.of(result), Pictures(result=result), progress
+        self.values: MapValues | None = None
         self._pointer: tuple[float, float] | None = None
-        self._read = lru_cache(1)(lambda name, frame, changes: self.fields.read(name, frame))
-        self._test_range = lru_cache(8)(lambda name, changes: self.fields.range_of_test(name))
+        self._read = lru_cache(4)(lambda name, frame, changes, chosen: self.fields.read(name, frame))
+        self._test_range = lru_cache(8)(lambda name, changes, chosen: range_of_test(self.fields, name))
         self._changes = self._size = 0
+        self._chosen: tuple[Any, ...] = ()
         self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=self.dark)
         self.canvas = Canvas(document, list(KINDS), view.window or Canvas.around(result.nodes), self._redraw)
-        self.directions, self.marks = DirectionLayer(self.canvas), MarkLayer(self.canvas, result.elements)
+        self.beside: list[Canvas] = []
+        self.directions, self.contours = LineLayer(self.canvas, "directions"), LineLayer(self.canvas, "contours", 0.8)
+        self.arrows, self.blank = LineLayer(self.canvas, "arrows"), LabelLayer(self.canvas, "blank", size=5)
+        self.marks, self.ends = MarkLayer(self.canvas, result.elements), LabelLayer(self.canvas, "extremes", size=9)
         self.timeline = TimeLine(len(result), view.frame)
         self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, message=p.message, hint=_HELP)
+        self.maps = bk.Column(children=[self.canvas.plot], sizing_mode="stretch_both")
         self._begin()
         p.wire(self.state, self.canvas.tools, self.timeline.now, self.curves.plot)
         self._listen()
@@ -78,39 +88,56 @@ class ResultPage:
     @property
     def roots(self) -> dict[str, Any]:
         """The parts of the page by the names that its template gives their places."""
-        p, wide = self.parts, partial(row, sizing_mode="stretch_width")
-        side = column(
-            p.description, p.field, p.over, p.opacity, p.range, wide(p.low, p.high), p.symmetric, p.directions,
-            p.mode, p.curve, wide(p.clear, p.csv, p.png), p.message, p.theme, sizing_mode="stretch_width",
-        )  # fmt: skip
-        drawn = {"plot": self.canvas.plot, "timeline": self.timeline.plot, "curves": self.curves.plot}
-        return {"head": p.head, "under": p.under, "side": side, "player": p.player, **drawn}
+        p = self.parts
+        drawn = {"maps": self.maps, "timeline": self.timeline.plot, "curves": self.curves.plot}
+        return {"head": p.head, "under": p.under, "side": p.side, "player": p.player, **drawn}
 
     def _begin(self) -> None:
         """Set the controls to the view, and let them change it."""
         p, view = self.parts, self.view
-        p.field.options = [(name, field.label) for name, field in self.fields.all.items()]
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for field in self.fields.all.values():
+            groups.setdefault(field.group, []).append((field.name, field.label))
+        p.of["field"].options = groups
+        for name in BESIDE:
+            p.of[name].options = {"": [("", "nothing"), (UNCERTAINTY, "its uncertainty")], **groups}
+        p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
-        p.low.value, p.high.value = view.low, view.high
         p.message.text, p.head.text = _HELP, self._title()
-        for model, key, entry in (
-            (p.field, "value", "field"), (p.opacity, "value", "opacity"), (p.range, "value", "range"),
-            (p.symmetric, "active", "symmetric"), (p.directions, "active", "directions"),
-        ):  # fmt: skip
-            model.update(**{key: getattr(view, entry)})
-            model.on_change(key, lambda attr, old, new, entry=entry: self.show(**{entry: new}))
+        for entry, _, kind, *_ in CONTROLS:
+            key = "active" if kind is bk.Checkbox else "value"
+            p.of[entry].update(**{key: getattr(view, entry)})
+            p.of[entry].on_change(key, partial(self._set, entry))
         for model, key, change in (
             (self.state, "asked", lambda frame: {"frame": min(frame, len(self.result) - 1)}),
             (p.over, "active", lambda place: {"over": OVER[place]}),
             (p.curve, "value", lambda name: {"curve": name}),
-            (p.low, "value", lambda low: self._by_hand()),
-            (p.high, "value", lambda high: self._by_hand()),
         ):
             model.on_change(key, lambda attr, old, new, change=change: self.show(**change(new)))
+
+    def _set(self, entry: str, attribute: str, old: Any, new: Any) -> None:
+        """Take the value of a control into the view; a range by hand starts from that in view."""
+        of = self.parts.of
+        if new is None:  # a number that was deleted
+            return
+        if entry in ("low", "high"):
+            low, high = of["low"].value, of["high"].value
+            self.show(**({"low": low, "high": high} if None not in (low, high) and low < high else {}))
+        elif entry == "range" and new == "hand":
+            self.view = replace(self.view, range="hand")
+            of["low"].value, of["high"].value = (
+                float(end) for end in (self.canvas.colours.low, self.canvas.colours.high)
+            )
+            self._set("low", "value", None, 0)
+        else:
+            self.show(**{entry: new})
+            if entry in ("gauge", "measure") and self.view.marks:
+                self._read_curves()
 
     def _listen(self) -> None:
         p = self.parts
         self.canvas.marks.on_change("data", lambda attr, old, new: self._marked())
+        p.lock.on_click(lambda: p.of["range"].update(value="hand"))
         p.clear.on_click(lambda: self.canvas.place([]))
         p.csv.on_click(self._save)
         self.canvas.plot.on_event(MouseMove, self._hover)
@@ -132,10 +159,6 @@ class ResultPage:
         self.parts.description.text = warning(text)
         self.state.shown = self.state.asked
 
-    def _by_hand(self) -> dict[str, float]:
-        low, high = self.parts.low.value, self.parts.high.value
-        return {"low": float(low), "high": float(high)} if None not in (low, high) and low < high else {}
-
     def show(self, **changes: Any) -> None:
         """Draw the page with other values of some entries of the view."""
         self.view = replace(self.view, **changes)
@@ -148,66 +171,156 @@ class ResultPage:
     def _blank(self, text: str) -> None:
         """Show an error and nothing of the view that cannot be drawn, nor of the one before it."""
         self.values = None
-        self.canvas.clear()
-        self.directions.hide()
+        for canvas in (self.canvas, *self.beside):
+            canvas.clear()
+        for layer in (self.directions, self.contours, self.arrows):
+            layer.show(None)
+        self.ends.show()
+        self.blank.show()
         self._read_out()
         self.curves.point(self.view.frame)
         self.state.query = self.view.query()
         self.complain(text)
 
     def _draw(self) -> None:
-        view, field = self.view, self.fields.all[self.view.field]
-        values = self.values = self._read(view.field, view.frame, self._changes)
+        view = self.view
+        self._choose()
+        field = self.fields.all[view.field]
+        values = self.values = self._values(view.field)
         picture, remark = self.pictures.frame(view.frame) if view.over == "deformed" else (self.pictures.reference, "")
-        if view.range == "hand" and (self.parts.low.value, self.parts.high.value) != (view.low, view.high):
+        low, high = (self.parts.of[name] for name in ("low", "high"))
+        if view.range == "hand" and (low.value, high.value) != (view.low, view.high):
             remark = f"The colours go from {view.low:g} to {view.high:g}: the lowest number must be below the highest."
-        nodes, colours = self._nodes(values), palette(palette_name(field.kind, symmetric=self._symmetric))
+        nodes, names = self._nodes(values), [view.field, *self._others]
+        self._arrange(len(names))
+        for canvas, name in zip((self.canvas, *self.beside), names, strict=False):
+            self._paint(canvas, name, nodes, picture)
+        low.visible = high.visible = view.range == "hand"
+        self.parts.of["symmetric"].visible = field.signed and view.range != "hand"
+        self.parts.description.text = frame_text(self.fields, view.frame, field, values, remark)
+        self._draw_layers(field, values, nodes)
+        self._read_out()
+        self.curves.point(view.frame)
+        self.state.query, self.state.shown = view.query(), self.state.asked
+
+    def _choose(self) -> None:
+        """Derive fields as the view has it."""
+        view = self.view
+        chosen = (view.gauge, view.measure, view.since, view.rigid, view.rate_window)
+        if chosen != self._chosen:
+            self.fields = self.fields.chosen(
+                gauge=view.gauge or None,
+                measure=view.measure,
+                since=None if view.since < 0 else view.since,
+                rigid_removed=view.rigid,
+                window=view.rate_window or None,
+            )
+            self._chosen = chosen
+
+    def _values(self, name: str) -> MapValues:
+        read: MapValues = self._read(name, self.view.frame, self._changes, self._chosen)
+        return read
+
+    @property
+    def _others(self) -> list[str]:
+        """Names of the fields beside the first."""
+        asked = [getattr(self.view, entry) for entry in BESIDE]
+        named = [f"{self.view.field}_std" if name == UNCERTAINTY else name for name in asked]
+        return [name for name in named if name in self.fields.all]
+
+    def _arrange(self, count: int) -> None:
+        """Show so many canvases: side by side, two in a row, or one below the other where the field is wide."""
+        if count == sum(canvas.plot.visible for canvas in (self.canvas, *self.beside)):
+            return
+        while len(self.beside) < count - 1:
+            self.beside.append(Canvas(self.document, (), self.canvas.wanted, self._redraw, like=self.canvas))
+            self.beside[-1].plot.on_event(MouseMove, self._hover)
+        for place, canvas in enumerate(self.beside):
+            canvas.plot.visible = place < count - 1
+        plots = [canvas.plot for canvas in (self.canvas, *self.beside)][:count]
+        wide = count == 2 and np.ptp(self.result.nodes[:, 0]) > np.ptp(self.result.nodes[:, 1])
+        across = 1 if wide or count == 1 else 2
+        rows = [bk.Row(children=plots[at : at + across], sizing_mode="stretch_both") for at in range(0, count, across)]
+        self.maps.children = rows if count > 1 else plots
+
+    def _paint(self, canvas: Canvas, name: str, nodes: FloatArray, picture: Picture) -> None:
+        """Paint a field on a canvas; palette, range by hand and number of colours are those of the first."""
+        view, field, values = self.view, self.fields.all[name], self._values(name)
+        first = canvas is self.canvas
+        suits = palette_name(field.kind, symmetric=view.symmetric and field.signed)
+        colours = palette((first and not field.codes and view.palette) or suits, view.levels)
         over = Overlay(
             nodes=nodes,
             elements=self.result.elements,
             values=values.values,
-            ends=self._ends(values),
+            ends=self._ends(name, values, by_hand=first),
             colours=colours,
             opacity=view.opacity,
             stepped=field.stepped,
+            beyond=np.abs(values.values) - 2 * values.std if view.hatched else None,
         )
-        self.canvas.show(paint(self.canvas.window, picture, over, AROUND[self.dark]))
-        self.canvas.colour(over.ends, colours, field.label)
-        self.parts.low.visible = self.parts.high.visible = view.range == "hand"
-        self.parts.symmetric.visible = field.signed and view.range != "hand"
-        self.parts.description.text = frame_text(self.result, view.frame, field, values, remark)
-        self.marks.place(view.marks, self.result.nodes, nodes)
-        if view.directions:
-            self.directions.show(nodes, self.fields.read("direction", view.frame).values)
-        else:
-            self.directions.hide()
-        self._read_out()
-        self.curves.point(view.frame)
-        self.state.query, self.state.shown = view.query(), self.state.asked
+        canvas.show(paint(self.canvas.window, picture, over, AROUND[self.dark]), self.canvas.window)
+        canvas.colour(over.ends, colours, field.label)
+
+    def _draw_layers(self, field: MapField, values: MapValues, nodes: FloatArray) -> None:
+        """Draw what lies over the first field: lines, arrows, extremes, nodes without data, marks."""
+        view, window, elements = self.view, self.canvas.window, self.result.elements
+        direction = self._values("direction").values if view.directions else None
+        self.directions.show(None if direction is None else direction_lines(window, nodes, direction))
+        levels = np.linspace(*self._ends(view.field, values), min(view.levels, _CONTOURS) + 1)[1:-1]
+        smooth = view.contours and not field.stepped
+        self.contours.show(contour_lines(nodes, elements, values.values, levels.tolist()) if smooth else None)
+        arrows, title = None, "times their length (0: as there is room)"
+        if view.vectors:
+            moved = self.fields.displacement(view.frame)[:2].T
+            arrows, longer = arrow_lines(window, nodes, moved, view.longer)
+            title = f"{title}: {longer:.3g}"
+        self.arrows.show(arrows)
+        self.parts.of["longer"].title = title
+        ends = extremes(field, values) if view.extremes else ()
+        names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), ends, strict=False)
+        self.ends.show(
+            [
+                (*nodes[node].tolist(), f"{name} {field.text(values.values[node])}", colour)
+                for name, colour, node in names
+            ]
+        )
+        missing = np.flatnonzero(values.status) if view.blank else ()
+        colours = palette("codes")
+        self.blank.show([(*self.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
+        probes = probe_marks(view.marks).items()
+        gauge = self._gauge
+        texts = {
+            name: probe_text(self.fields, field, values, marks[0].kind, probe_place(marks, gauge))
+            for name, marks in probes
+        }
+        self.marks.place(view.marks, self.result.nodes, nodes, texts, gauge)
+
+    @property
+    def _gauge(self) -> float:
+        """Length of the virtual strain gauges, px."""
+        return self.view.gauge or shortest_gauge(self.fields.physical.mesh)
 
     def _redraw(self) -> None:
         """Draw another part of the image."""
         wanted = self.canvas.wanted
         self.show(window=() if wanted == Canvas.around(self.result.nodes) else wanted)
 
-    @property
-    def _symmetric(self) -> bool:
-        return self.view.symmetric and self.fields.all[self.view.field].signed
-
-    def _ends(self, values: Values) -> tuple[float, float]:
+    def _ends(self, name: str, values: MapValues, *, by_hand: bool = True) -> tuple[float, float]:
         """Return the values of the first and the last colour."""
-        view, field = self.view, self.fields.all[self.view.field]
-        if view.range == "hand":
+        view, field = self.view, self.fields.all[name]
+        if view.range == "hand" and by_hand:
             return view.low, view.high
         if field.ends is not None:
             return field.ends
         if view.range == "test":
-            low, high = self._test_range(view.field, self._changes)
+            low, high = self._test_range(name, self._changes, self._chosen)
         else:
             low, high = robust_range(values) or (0.0, 1.0)
-        return (-max(abs(low), abs(high)), max(abs(low), abs(high))) if self._symmetric else (low, high)
+        even = view.symmetric and field.signed
+        return (-max(abs(low), abs(high)), max(abs(low), abs(high))) if even else (low, high)
 
-    def _nodes(self, values: Values) -> FloatArray:
+    def _nodes(self, values: MapValues) -> FloatArray:
         """Return the places (N, 2) at which the nodes are drawn."""
         return values.moved if self.view.over == "deformed" else self.result.nodes
 
@@ -220,8 +333,11 @@ class ResultPage:
         """Show the value under the pointer, of the field and the frame in view."""
         text = ""
         if self.values is not None and self._pointer is not None:
-            field, nodes = self.fields.all[self.view.field], self._nodes(self.values)
-            text = pointer_text(field, self.values, nodes, self.result.elements, *self._pointer)
+            nodes, elements = self._nodes(self.values), self.result.elements
+            text = " &nbsp; ".join(
+                pointer_text(self.fields.all[name], self._values(name), nodes, elements, *self._pointer)
+                for name in (self.view.field, *self._others)
+            )
         self.parts.under.text = text
 
     def _marked(self) -> None:
@@ -235,8 +351,9 @@ class ResultPage:
 
     def _read_curves(self) -> None:
         self.curves.colours = self.marks.colours
-        gauge = shortest_gauge(self.fields.physical.mesh)
-        self.curves.read(self.result, self.view.marks, gauge, lambda: self.curves.point(self.view.frame))
+        view = self.view
+        measure = view.measure if view.measure != MEASURES[0] else None
+        self.curves.read(self.result, view.marks, self._gauge, measure, lambda: self.curves.point(self.view.frame))
 
     def _save(self) -> None:
         if self.curves.reading:

@@ -39,6 +39,8 @@ _PALETTES = {
     "displacement": "viridis", "strain": "viridis", "positive": "plasma", "fraction": "cividis", "angle": "twilight",
     "codes": "codes",
 }  # fmt: skip
+_SIDES, _APART = ("#010203", "#ffffff"), 8
+"""Colours of what lies below and above 0, of which the first is no grey, and pixels from one hatch to the next."""
 _STATUS = ("#2c7fb8", "#bdbdbd", "#d95f0e", "#fec44f")
 """Measured, not seen, decorrelated, filled: distinct without distinguishing red from green."""
 
@@ -112,6 +114,8 @@ class Overlay:
         Opacity of the field, from 0 to 1.
     stepped
         Whether values between those of two nodes mean nothing.
+    beyond : ndarray, shape (N,), or None
+        What is hatched where it is below 0; None: nothing.
     """
 
     nodes: FloatArray
@@ -121,6 +125,7 @@ class Overlay:
     colours: tuple[str, ...]
     opacity: float = 1.0
     stepped: bool = False
+    beyond: FloatArray | None = None
 
 
 def paint(window: Window, picture: AnyArray, over: Overlay | None = None, around: int = 40) -> npt.NDArray[np.uint32]:
@@ -149,6 +154,11 @@ def paint(window: Window, picture: AnyArray, over: Overlay | None = None, around
     (x, y), grey_part = window.place(over.nodes), round(256 * (1 - over.opacity))
     packed = _packed(over.colours, grey_part)
     paint_field(out, grey, x, y, over.elements, over.values, *map(float, over.ends), packed, grey_part, over.stepped)
+    if over.beyond is not None:
+        below, lines = np.empty_like(out), sum(np.indices(out.shape)) % _APART < 2
+        reach = float(np.nanmax(np.abs(over.beyond), initial=0)) or 1.0
+        paint_field(below, grey, x, y, over.elements, over.beyond, -reach, reach, _packed(_SIDES, 0), 0, False)
+        out[lines & (below == _packed(_SIDES, 0)[0])] = 0xFF000000
     return out
 
 
@@ -185,12 +195,13 @@ def palette_name(kind: str, *, symmetric: bool) -> str:
 
 
 @cache
-def palette(name: str) -> tuple[str, ...]:
-    """Return the colours of a palette as ``"#rrggbb"``."""
+def palette(name: str, levels: int = _COLOURS) -> tuple[str, ...]:
+    """Return so many colours of a palette as ``"#rrggbb"``."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    return _STATUS if name == "codes" else tuple(map(to_hex, colormaps[name](np.linspace(0, 1, _COLOURS))))
+    places = np.linspace(0, 1, min(max(levels, 2), _COLOURS))
+    return _STATUS if name == "codes" else tuple(map(to_hex, colormaps[name](places)))
 
 
 def grey_picture(frame: Mosaic | ChannelFrame) -> Picture:

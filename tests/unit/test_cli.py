@@ -253,6 +253,27 @@ def test_run_tells_how_many_deformed_frames_failed(
         assert Result.open(test_file.parent / "out").finished.all()
 
 
+def test_figures_of_any_field(command: Run, tmp_path: Path) -> None:
+    result = make_result(tmp_path / "result", frames=2, record=smooth_record)
+    status, printed, _ = command(
+        "figures", result.path, "--field", "exx,magnitude", "--frames", "1", "--out", tmp_path / "maps", "--gauge", "70"
+    )
+    assert status == 0
+    assert [Path(line).name for line in printed.split()] == ["map_exx_000001.png", "map_magnitude_000001.png"]
+    for options, says in (
+        (("--field", "speed"), 'no field "speed"'),
+        (("--field", "exx", "--gauge", "9"), "at least 56.12 px"),
+        (("--field", "exx", "--measure", "small"), "allowed are green-lagrange"),
+        (("--field", "exx", "--since", "5"), "no frame 5"),
+        (("--field", "velocity"), "rates need 4 measured frames or more; there are 2"),
+        (("--gauge", "70"), "need a --field"),
+    ):
+        status, _, error = command("figures", result.path, "--out", tmp_path / "none", *options)
+        assert status == 2
+        assert says in error
+    assert not (tmp_path / "none").exists()
+
+
 def test_figures_later(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rgbmidic.report.gallery.save_figure", lambda _, path: path.touch())
     result = make_result(tmp_path / "result", frames=4)

@@ -17,8 +17,8 @@ from results import LIGHTS, MESH, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.report import figures, gallery, remove_figures, save_figure, style, write_figures
-from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
+from rgbmidic.report import figures, gallery, remove_figures, save_figure, style, write_figures, write_maps
+from rgbmidic.results import FrameRecord, Maps, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import AnyArray
 from rgbmidic.view.fields import Pictures
@@ -111,6 +111,28 @@ def test_every_map_shows_its_quantities_around_the_mesh(tmp_path: Path, kind: st
         (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
         assert left < 10 < 110 < right < 150
         assert top < 5 < 75 < bottom < 100
+
+
+def test_a_derived_field_has_its_uncertainty_beside_it_and_hatches_where_it_may_be_zero(
+    tmp_path: Path,
+) -> None:
+    still = {"u": 0.01 * (X - 60), "v": 0 * X, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.01)}
+    result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), **still)
+    maps, drawer = Maps.of(result, gauge=70.0, measure="engineering"), figures.MapDrawer(result)
+    figure, read = drawer.of_field(maps, "exx", 0, hatched=True), maps.read("exx", 0)
+    assert [axis.get_title() for axis in figure.axes] == ["εxx", "σ(εxx)"]
+    assert "Engineering, virtual strain gauge of 70 px" in figure.texts[0].get_text()
+    for axis, values in zip(figure.axes, (read.values, read.std), strict=True):
+        picture = axis.images[-1].get_array()
+        assert np.nanmin(picture) >= values.min() - 1e-9
+        assert np.nanmax(picture) == pytest.approx(values.max(), rel=0.02)
+    assert not figure.axes[0].collections[0].get_paths()[0].vertices.size, "a stretch of 10 standard uncertainties"
+    figure = drawer.of_field(maps, "eyy", 0, hatched=True)
+    assert figure.axes[0].collections[0].get_paths()[0].vertices.size
+    files = write_maps(maps, ["eyy", "node_status"], tmp_path / "maps", [0])
+    assert [file.name for file in files] == ["map_eyy_000000.png", "map_node_status_000000.png"]
+    remove_figures(tmp_path / "maps")
+    assert not [*(tmp_path / "maps").iterdir()]
 
 
 def test_blank_where_not_measured(tmp_path: Path) -> None:
