@@ -1,7 +1,7 @@
 """From a solution to what an engineer reads: the field at pixels and nodes, strain, rates, units, probes."""
 
 from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, Units, column, high_pass, rates
-from rgbmidic.fields.measures import EQUIVALENT, MEASURES, RigidMotion, Strain, strain_of_gradient
+from rgbmidic.fields.measures import EQUIVALENT, MEASURES, RigidMotion, Strain, length_of, strain_of_gradient
 from rgbmidic.fields.nodal import (
     NodalCovariance,
     Places,
@@ -43,6 +43,7 @@ __all__ = [
     "field_rms",
     "frame_covariance",
     "high_pass",
+    "length_of",
     "make_probe",
     "rates",
     "reference_fraction",

@@ -17,7 +17,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.typing import FloatArray
 
-__all__ = ["EQUIVALENT", "MEASURES", "RigidMotion", "Strain", "strain_of_gradient"]
+__all__ = ["EQUIVALENT", "MEASURES", "RigidMotion", "Strain", "length_of", "strain_of_gradient"]
 
 _Function = Callable[[FloatArray], FloatArray]
 _OF_STRETCH: dict[str, tuple[_Function, _Function]] = {
@@ -61,6 +61,8 @@ class Strain:
         `measure` is: ``ln`` of the stretch in a tensile test. Where the volume changes it is another number: in tension
         with a Poisson ratio of .3 it is 2.6 % too large. Being positive, it is more than 0 in noise alone, by about
         its uncertainty.
+    shear, shear_std : ndarray, shape (...)
+        Largest shear angle in the plane, ``e1 - e2``: engineering shear, twice the tensor's. Positive, see `length_of`.
     """
 
     measure: str
@@ -72,6 +74,32 @@ class Strain:
     direction_std_deg: FloatArray
     equivalent: FloatArray
     equivalent_std: FloatArray
+    shear: FloatArray
+    shear_std: FloatArray
+
+
+def length_of(parts: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Compute the length of vectors and its standard uncertainty: first order where long, else that of noise alone.
+
+    A length is positive: of nothing but noise it is as large as the noise, where the first order fails. By as much as
+    its square exceeds the noise's, the first order counts.
+
+    Parameters
+    ----------
+    parts : ndarray, shape (..., d)
+        Components of the vectors.
+    covariance : ndarray, shape (..., d, d)
+        Of the components.
+
+    Returns
+    -------
+    length, std : ndarray, shape (...)
+    """
+    square, noise = (parts**2).sum(axis=-1), np.einsum("...aa->...", covariance)
+    over = np.where(square > 0, square, 1.0)
+    first = np.einsum("...a,...ab,...b->...", parts, covariance, parts) / over
+    long = np.maximum(square - noise, 0) / over
+    return np.sqrt(square), np.sqrt(np.maximum(long * first + (1 - long) * noise, 0))
 
 
 def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: str = MEASURES[0]) -> Strain:
@@ -160,18 +188,22 @@ def _with_principal(
     c, s = vectors[:, 0, 0], vectors[:, 1, 0]
     along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
     turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
+    split = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0]])  # exx - eyy and 2 exy, whose length is e1 - e2
+    shear, shear_std = length_of(_components(tensor) @ split.T, split @ covariance @ split.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = principal[:, 0] - principal[:, 1]
         direction = np.degrees(_deviation(turn, covariance) / apart)
     parts = {
         "components": _components(tensor),
-        "components_std": np.sqrt(np.einsum("naa->na", covariance)),
+        "components_std": np.sqrt(np.maximum(np.einsum("naa->na", covariance), 0)),
         "principal": principal,
         "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
         "direction_deg": np.where(apart > 0, (angle + 90) % 180 - 90, np.nan),
         "direction_std_deg": np.minimum(direction, _LARGEST_ANGLE),
         "equivalent": equivalent[0],
         "equivalent_std": equivalent[1],
+        "shear": shear,
+        "shear_std": shear_std,
     }
     return Strain(measure=measure, **{name: part.reshape((*shape, *part.shape[1:])) for name, part in parts.items()})
 

@@ -4,6 +4,7 @@ from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
 from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
+from rgbmidic.results.maps import MapField, Maps, MapValues
 from rgbmidic.results.physical import (
     Channels,
     exposure,
@@ -28,6 +29,9 @@ __all__ = [
     "FrameRecord",
     "Histories",
     "HistoryColumn",
+    "MapField",
+    "MapValues",
+    "Maps",
     "Origin",
     "Result",
     "ResultQuantity",

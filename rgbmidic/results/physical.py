@@ -26,6 +26,7 @@ from rgbmidic.fields import (
     CameraCalibration,
     NodalCovariance,
     Rectification,
+    Strain,
     StrainGauges,
     Units,
     reference_fraction,
@@ -297,7 +298,12 @@ _STRAIN = (
     ResultQuantity("exy_std", _NODE, "", "components_std.2", "standard uncertainty of exy"),
     ResultQuantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane"),
     ResultQuantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane"),
+    ResultQuantity("e1_std", _NODE, "", "principal_std.0", "standard uncertainty of e1"),
+    ResultQuantity("e2_std", _NODE, "", "principal_std.1", "standard uncertainty of e2"),
     ResultQuantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y"),
+    ResultQuantity("direction_std", _NODE, "deg", "direction_std_deg", "standard uncertainty of direction"),
+    ResultQuantity("shear", _NODE, "", "shear", "largest shear in the plane, e1 - e2 (engineering shear)"),
+    ResultQuantity("shear_std", _NODE, "", "shear_std", "standard uncertainty of shear"),
     ResultQuantity("equivalent", _NODE, "", "equivalent", EQUIVALENT),
     ResultQuantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of equivalent"),
 )
@@ -325,6 +331,10 @@ class Physical:
         Of the frames: seconds where all are known and each is later than the one before, else places in the result.
     rectified
         Change to rectified px, where a camera is stated.
+    gauge
+        Length of the virtual strain gauges in (rectified) px; None: the shortest there are.
+    measure
+        Name of the strain measure, one of `MEASURES`.
     """
 
     result: Result
@@ -332,6 +342,8 @@ class Physical:
     units: Units
     times: FloatArray
     rectified: Rectification
+    gauge: float | None = None
+    measure: str = MEASURES[0]
 
     @classmethod
     def of(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
@@ -366,14 +378,14 @@ class Physical:
         return found
 
     @cached_property
-    def gauges(self) -> StrainGauges:
-        """Virtual strain gauges around the nodes, the shortest there are."""
-        return StrainGauges.at_nodes(NodalCovariance.from_mesh(self.mesh))
+    def covariance(self) -> NodalCovariance:
+        """Correlation of the nodes' errors."""
+        return NodalCovariance.from_mesh(self.mesh)
 
-    @property
-    def measure(self) -> str:
-        """Name of the strain measure."""
-        return MEASURES[0]
+    @cached_property
+    def gauges(self) -> StrainGauges:
+        """Virtual strain gauges around the nodes."""
+        return StrainGauges.at_nodes(self.covariance, self.gauge)
 
     @property
     def measure_name(self) -> str:
@@ -410,10 +422,14 @@ class Physical:
             values |= zip((component, f"{component}_std"), self.units.lengths(*pair), strict=True)
         values |= self.strain(u, v, u_std, v_std)
         gradient = self.mesh.element_gradient(np.stack([u, v], axis=1))
-        elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)))
+        elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
         return values | {entry.name: entry.of(elements) for entry in _ELEMENT_STRAIN}
 
     def strain(self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) -> dict[str, FloatArray]:
         """Return the strain at the nodes by name, from the displacements (N,) of one frame in rectified px."""
-        strain = self.gauges.strain(u, v, u_std, v_std)
+        return self.named(self.gauges.strain(u, v, u_std, v_std, measure=self.measure))
+
+    @staticmethod
+    def named(strain: Strain) -> dict[str, FloatArray]:
+        """Return the quantities of a strain by name."""
         return {entry.name: entry.of(strain) for entry in _STRAIN}

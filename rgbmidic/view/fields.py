@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,22 +18,19 @@ from rgbmidic.errors import RgbmidicError
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import spread
 from rgbmidic.report.style import colour_range, ordinary_values, time_text
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Result
-from rgbmidic.results.physical import Physical
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Result
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.picture import Picture, element_at, grey_picture
 
 __all__ = [
     "Background",
-    "Field",
-    "Fields",
     "Pictures",
-    "Values",
     "every",
     "frame_text",
     "guarded",
     "pointer_text",
+    "range_of_test",
     "robust_range",
     "warning",
     "watched",
@@ -43,184 +40,22 @@ T = TypeVar("T")
 
 logger = logging.getLogger(__name__)
 
-Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
-
-_MOVED = ("u", "v", "u_std", "v_std")
 _SPREAD = 24
 """Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second."""
-_ORDER = ("u", "v", "magnitude", "exx", "eyy", "exy", "e1", "e2", "direction", "equivalent")
-"""Fields that stand first."""
-_KINDS: dict[str, Kind] = {
-    "u": "displacement", "v": "displacement", "node_status": "codes", "direction": "angle", "misfit": "positive",
-    "equivalent": "positive",
-}  # fmt: skip
-"""Kinds of fields; uncertainties are positive, all others strains."""
 _KEPT = 8
 """Raw frames that are kept as pictures: those around the one in view."""
 _FAILED = QUANTITIES["status"].codes.index("failed")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Field:
-    """A nodal field that can be shown.
-
-    Attributes
-    ----------
-    name
-        As in the field table; a fraction is named by its light.
-    unit, meaning
-        As in the field table, lengths in the unit of the reader.
-    kind
-        Kind of the values, which sets colours and format.
-    codes
-        Meaning of each number, for a status.
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    kind: Kind
-    codes: tuple[str, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """Name and unit."""
-        return f"{self.name} ({self.unit})" if self.unit else self.name
-
-    @property
-    def signed(self) -> bool:
-        """Whether colours symmetric about 0 make sense."""
-        return self.kind in ("displacement", "strain")
-
-    @property
-    def stepped(self) -> bool:
-        """Whether values between those of two nodes mean nothing."""
-        return self.kind in ("angle", "codes")
-
-    @property
-    def ends(self) -> tuple[float, float] | None:
-        """Values of the first and last colour, where the kind of field sets them."""
-        fixed = {"codes": (-0.5, len(self.codes) - 0.5), "fraction": (0.0, 1.0), "angle": (-90.0, 90.0)}
-        return fixed.get(self.kind)
-
-    def text(self, value: float, std: float = float("nan")) -> str:
-        """Return a value with its standard uncertainty and unit as text."""
-        if not np.isfinite(value):
-            return "not measured"
-        if self.codes:
-            return self.codes[int(value)]
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{value:.5g}{unit}" if not np.isfinite(std) else f"{value:.5g} ± {std:.2g}{unit}"
+def range_of_test(maps: Maps, name: str) -> tuple[float, float]:
+    """Return the colour range of a field over the whole test, from frames evenly spread over those measured."""
+    there = np.flatnonzero(maps.result.finished).tolist()
+    ends = [robust_range(maps.read(name, frame)) for frame in (spread(there, _SPREAD) if there else ())]
+    measured = [pair for pair in ends if pair is not None]
+    return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Values:
-    """A field in one frame.
-
-    Attributes
-    ----------
-    values, std : ndarray, shape (N,)
-        In the unit of the field; NaN where not known.
-    moved : ndarray, shape (N, 2)
-        Deformed places of the nodes, px; NaN where not measured.
-    """
-
-    values: FloatArray
-    std: FloatArray
-    moved: FloatArray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Fields:
-    """The fields of a result.
-
-    Attributes
-    ----------
-    result
-        The result.
-    physical
-        The result in the units of its ``[scale]``.
-    """
-
-    result: Result
-    physical: Physical
-
-    @classmethod
-    def of(cls, result: Result) -> Self:
-        """Return the fields of a result."""
-        return cls(result=result, physical=Physical.untimed(result))
-
-    @cached_property
-    def all(self) -> dict[str, Field]:
-        """Every field by its name, displacements first."""
-        quantities, length = self.physical.quantities, self.physical.units.length
-        fields = [Field(name="magnitude", unit=length, meaning="length of the displacement", kind="positive")]
-        for name, entry in quantities.items():
-            if entry.axes == ("node",):
-                meaning = ", ".join(entry.codes) or entry.meaning
-                kind = _KINDS.get(name, "positive" if name.endswith("_std") else "strain")
-                fields.append(Field(name=name, unit=entry.unit, meaning=meaning, kind=kind, codes=entry.codes))
-        meaning = quantities["light_fraction"].meaning
-        names = [f"fraction of {light}" for light in self.result.lights]
-        fields += [Field(name=name, unit="", meaning=meaning, kind="fraction") for name in names]
-        fields.sort(key=lambda field: _ORDER.index(field.name) if field.name in _ORDER else len(_ORDER))
-        return {field.name: field for field in fields}
-
-    def read(self, name: str, frame: int) -> Values:
-        """Read a field in one frame.
-
-        Parameters
-        ----------
-        name
-            Name of the field, one of `all`.
-        frame
-            Index of the frame.
-
-        Returns
-        -------
-        Values
-            Its values.
-
-        Raises
-        ------
-        InputError, ResultError
-            As `Result.frame`.
-        """
-        more = {"fraction": ("light_fraction", "node_status")}.get(self.all[name].kind, ())
-        stored = (name,) if name in QUANTITIES and name not in _MOVED and not self.physical.is_strain(name) else ()
-        read = next(self.result.table.each([*_MOVED, *stored, *more], [frame]))
-        u, v, u_std, v_std = (np.asarray(read[part], dtype=np.float64) for part in _MOVED)
-        moved = self.result.nodes + np.stack([u, v], axis=1)
-        u, v, u_std, v_std = self.physical.rectified.displacement(u, v, u_std, v_std)
-        nothing = np.full(len(u), np.nan)
-        if name == "magnitude":
-            length = np.hypot(u, v)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                std = np.hypot(u * u_std, v * v_std) / length
-            std = np.where(length > 0, std, np.hypot(u_std, v_std))  # at 0 the first order fails: that of the parts
-            values, std = self.physical.units.lengths(length, std)
-        elif name in _MOVED:
-            values, std = self.physical.units.lengths(*((u, u_std) if name.startswith("u") else (v, v_std)))
-            values, std = (std, nothing) if name.endswith("_std") else (values, std)
-        elif self.physical.is_strain(name):
-            strain = self.physical.strain(u, v, u_std, v_std)
-            values, std = strain[name], strain.get(f"{name}_std", nothing)
-        elif more:
-            light = self.result.lights.index(name.removeprefix("fraction of "))
-            values, std = np.where(read["node_status"] == 0, read["light_fraction"][:, light], np.nan), nothing
-        else:
-            values, std = np.asarray(read[name], dtype=np.float64), nothing
-        return Values(values=np.ascontiguousarray(values, dtype=np.float64), std=std, moved=moved)
-
-    def range_of_test(self, name: str) -> tuple[float, float]:
-        """Return the colour range over the whole test, from frames evenly spread over those that are measured."""
-        there = np.flatnonzero(self.result.finished).tolist()
-        ends = [robust_range(self.read(name, frame)) for frame in (spread(there, _SPREAD) if there else ())]
-        measured = [pair for pair in ends if pair is not None]
-        return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
-
-
-def robust_range(read: Values) -> tuple[float, float] | None:
+def robust_range(read: MapValues) -> tuple[float, float] | None:
     """Return the colour range of one frame without doubtful nodes and outliers; None where nothing is measured."""
     ordinary = ordinary_values(read.values, read.std)
     return colour_range(ordinary) if ordinary.size else None
@@ -319,7 +154,7 @@ class Background:
         task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
 
 
-def frame_text(result: Result, place: int, field: Field, values: Values, remark: str) -> str:
+def frame_text(result: Result, place: int, field: MapField, values: MapValues, remark: str) -> str:
     """Describe what is in view, as HTML: the frame, how it ended, the field and a remark."""
     read = next(result.table.each(["status", "reason", "iterations", "node_status", "time_ns"], [place]))
     missing = float(np.mean(read["node_status"] != 0))
@@ -338,7 +173,7 @@ def frame_text(result: Result, place: int, field: Field, values: Values, remark:
 
 
 def pointer_text(
-    field: Field, values: Values, nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
+    field: MapField, values: MapValues, nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
 ) -> str:
     """Return the value at a place of the image, as HTML."""
     found = element_at(nodes, elements, x, y)

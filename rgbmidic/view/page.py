@@ -13,19 +13,18 @@ from bokeh.events import DocumentReady, MouseMove, Tap
 from bokeh.layouts import column, row
 
 from rgbmidic.fields.strain import shortest_gauge
-from rgbmidic.results import Result
+from rgbmidic.results import Maps, MapValues, Result
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import KINDS, OVER, ViewState
 from rgbmidic.view.canvas import Canvas, DirectionLayer
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, places
 from rgbmidic.view.fields import (
-    Fields,
     Pictures,
-    Values,
     every,
     frame_text,
     guarded,
     pointer_text,
+    range_of_test,
     robust_range,
     warning,
 )
@@ -59,11 +58,11 @@ class ResultPage:
 
     def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
         self.document, self.result, self.view = document, result, view
-        self.fields, self.pictures, self.progress = Fields.of(result), Pictures(result=result), progress
-        self.values: Values | None = None
+        self.fields, self.pictures, self.progress = Maps.of(result), Pictures(result=result), progress
+        self.values: MapValues | None = None
         self._pointer: tuple[float, float] | None = None
         self._read = lru_cache(1)(lambda name, frame, changes: self.fields.read(name, frame))
-        self._test_range = lru_cache(8)(lambda name, changes: self.fields.range_of_test(name))
+        self._test_range = lru_cache(8)(lambda name, changes: range_of_test(self.fields, name))
         self._changes = self._size = 0
         self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=self.dark)
@@ -194,7 +193,7 @@ class ResultPage:
     def _symmetric(self) -> bool:
         return self.view.symmetric and self.fields.all[self.view.field].signed
 
-    def _ends(self, values: Values) -> tuple[float, float]:
+    def _ends(self, values: MapValues) -> tuple[float, float]:
         """Return the values of the first and the last colour."""
         view, field = self.view, self.fields.all[self.view.field]
         if view.range == "hand":
@@ -207,7 +206,7 @@ class ResultPage:
             low, high = robust_range(values) or (0.0, 1.0)
         return (-max(abs(low), abs(high)), max(abs(low), abs(high))) if self._symmetric else (low, high)
 
-    def _nodes(self, values: Values) -> FloatArray:
+    def _nodes(self, values: MapValues) -> FloatArray:
         """Return the places (N, 2) at which the nodes are drawn."""
         return values.moved if self.view.over == "deformed" else self.result.nodes
 

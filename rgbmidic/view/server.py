@@ -28,11 +28,10 @@ from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler
 
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
-from rgbmidic.results import Result
+from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.view.address import ViewState
 from rgbmidic.view.curves import Progress
-from rgbmidic.view.fields import Fields
 from rgbmidic.view.models import page_file
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup_panel import Run
@@ -174,7 +173,7 @@ def _fill(path: Path, shared: dict[tuple[Path, str], Progress], document: Docume
     result = Result.open(path, partial=True, check=False)
     there = np.flatnonzero(result.finished)
     last = int(there[-1]) if len(there) else 0
-    names = list(Fields.of(result).all)
+    names = list(Maps.of(result).all)
     view = ViewState.from_query(_query(document), frames=len(result), names=names, frame=last)
     progress = shared.setdefault((path, result.provenance["created"]), Progress(len(result)))
     page = ResultPage(document, result, view, progress)

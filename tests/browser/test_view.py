@@ -10,10 +10,10 @@ import pytest
 from results import NODES, make_origin, make_result, smooth_record
 from viewer import MISSING, Page, chromium, click, serving
 
-from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories
 from rgbmidic.settings import ProbeSettings
-from rgbmidic.view.fields import Fields, robust_range
+from rgbmidic.view.fields import robust_range
 from rgbmidic.view.picture import element_at
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
@@ -59,7 +59,7 @@ def test_frames_are_scrubbed_and_the_address_holds_what_is_shown(driver, address
     page.do("model('quantity').value = 'v'")
     page.do("model('frame').value = 2")
     shown(page, 2)
-    low, high = robust_range(Fields.of(result).read("v", 2))
+    low, high = robust_range(Maps.of(result).read("v", 2))
     mapper = "model('colours')"
     page.until(f"{mapper}.low === {low!r} && {mapper}.high === {high!r}")
     held = parse_qs(urlsplit(driver.current_url).query)
@@ -89,7 +89,7 @@ def test_the_value_stays_that_of_what_is_shown(driver, address, result):
     page.until("model('under').text.includes('u = ')")
     page.do("model('mode').active = 1")
     page.pointer(("click", 90, 50))
-    fields = Fields.of(result)
+    fields = Maps.of(result)
 
     def check(frame, name):
         page.until(f"model('state').shown === {frame} && model('plot').title.text.startsWith({name + ' '!r})")

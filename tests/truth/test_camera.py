@@ -22,12 +22,11 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.fields import Rectification
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import write_report
-from rgbmidic.results import FrameRecord, Origin, Result, ResultStore, export_result
+from rgbmidic.results import FrameRecord, Maps, Origin, Result, ResultStore, export_result
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings, read_test
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.fields import Fields
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 
 BOX = (60.0, 60.0, 580.0, 420.0)
@@ -208,7 +207,7 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
     np.testing.assert_allclose(data.strain[1, :, 0], values["exx"], rtol=1e-5)
     assert data.u_mm.units == "mm"
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(data)).strain, data.strain)
-    viewed = Fields.of(result)
+    viewed = Maps.of(result)
     assert viewed.read("u", 1).values[node] == pytest.approx(u, abs=1e-6)
     np.testing.assert_allclose(viewed.read("exx", 1).values, values["exx"])
     np.testing.assert_allclose(viewed.read("u", 1).moved[node], now)

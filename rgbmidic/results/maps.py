@@ -1,0 +1,503 @@
+"""Maps: nodal fields of a result in a frame, measured or derived, each with its unit and standard uncertainty.
+
+Displacement and strain are those against the test's reference, or since a later frame (see `Maps.since`). Velocities,
+accelerations and strain rates are those of `rgbmidic.fields.rates` at every node, always against the test's reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import InputError
+from rgbmidic.fields import (
+    NodalCovariance,
+    RigidMotion,
+    Strain,
+    Units,
+    frame_covariance,
+    length_of,
+    rates,
+    strain_of_gradient,
+)
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.results.physical import Physical, frame_times, reference_frames, scale_of, shared_part
+from rgbmidic.results.quantities import UNKNOWN_TIME
+from rgbmidic.results.result import Result
+from rgbmidic.settings import ScaleSettings
+from rgbmidic.typing import BoolArray, FloatArray
+
+__all__ = ["WINDOW", "MapField", "MapValues", "Maps"]
+
+WINDOW = 9
+"""Frames that a parabola takes in for rates where none are stated. Chosen: the noise of a velocity is then .13 of that
+of a displacement per frame, and a change within 4 frames is still seen."""
+_FEWEST = 4
+"""Frames that a parabola with an uncertainty needs, as in `rgbmidic.fields.rates`."""
+_AROUND = 2
+"""Windows of frames that are read at once, and on either side of these: the widest fit takes in 5/3 of a window."""
+_AT_ONCE = 4096
+"""Nodes whose rates are computed at once: 25 MB of results at the default window."""
+_MOVED = ("u", "v", "u_std", "v_std")
+
+Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Derived:
+    """A field that follows from others: their length where there are two, the derivative by time of an order."""
+
+    symbol: str
+    group: str
+    meaning: str
+    parts: tuple[str, ...]
+    order: int = 0
+
+
+_UV = ("u", "v")
+_OF_LENGTHS = {
+    "u": _Derived("u", "Displacement", "displacement in x", ("u",)),
+    "v": _Derived("v", "Displacement", "displacement in y", ("v",)),
+    "magnitude": _Derived("|u|", "Displacement", "length of the displacement", _UV),
+    "u_velocity": _Derived("du/dt", "Rates", "velocity in x", ("u",), 1),
+    "v_velocity": _Derived("dv/dt", "Rates", "velocity in y", ("v",), 1),
+    "velocity": _Derived("|du/dt|", "Rates", "magnitude of the velocity", _UV, 1),
+    "u_acceleration": _Derived("d²u/dt²", "Rates", "acceleration in x", ("u",), 2),
+    "v_acceleration": _Derived("d²v/dt²", "Rates", "acceleration in y", ("v",), 2),
+    "acceleration": _Derived("|d²u/dt²|", "Rates", "magnitude of the acceleration", _UV, 2),
+}
+_OF_STRAINS = {
+    "exx_rate": _Derived("dεxx/dt", "Rates", "rate of the strain in x", ("exx",), 1),
+    "eyy_rate": _Derived("dεyy/dt", "Rates", "rate of the strain in y", ("eyy",), 1),
+    "exy_rate": _Derived("dεxy/dt", "Rates", "rate of the tensor shear", ("exy",), 1),
+    "equivalent_rate": _Derived("dεeq/dt", "Rates", "rate of the von Mises equivalent strain", ("equivalent",), 1),
+}
+_DERIVED = _OF_LENGTHS | _OF_STRAINS
+_SYMBOLS = {
+    "exx": "εxx", "eyy": "εyy", "exy": "εxy", "e1": "ε₁", "e2": "ε₂", "direction": "θ₁", "shear": "γmax",
+    "equivalent": "εeq",
+}  # fmt: skip
+_GROUPS = ("Displacement", "Strain", "Rates", "Quality", "Uncertainty")
+_POSITIVE = ("magnitude", "velocity", "acceleration", "equivalent", "shear", "misfit")
+_KINDS: dict[str, Kind] = {"direction": "angle", "node_status": "codes", **dict.fromkeys(_POSITIVE, "positive")}
+"""Kinds of fields; other lengths and their rates are displacements, uncertainties positive, all others strains."""
+_OTHERS: dict[bool, Kind] = {True: "displacement", False: "strain"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapField:
+    """A nodal field that can be shown.
+
+    Attributes
+    ----------
+    name
+        As in the field table; a fraction is named by its light, an uncertainty ends in ``_std``.
+    symbol
+        How formulas and pictures write it.
+    unit, meaning
+        As in the field table, lengths in the unit of the reader.
+    group
+        Heading under which it stands in lists.
+    kind
+        Kind of the values, which sets colours and format.
+    codes
+        Meaning of each number, for a status.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    meaning: str
+    group: str
+    kind: Kind
+    codes: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Name and unit."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+    @property
+    def signed(self) -> bool:
+        """Whether colours symmetric about 0 make sense."""
+        return self.kind in ("displacement", "strain")
+
+    @property
+    def stepped(self) -> bool:
+        """Whether values between those of two nodes mean nothing."""
+        return self.kind in ("angle", "codes")
+
+    @property
+    def ends(self) -> tuple[float, float] | None:
+        """Values of the first and last colour, where the kind of field sets them."""
+        fixed = {"codes": (-0.5, len(self.codes) - 0.5), "fraction": (0.0, 1.0), "angle": (-90.0, 90.0)}
+        return fixed.get(self.kind)
+
+    def text(self, value: float, std: float = float("nan")) -> str:
+        """Return a value with its standard uncertainty and unit as text."""
+        if not np.isfinite(value):
+            return "not measured"
+        if self.codes:
+            return self.codes[int(value)]
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{value:.5g}{unit}" if not np.isfinite(std) else f"{value:.5g} ± {std:.2g}{unit}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapValues:
+    """A field in one frame.
+
+    Attributes
+    ----------
+    values, std : ndarray, shape (N,)
+        In the unit of the field; NaN where not known.
+    moved : ndarray, shape (N, 2)
+        Deformed places of the nodes, px of the image; NaN where not measured.
+    status : ndarray, shape (N,), uint8
+        `node_status`.
+    """
+
+    values: FloatArray
+    std: FloatArray
+    moved: FloatArray
+    status: npt.NDArray[np.uint8]
+
+    @property
+    def doubtful(self) -> BoolArray:
+        """Mask of the nodes whose value lies within two standard uncertainties of 0, shape (N,)."""
+        return np.asarray(np.abs(self.values) < 2 * self.std)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Maps:
+    """The nodal fields of a result.
+
+    Attributes
+    ----------
+    result
+        The result.
+    physical
+        The result in the units of its ``[scale]``, with gauge length and measure of the strain.
+    since
+        Frame that displacement and strain are taken from, in place of the test's reference; None: that one. The
+        displacement since frame n of a material point is ``u_t - u_n``, its deformation gradient ``F_t F_n⁻¹``, in the
+        axes and lengths of frame n; fields stay on the nodes of the test's reference. The noise of the test's reference
+        is in both frames and cancels, as in `frame_covariance`; that of frame n counts, so that the uncertainty is
+        that of two frames.
+    rigid_removed
+        Whether shift and rotation of the field as a whole are removed from the displacement, and from the gradient of
+        the engineering strain; other strains do not depend on it.
+    window
+        Frames that a parabola takes in for rates, as ``probes.window``.
+    """
+
+    result: Result
+    physical: Physical
+    since: int | None = None
+    rigid_removed: bool = False
+    window: int = WINDOW
+
+    @classmethod
+    def of(
+        cls,
+        result: Result,
+        scale: ScaleSettings | None = None,
+        *,
+        gauge: float | None = None,
+        measure: str | None = None,
+        since: int | None = None,
+        rigid_removed: bool = False,
+        window: int | None = None,
+    ) -> Self:
+        """Choose how fields are derived.
+
+        Parameters
+        ----------
+        result
+            The result; a run may still add to it.
+        scale
+            It replaces the ``[scale]`` that was kept with the result; None: that one.
+        gauge
+            Length of the virtual strain gauge in px; None: the shortest, three elements.
+        measure
+            One of `rgbmidic.fields.MEASURES`; None: the first.
+        since, rigid_removed, window
+            See the class; the window is that of ``[probes]``, or 9 frames, where None is stated.
+
+        Raises
+        ------
+        InputError
+            There is no such frame or measure, the gauge is too short, or the window holds fewer than 4 frames.
+        """
+        if since is not None and not 0 <= since < len(result):
+            raise InputError(f"there is no frame {since} in a result of {len(result)} frames (0 to {len(result) - 1})")
+        window = window or int(result.setting("probes", "window", 0)) or WINDOW
+        if window < _FEWEST:
+            raise InputError(f"rates are taken over a window of {_FEWEST} frames or more, not {window}")
+        physical = Physical.untimed(result, scale)
+        physical = replace(physical, gauge=gauge, measure=measure or physical.measure)
+        strain_of_gradient(np.zeros((1, 2, 2)), np.zeros((1, 4, 4)), physical.measure)
+        if gauge is not None:
+            _ = physical.gauges
+        return cls(result=result, physical=physical, since=since, rigid_removed=rigid_removed, window=window)
+
+    @cached_property
+    def all(self) -> dict[str, MapField]:
+        """Every field by its name, displacements first; each that has an uncertainty is followed by it further down."""
+        units, quantities, found = self._units, self.physical.quantities, dict[str, MapField]()
+
+        def add(name: str, symbol: str, unit: str, meaning: str, group: str, codes: tuple[str, ...] = ()) -> None:
+            kind = _KINDS.get(name, "positive" if group == "Uncertainty" else _OTHERS[name in _OF_LENGTHS])
+            kind = "fraction" if name.startswith("fraction") else kind
+            found[name] = MapField(
+                name=name, symbol=symbol, unit=unit, meaning=meaning, group=group, kind=kind, codes=codes
+            )
+
+        for name, entry in _OF_LENGTHS.items():
+            unit = units.per_time(units.length, entry.order) if entry.order else units.length
+            add(name, entry.symbol, unit, entry.meaning, entry.group)
+        for name, symbol in _SYMBOLS.items():
+            add(name, symbol, quantities[name].unit, quantities[name].meaning, "Strain")
+        for name, entry in _OF_STRAINS.items():
+            add(name, entry.symbol, units.per_time("", entry.order), entry.meaning, entry.group)
+        uncertain = tuple(found.values())
+        spread = {f"{each.name}_std" for each in uncertain}
+        for name, quantity in quantities.items():
+            if quantity.axes == ("node",) and name not in (*found, *spread):
+                add(name, name, quantity.unit, ", ".join(quantity.codes) or quantity.meaning, "Quality", quantity.codes)
+        for light in self.result.lights:
+            add(name := f"fraction of {light}", name, "", quantities["light_fraction"].meaning, "Quality")
+        for each in uncertain:
+            meaning = f"standard uncertainty of {each.name}"
+            add(f"{each.name}_std", f"σ({each.symbol})", each.unit, meaning, "Uncertainty")
+        return {each.name: each for each in sorted(found.values(), key=lambda each: _GROUPS.index(each.group))}
+
+    def field(self, name: str) -> MapField:
+        """Return a field by its name; an `InputError` that lists all names where there is none."""
+        if name not in self.all:
+            raise InputError(f'there is no field "{name}"; the fields are {", ".join(self.all)}')
+        return self.all[name]
+
+    @property
+    def how(self) -> dict[str, str]:
+        """Describe how derived fields are made, for the texts beside them: strain, reference, rates."""
+        since = "" if self.since is None else f"since frame {self.since}"
+        moved = [*filter(None, [since, "rigid motion removed" if self.rigid_removed else ""])]
+        gauge = f"virtual strain gauge of {self.physical.in_units(self.physical.gauges.length)}"
+        return {
+            "Displacement": ", ".join(moved),
+            "Strain": ", ".join([self.physical.measure_name, gauge, *moved[: bool(since)]]),
+            "Rates": f"over {self.window} frames",
+        }
+
+    def read(self, name: str, frame: int) -> MapValues:
+        """Read a field in one frame.
+
+        Parameters
+        ----------
+        name
+            Name of the field, one of `all`.
+        frame
+            Index of the frame.
+
+        Returns
+        -------
+        MapValues
+            Its values, uncertainties and the places of the nodes.
+
+        Raises
+        ------
+        InputError
+            There is no such field or frame, or too few frames for rates.
+        ResultError
+            The frame is damaged, or does not fit the mesh.
+        """
+        kind = self.field(name).kind
+        if not 0 <= frame < len(self.result):
+            raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
+        base = name.removesuffix("_std")
+        derived = base in _DERIVED or base in _SYMBOLS
+        stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
+        read = next(self.result.table.each([*_MOVED, "node_status", *stored], [frame]))
+        nothing = np.full(len(self.result.nodes), np.nan)
+        if derived:
+            values, std = self._derived(base, frame)
+            values, std = (std, nothing) if base != name else (values, std)
+        elif kind == "fraction":
+            light = self.result.lights.index(name.removeprefix("fraction of "))
+            values, std = np.where(read["node_status"] == 0, read["light_fraction"][:, light], np.nan), nothing
+        else:
+            values, std = np.asarray(read[name], dtype=np.float64), nothing
+        return MapValues(
+            values=np.ascontiguousarray(values, dtype=np.float64),
+            std=np.asarray(std, dtype=np.float64),
+            moved=self.result.nodes + np.stack([read["u"], read["v"]], axis=1),
+            status=read["node_status"],
+        )
+
+    def _derived(self, name: str, frame: int) -> tuple[FloatArray, FloatArray]:
+        """Compute a field of `_DERIVED`, or a strain, and its uncertainty, each (N,)."""
+        entry = _DERIVED.get(name)
+        if entry is None:
+            return self._strain(frame)[name], self._strain(frame)[f"{name}_std"]
+        if entry.order:
+            parts = [self._rates(part, frame, entry.order) for part in entry.parts]
+        else:
+            moved = self.displacement(frame)
+            parts = [(moved[_UV.index(part)], moved[2 + _UV.index(part)]) for part in entry.parts]
+        values, std = parts[0]
+        if len(parts) > 1:
+            vector, error = (np.stack(each, axis=1) for each in zip(*parts, strict=True))
+            values, std = length_of(vector, error[:, :, None] ** 2 * np.eye(len(parts)))
+        return self._units.lengths(values, std) if name in _OF_LENGTHS else (values, std)
+
+    def displacement(self, frame: int) -> FloatArray:
+        """Return u, v and their standard uncertainties (4, N) in rectified px, since `since`, rigid motion removed."""
+        moved = self._since(frame)
+        motion = self._rigid(moved)
+        return moved if motion is None else motion.removed(self._covariance.mesh.nodes, moved)
+
+    def _measured(self, frame: int) -> FloatArray:
+        """Read u, v and their uncertainties (4, N) against the test's reference, in rectified px."""
+        read = next(self.result.table.each(_MOVED, [frame]))
+        return np.stack(self.physical.rectified.displacement(*(np.asarray(read[name], np.float64) for name in _MOVED)))
+
+    def _since(self, frame: int) -> FloatArray:
+        """Return u, v and their uncertainties (4, N) since the frame that is the reference here."""
+        moved = self._measured(frame)
+        if self.since is None:
+            return moved
+        first, factor = self._first, self._common(frame)
+        variance = moved[2:] ** 2 + first[2:] ** 2 - 2 * factor * np.minimum(moved[2:], first[2:]) ** 2
+        return np.concatenate([moved[:2] - first[:2], np.sqrt(np.maximum(variance, 0))])
+
+    @cached_property
+    def _first(self) -> FloatArray:
+        return self._measured(0 if self.since is None else self.since)
+
+    def _common(self, frame: int) -> float:
+        """Return the fraction of the smaller variance that a frame has in common with the one of `since`."""
+        if frame == self.since:
+            return 1.0
+        references = reference_frames(self.result)[[frame, self.since or 0]]
+        return float(frame_covariance(np.ones(2), shared_part(self.result), references)[0, 1])
+
+    @cached_property
+    def _covariance(self) -> NodalCovariance:
+        """Correlation of the nodes' errors, with the nodes where they are at the reference."""
+        if self.since is None:
+            return self.physical.covariance
+        mesh = self.physical.mesh
+        places = mesh.nodes + np.nan_to_num(self._first[:2].T)
+        return replace(self.physical.covariance, mesh=Tri3Mesh(nodes=places, elements=mesh.elements))
+
+    def _rigid(self, moved: FloatArray) -> RigidMotion | None:
+        """Fit the rigid motion that is removed; None where none is, or fewer than two nodes are measured."""
+        fits = self.rigid_removed and np.isfinite(moved).all(axis=0).sum() > 1
+        return RigidMotion.of(self._covariance, *moved) if fits else None
+
+    @cached_property
+    def _strain(self) -> Callable[[int], Mapping[str, FloatArray]]:
+        """Strain by name of a frame; of the last two it is kept, for several fields of one frame."""
+        return lru_cache(2)(lambda frame: Physical.named(self._strain_of(frame)))
+
+    def _strain_of(self, frame: int) -> Strain:
+        gauges, moved = self.physical.gauges, self._measured(frame)
+        if self.since is None:
+            gradient, covariance = gauges.gradient(*moved)
+        else:  # both gradients of the same nodes, which have data in both frames
+            both, factor = np.isfinite(moved + self._first).all(axis=0), self._common(frame)
+            now, first = np.where(both, moved, np.nan), np.where(both, self._first, np.nan)
+            smaller = np.sqrt(abs(factor)) * np.minimum(now[2:], first[2:])
+            shared = np.sign(factor) * gauges.gradient(*now[:2], *smaller)[1]
+            gradient, covariance = _composed(gauges.gradient(*now), gauges.gradient(*first), shared)
+        motion = self._rigid(self._since(frame))
+        if motion is not None:
+            c, s = np.cos(motion.rotation), np.sin(motion.rotation)
+            back = np.array([[c, s], [-s, c]])
+            wide = np.kron(back, np.eye(2))
+            gradient, covariance = back @ (np.eye(2) + gradient) - np.eye(2), wide @ covariance @ wide.T
+        return strain_of_gradient(gradient, covariance, self.physical.measure)
+
+    def _rates(self, name: str, frame: int, order: int) -> tuple[FloatArray, FloatArray]:
+        """Return the derivative of an order of a field against the test's reference, and its uncertainty."""
+        places = np.flatnonzero(self._there == frame)
+        if not len(places):  # not measured yet
+            return np.full(len(self.result.nodes), np.nan), np.full(len(self.result.nodes), np.nan)
+        block, row = divmod(int(places[0]), _AROUND * self.window)
+        values, std = self._block(name, block)[order - 1]
+        return values[row], std[row]
+
+    @cached_property
+    def _there(self) -> npt.NDArray[np.int64]:
+        return np.flatnonzero(self.result.finished)
+
+    @cached_property
+    def _units(self) -> Units:
+        """Units with that of time, for which one frame is read: `_clock` reads all."""
+        first = next(iter(self.result.each("time_ns", self._there[:1])), UNKNOWN_TIME)
+        scale = self.physical.scale or scale_of(self.result)
+        rate = scale.frame_rate or self.result.provenance.get("frame_rate")
+        return replace(self.physical.units, timed=bool(rate) or first != UNKNOWN_TIME)
+
+    @cached_property
+    def _clock(self) -> FloatArray:
+        """Times of the frames that are measured, or their numbers where no time is known."""
+        times = frame_times(self.result, self.physical.scale)
+        if times is None and self._units.timed:
+            raise InputError("rates need the times of all frames, of which some have none: state frame_rate in [scale]")
+        clock = self.result.number if times is None else times
+        return np.asarray(clock[self._there], dtype=np.float64)
+
+    @cached_property
+    def _block(self) -> Callable[[str, int], FloatArray]:
+        """Rates (2 orders, value and uncertainty, frames, N) of a block of frames; those used last are kept."""
+        return lru_cache(4)(self._rates_of)
+
+    def _rates_of(self, name: str, block: int) -> FloatArray:
+        """Compute rates of a field from the frames of a block and those around: the same whichever is asked for."""
+        if len(self._there) < _FEWEST:
+            raise InputError(f"rates need {_FEWEST} measured frames or more; there are {len(self._there)}")
+        size = _AROUND * self.window
+        inner = slice(block * size, min((block + 1) * size, len(self._there)))
+        outer = slice(max(inner.start - size, 0), inner.stop + size)
+        frames, clock = self._there[outer], self._clock[outer]
+        plain = replace(self, since=None, rigid_removed=False)
+        if name in _UV:
+            series = np.stack([self._measured(frame)[_UV.index(name) :: 2] for frame in frames.tolist()], axis=1)
+        else:
+            series = np.stack([np.stack(plain._derived(name, frame)) for frame in frames.tolist()], axis=1)
+        span = (min(self.window, len(self._there)) - 1) * float(np.median(np.diff(self._clock)))
+        common, references = shared_part(self.result), reference_frames(self.result)[frames]
+        mine = slice(inner.start - outer.start, inner.stop - outer.start)
+        found = np.empty((2, 2, inner.stop - inner.start, series.shape[2]))
+        for start in range(0, series.shape[2], _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            made = rates(clock, *series[..., part], window=span, common_fraction=common, references=references)
+            for order, quantity in enumerate(("velocity", "acceleration")):
+                found[order, 0, :, part] = getattr(made, quantity)[mine]
+                found[order, 1, :, part] = getattr(made, f"{quantity}_std")[mine]
+        return found
+
+
+def _composed(
+    now: tuple[FloatArray, FloatArray], first: tuple[FloatArray, FloatArray], shared: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Compute the displacement gradient from one state to another, ``F_now F_first⁻¹ - I``, and its covariance.
+
+    With ``A = I ⊗ F_first⁻ᵀ`` and ``B = (F_now F_first⁻¹) ⊗ F_first⁻ᵀ`` its change is ``A d(now) - B d(first)``, both
+    row by row; `shared` (G, 4, 4) is the covariance between both gradients.
+    """
+    inverse = np.linalg.inv(np.eye(2) + first[0])
+    whole = (np.eye(2) + now[0]) @ inverse
+    a = np.einsum("ij,glk->gikjl", np.eye(2), inverse).reshape(-1, 4, 4)
+    b = np.einsum("gij,glk->gikjl", whole, inverse).reshape(-1, 4, 4)
+    turned = [np.swapaxes(part, 1, 2) for part in (a, b)]
+    cross = a @ shared @ turned[1]
+    covariance = a @ now[1] @ turned[0] + b @ first[1] @ turned[1] - cross - np.swapaxes(cross, 1, 2)
+    return whole - np.eye(2), covariance
