@@ -326,6 +326,84 @@ def history(
     print(f"table: {out}   picture: {picture}")
 
 
+_DERIVED: dict[str, Any] = {
+    "gauge": Annotated[float | None, typer.Option("--gauge", metavar="PX", help="Virtual strain gauge length, px.")],
+    "measure": _PROBE_OPTIONS["measure"],
+    "since": Annotated[int | None, typer.Option("--since", metavar="N", help="Displacement and strain since frame N.")],
+    "rigid_removed": Annotated[bool, typer.Option("--rigid-removed", help="Remove the motion as a whole.")],
+    "window": Annotated[int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more.")],
+}
+"""Options that state how fields are derived, by the keys of `rgbmidic.results.Maps.of`."""
+_derived_options = command.gather("derived", _DERIVED, lambda options: options, rigid_removed=False)
+
+
+def _chosen_frames(result: Result, text: str) -> list[int] | None:
+    """The measured frames of a range that ``--frames`` states; None where it states none."""
+    from rgbmidic.settings import read_range
+
+    if not text:
+        return None
+    chosen = [frame for frame in read_range(text, "--frames") if frame < len(result) and result.finished[frame]]
+    if not chosen:
+        raise InputError(f"--frames {text}: none of them is measured; {result.path} has frames 0 to {len(result) - 1}")
+    return chosen
+
+
+@app.command()
+@_derived_options
+def movie(
+    folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    out: Annotated[Path, typer.Option("--out", help="File to write: .mp4, .webm or .gif.")],
+    derived: dict[str, Any],
+    field: Annotated[str, typer.Option("--field", help="Fields side by side, such as u,exx,velocity.")] = "u",
+    range_: Annotated[
+        str, typer.Option("--range", metavar="LOW:HIGH", help="Ends of the colour bars; else those of all frames.")
+    ] = "",
+    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 10:200; by default all.")] = "",
+    fps: Annotated[float, typer.Option("--fps", help="Frames per second of the movie.")] = 15.0,
+    over: Annotated[str, typer.Option("--over", help="reference, or frame: the raw frames, deformed.")] = "reference",
+    curve: Annotated[
+        Path | None, typer.Option("--curve", help="CSV of `rgbmidic history` or of channels: a curve with a cursor.")
+    ] = None,
+    column: Annotated[str | None, typer.Option("--column", help="Column of --curve; by default the first.")] = None,
+    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
+    colours: Annotated[str | None, typer.Option("--colours", help="matplotlib's name of the colours.")] = None,
+    opacity: Annotated[float, typer.Option("--opacity", help="Of the fields over the image, 0 to 1.")] = 1.0,
+    width: Annotated[int, typer.Option("--width", help="Of the movie, px.")] = 1280,
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
+    test: Reading = None,
+    overwrite: Overwrite = False,
+    partial: Partial = False,
+) -> None:
+    """Write a movie of one field or several side by side, over the reference image or the raw frames."""
+    from rgbmidic._kernels.threads import threads
+    from rgbmidic.report import Curve, write_movie
+    from rgbmidic.results import Maps, Result
+    from rgbmidic.view.picture import RawPictures
+
+    result, settings = Result.open(folder, partial=partial), _settings(test)
+    if over not in ("reference", "frame"):
+        raise InputError(f"--over is reference or frame, not {over!r}")
+    with _progress("movie") as progress:
+        write_movie(
+            Maps.of(result, None if settings is None else settings.scale, **derived),
+            out,
+            [name.strip() for name in field.split(",")],
+            frames=_chosen_frames(result, frames),
+            limits=None if not range_ else command.read_pair(range_, "--range"),
+            fps=fps,
+            images=RawPictures(result=result) if over == "frame" else None,
+            curve=None if curve is None else Curve.read(curve, column, offset),
+            colours=colours,
+            opacity=opacity,
+            width=width,
+            processes=workers or threads(),
+            overwrite=overwrite,
+            progress=progress,
+        )
+    print(out)
+
+
 @app.command()
 def scale(
     points: Annotated[str, typer.Argument(metavar="X0,Y0:X1,Y1", help="Two points of a known distance, px.")],

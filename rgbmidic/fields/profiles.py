@@ -352,9 +352,7 @@ class _Smooth:
         part = (level - curve[i]) / (curve[i + 1] - curve[i])
         return float(self.places[i] + part * (self.places[i + 1] - self.places[i]))
 
-    def arrival(
-        self, series: FloatArray, std: FloatArray, what: str, level: float
-    ) -> tuple[float, FloatArray] | None:
+    def arrival(self, series: FloatArray, std: FloatArray, what: str, level: float) -> tuple[float, FloatArray] | None:
         """Return the arrival time in a series (T,), and its change (T,) by every value; None where nothing arrives."""
         known = np.isfinite(std)
         operator = self.operator(known)

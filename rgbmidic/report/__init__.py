@@ -13,12 +13,15 @@ from rgbmidic.report.figures import (
     residual_figure,
 )
 from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures
+from rgbmidic.report.movie import MOVIES, Curve, write_movie
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [
     "MAPS",
+    "MOVIES",
     "REPORT",
     "STYLE",
+    "Curve",
     "Page",
     "brightness_figure",
     "convergence_figure",
@@ -33,5 +36,6 @@ __all__ = [
     "residual_figure",
     "save_figure",
     "write_figures",
+    "write_movie",
     "write_report",
 ]
