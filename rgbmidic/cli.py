@@ -405,6 +405,50 @@ def movie(
 
 
 @app.command()
+@_derived_options
+def profile(
+    folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    line: Annotated[str, typer.Option("--line", metavar="X0,Y0:X1,Y1", help="Ends of the line on the reference, px.")],
+    out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
+    derived: dict[str, Any],
+    field: Annotated[str, typer.Option("--field", help="One field, such as exx, u or u_velocity.")] = "u",
+    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 10:200; by default all.")] = "",
+    curves: Annotated[str, typer.Option("--curves", help="Frames drawn as curves, such as 10,20,30.")] = "",
+    speed: Annotated[
+        str, typer.Option("--speed", metavar="WHAT", help="Fit the speed of the front, or of the peak.")
+    ] = "",
+    level: Annotated[float, typer.Option("--level", help="Fraction of the peak at which the front is taken.")] = 0.5,
+    test: Reading = None,
+    overwrite: Overwrite = False,
+    partial: Partial = False,
+) -> None:
+    """A field along a line in every frame: table, position-time picture, curves, and the speed of a front or peak."""
+    from rgbmidic.report import profile_figure, save_figure, wave_text
+    from rgbmidic.results import Maps, Result, read_profile, write_profile
+    from rgbmidic.results.files import check_file
+    from rgbmidic.results.histories import arrivals_file
+
+    picture, place = out.with_suffix(".png"), command.read_place(line, "--line", "X0,Y0:X1,Y1")
+    for file in (out, picture, *([arrivals_file(out)] if speed else [])):
+        check_file(file, overwrite=overwrite)
+    result, settings = Result.open(folder, partial=partial), _settings(test)
+    maps = Maps.of(result, None if settings is None else settings.scale, **derived)
+    read = read_profile(maps, field, place, _chosen_frames(result, frames))
+    rows = [list(read.frames).index(frame) for frame in _frames(curves) or [] if frame in read.frames]
+    wave = read.wave(speed, level) if speed else None
+    write_profile(read, out, wave, overwrite=overwrite)
+    save_figure(profile_figure(read, wave, rows), picture)
+    if wave is not None:
+        print(f"{wave_text(read, wave)}; arrival times: {arrivals_file(out)}")
+        if not wave.front.straight:
+            _note(
+                "note: the arrival times do not lie on a line within their uncertainty: the wave changes its speed or "
+                "form, or the mesh does not follow it; the uncertainty of the speed includes that scatter"
+            )
+    print(f"table: {out}   picture: {picture}")
+
+
+@app.command()
 def scale(
     points: Annotated[str, typer.Argument(metavar="X0,Y0:X1,Y1", help="Two points of a known distance, px.")],
     length: Annotated[float, typer.Option("--length", metavar="MM", help="Their distance in mm.")],

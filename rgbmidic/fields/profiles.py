@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -34,7 +35,7 @@ _LEAST = 0.5
 """Least part of a line that must be inside the region: the larger part represents the whole, as of a probe's."""
 _STEP = 0.382
 """Distance of the points along a line in elements, the golden section: the positions of a fit then lie anywhere between
-the nodes, and what interpolation leaves out shows in its chi-square. Half an element gave 3.4 times the stated error."""
+the nodes, and what interpolation leaves out shows in its chi-square. With half an element errors were 3.4 times stated."""
 _AROUND = 4.0
 """Elements around a line whose nodes are read: the quadratic at a node is fitted to those within two edges of it."""
 _LOPSIDED = 0.1
@@ -51,7 +52,7 @@ _RISE = (0.2, 0.8)
 """Fractions of the peak between which a front rises, by which the smoothing is chosen: nearly straight for a half sine
 and for an error function."""
 _PEAK = 2.0
-"""Rises that the smoothing of a peak is wide: narrower, noise of a twentieth of the peak moves it to another maximum."""
+"""Rises that the smoothing of a peak is wide: with 1, noise of 5 % of the peak moves it to another maximum."""
 _ABRUPT = 1.5
 """Frames: within a shorter rise the frames do not resolve when the front arrives between two of them."""
 _INDEPENDENT = 0.5
@@ -173,7 +174,7 @@ class ProfileLine:
     def _weights(self, measured: BoolArray) -> FloatArray:
         """Return the weight (P, n) of every node at each point; NaN outside the mesh and beside missing nodes."""
         mesh, places = self.places.mesh, self.places
-        used = measured[mesh.elements].all(axis=1)
+        used = np.asarray(measured[mesh.elements].all(axis=1))
         value, *slopes = (operator.toarray() for operator in quadratic_fit(mesh, used))
         value, total = np.eye(len(value)), np.zeros((len(self.points), len(value)))
         for node, shape in zip(mesh.elements[places.element].T, places.barycentric.T, strict=True):
@@ -186,7 +187,7 @@ class ProfileLine:
 
 def _unit(covariance: Any) -> FloatArray:
     """Return the correlation of a covariance matrix, sparse or not; 0 where a variance is."""
-    whole = np.asarray(covariance.toarray() if sp.issparse(covariance) else covariance)
+    whole = np.asarray(covariance.toarray() if hasattr(covariance, "toarray") else covariance)
     scale = np.sqrt(np.maximum(np.nan_to_num(np.diag(whole)), 0))
     scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
     return np.asarray(np.nan_to_num(whole) * scale * scale[:, None])
@@ -314,7 +315,7 @@ class _Smooth:
 
     def __init__(self, times: FloatArray, half: float) -> None:
         self.times, self.half = times, half
-        steps = [np.linspace(a, b, _FINE, endpoint=False) for a, b in zip(times[:-1], times[1:], strict=True)]
+        steps = [np.linspace(a, b, _FINE, endpoint=False) for a, b in pairwise(times)]
         self.places = np.append(np.concatenate(steps), times[-1])
         self._kept: dict[bytes, sp.csr_matrix] = {}
 

@@ -1,6 +1,6 @@
 """Figures, reports and pages of text and pictures of a result."""
 
-from rgbmidic.report.curves import history_figure
+from rgbmidic.report.curves import history_figure, profile_figure, wave_text
 from rgbmidic.report.document import Page, write_report
 from rgbmidic.report.figures import (
     MAPS,
@@ -30,11 +30,13 @@ __all__ = [
     "history_figure",
     "map_figure",
     "mask_figure",
+    "profile_figure",
     "reflection_figure",
     "remove_figures",
     "remove_report",
     "residual_figure",
     "save_figure",
+    "wave_text",
     "write_figures",
     "write_movie",
     "write_report",

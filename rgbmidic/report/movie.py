@@ -12,7 +12,7 @@ import signal
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -46,10 +46,8 @@ _FEW = 100
 _AROUND = 235
 """Grey level outside the image, as in the viewer's light page."""
 _ENCODERS = {
-    ".mp4": ("-c:v", "libx264", "-preset", "fast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
-    + ("-f", "mp4"),
-    ".webm": ("-c:v", "libvpx-vp9", "-crf", "28", "-b:v", "0", "-deadline", "realtime", "-cpu-used", "5")
-    + ("-row-mt", "1", "-pix_fmt", "yuv420p", "-f", "webm"),
+    ".mp4": "-c:v libx264 -preset fast -crf 18 -pix_fmt yuv420p -movflags +faststart -f mp4",
+    ".webm": "-c:v libvpx-vp9 -crf 28 -b:v 0 -deadline realtime -cpu-used 5 -row-mt 1 -pix_fmt yuv420p -f webm",
 }
 """Quality at which text of 9 points keeps its edges; both need an even number of rows and columns."""
 MOVIES = (*_ENCODERS, ".gif")
@@ -207,7 +205,7 @@ def write_movie(
                 progress(done, len(chosen), "")
 
     if exe:
-        write_complete(out, lambda file: _video(file, pages(), fps, [exe, *_ENCODERS[out.suffix.lower()]]))
+        write_complete(out, lambda file: _video(file, pages(), fps, [exe, *_ENCODERS[out.suffix.lower()].split()]))
     else:
         canvas = drawer.opened()
         samples = [*canvas.mixtures(), *(canvas.page(frame) for frame in spread(chosen, 3))]
@@ -323,7 +321,7 @@ class _Canvas:
         aspect = (bottom - top) / (right - left)
         self.figure = style.draw_figure(draw, count=count, aspect=aspect, beside=style.BAR, title=" ")
         self.figure.set_dpi(drawer.width / self.figure.get_figwidth())
-        self._canvas: Any = FigureCanvasAgg(self.figure)
+        self._canvas: Any = FigureCanvasAgg(self.figure)  # type: ignore[no-untyped-call]
         self._title = self.figure.texts[0]
         self._title.set_visible(False)
         self._canvas.draw()
@@ -355,7 +353,7 @@ class _Canvas:
         axis.set_title(style.literal(curve.name))
         style.finish_plot(axis, label, "", whole=not curve.timed)
         self._factor = style.time_unit(curve.times)[0] if curve.timed else 1.0
-        (self._cursor,) = axis.plot([], [], color=style.OKABE_ITO["vermillion"], linewidth=1.2, animated=True)
+        (self._cursor,) = axis.plot([], [], color="k", linewidth=1.0, animated=True)
 
     def _resampled(self, image: AnyArray, origin: tuple[int, int] = (0, 0)) -> npt.NDArray[np.uint8]:
         """Resample an image, which begins at `origin`, in the first panel; all have its size."""
@@ -364,7 +362,7 @@ class _Canvas:
         rows, columns, _ = self._boxes[0]
         (step, left), (_, top) = self._steps()
         factor = max(1, int(step))
-        small = np.asarray(image, dtype=np.uint8)
+        small: AnyArray = np.asarray(image, dtype=np.uint8)
         if factor > 1:  # reduced by a whole factor first, against moiré
             height, width = (size // factor * factor for size in small.shape)
             size = (width // factor, height // factor)
@@ -481,9 +479,9 @@ def _video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str]
     assert process.stderr is not None
     try:
         with suppress(BrokenPipeError):  # it says why on stderr
-            process.stdin.write(memoryview(first).cast("B"))
+            process.stdin.write(first.tobytes())
             for page in pages:
-                process.stdin.write(memoryview(page).cast("B"))
+                process.stdin.write(page.tobytes())
             process.stdin.close()
         said = process.stderr.read().decode(errors="replace").strip()
         if process.wait() != 0:
