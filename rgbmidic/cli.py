@@ -149,6 +149,64 @@ def run(
 
 
 @app.command()
+def batch(
+    tests: Annotated[
+        list[Path], typer.Argument(metavar="TEST.toml...", help="Settings of the tests; one with --table.")
+    ],
+    out: Out,
+    table: Annotated[
+        Path | None, typer.Option("--table", help="CSV: a column test, and keys of TEST.toml that its values replace.")
+    ] = None,
+    channels: Annotated[
+        Path | None, typer.Option("--channels", help="CSV beside each TEST.toml: time_s, then a column each.")
+    ] = None,
+    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
+    area: Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")] = None,
+    force: Annotated[str | None, typer.Option("--force", help="Channel with the force (_N or _kN).")] = None,
+    elastic: Annotated[
+        str, typer.Option("--elastic", metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
+    ] = "0.0005:0.0025",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
+    reports: Annotated[bool, typer.Option("--reports/--no-reports", help="Write a report of each test.")] = True,
+) -> None:
+    """Measure a series of tests, each into DIR/NAME, with one summary table and page.
+
+    A test that fails does not stop the rest; one that is measured already with the same settings is not measured again.
+    """
+    from rgbmidic.pipeline import batch as series
+    from rgbmidic.report import REPORT, write_batch_page, write_report
+    from rgbmidic.results.files import writing
+
+    readings = series.Readings(channels=channels, offset=offset, area=area, force=force)
+    if table is not None and len(tests) != 1:
+        raise InputError(f"--table goes with one TEST.toml, the template, not with {len(tests)}")
+    chosen = series.read_tests(tests, readings) if table is None else series.read_table(tests[0], table, readings)
+    limits = command.read_pair(elastic, "--elastic")
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+
+    def conclude(result: Result, settings: TestSettings, measured: bool) -> None:
+        if reports and (measured or not (result.path / REPORT).is_file()):
+            write_report(result, result.path / REPORT, settings=settings, overwrite=True)
+
+    _explain_first_run()
+    outcomes = []
+    with _progress("batch") as progress:
+        for outcome in series.run_batch(
+            chosen, out, workers=workers or None, elastic=limits, conclude=conclude, progress=lambda name: progress
+        ):
+            outcomes.append(outcome)
+            series.write_summary(outcomes, out / "summary.csv")
+            write_batch_page(*series.summary_rows(outcomes), out / "summary.html")
+            _note(f"{outcome.name}: {outcome.reason or ('measured' if outcome.measured else 'measured before')}")
+    print(f"table: {out / 'summary.csv'}   page: {out / 'summary.html'}")
+    if failed := [outcome.name for outcome in outcomes if outcome.reason]:
+        raise typer.Exit(
+            command.fail(f"{len(failed)} of {len(outcomes)} tests failed: {', '.join(failed)}", command.FAILURE)
+        )
+
+
+@app.command()
 def finish(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that runs with --frames have filled.")],
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,

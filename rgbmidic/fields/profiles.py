@@ -35,7 +35,7 @@ _LEAST = 0.5
 """Least part of a line that must be inside the region: the larger part represents the whole, as of a probe's."""
 _STEP = 0.382
 """Distance of the points along a line in elements, the golden section: the positions of a fit then lie anywhere between
-the nodes, and what interpolation leaves out shows in its chi-square. With half an element errors were 3.4 times stated."""
+the nodes, and what interpolation leaves out shows in its chi-square. With half an element it was 3.4 times that."""
 _AROUND = 4.0
 """Elements around a line whose nodes are read: the quadratic at a node is fitted to those within two edges of it."""
 _LOPSIDED = 0.1

@@ -1,7 +1,7 @@
 """Figures, reports and pages of text and pictures of a result."""
 
 from rgbmidic.report.curves import history_figure, profile_figure, wave_text
-from rgbmidic.report.document import Page, write_report
+from rgbmidic.report.document import Page, write_batch_page, write_report
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -37,6 +37,7 @@ __all__ = [
     "residual_figure",
     "save_figure",
     "wave_text",
+    "write_batch_page",
     "write_figures",
     "write_movie",
     "write_report",

@@ -175,7 +175,7 @@ def profile_figure(profile: Profile, wave: Wave | None = None, shown: Sequence[i
         above, below = axes
         known = ordinary_values(profile.values, profile.std)
         low, high = profile.field.ends or colour_range(known)
-        shape = {"cmap": colours, "vmin": low, "vmax": high, "rasterized": True, "shading": "nearest"}
+        shape: dict[str, Any] = {"cmap": colours, "vmin": low, "vmax": high, "rasterized": True, "shading": "nearest"}
         above.pcolormesh(times, profile.positions, profile.values.T, **shape)
         add_colour_bar(above, Normalize(low, high), colours, beyond=(bool(known.min() < low), bool(known.max() > high)))
         if wave is not None:
@@ -190,6 +190,7 @@ def profile_figure(profile: Profile, wave: Wave | None = None, shown: Sequence[i
         else:
             above.set_title(literal(profile.field.label))
         finish_plot(above, label_of_times, position, whole=profile.times is None)
+        above.grid(visible=False)
         for row, shade in zip(rows, np.linspace(0, 0.85, len(rows)), strict=True):
             look: dict[str, Any] = {"color": colormaps["plasma"](shade), "linewidth": 1.1}
             name = (

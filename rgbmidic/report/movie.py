@@ -321,12 +321,13 @@ class _Canvas:
         aspect = (bottom - top) / (right - left)
         self.figure = style.draw_figure(draw, count=count, aspect=aspect, beside=style.BAR, title=" ")
         self.figure.set_dpi(drawer.width / self.figure.get_figwidth())
-        self._canvas: Any = FigureCanvasAgg(self.figure)  # type: ignore[no-untyped-call]
+        canvas: Any = FigureCanvasAgg(self.figure)
+        self._canvas = canvas
         self._title = self.figure.texts[0]
         self._title.set_visible(False)
-        self._canvas.draw()
+        canvas.draw()
         self._title.set_visible(True)
-        self._bare = self._canvas.copy_from_bbox(self.figure.bbox)
+        self._bare = canvas.copy_from_bbox(self.figure.bbox)
         self._boxes = []
         for axis in self.figure.axes[: len(drawer.fields)]:
             box = axis.get_window_extent()  # from the bottom of the page

@@ -11,7 +11,7 @@ import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -426,7 +426,10 @@ class Profile:
         """
         clock = self.clock
         between = rate_correlation(clock, self.rate_window) if self.rate_window else None
-        more = {"common_fraction": 0.0 if self.rate_window else self.common_fraction, "between_frames": between}
+        more: dict[str, Any] = {
+            "common_fraction": 0.0 if self.rate_window else self.common_fraction,
+            "between_frames": between,
+        }
         arrivals = arrival_times(clock, self.values, self.std, what=what, level=level, **more)
         correlation = self.line.correlation(self.kind)
         front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.even, **more)
