@@ -182,6 +182,8 @@ def batch(
         raise InputError(f"--table goes with one TEST.toml, the template, not with {len(tests)}")
     chosen = series.read_tests(tests, readings) if table is None else series.read_table(tests[0], table, readings)
     limits = command.read_pair(elastic, "--elastic")
+    if not 0 <= limits[0] < limits[1]:
+        raise InputError(f"--elastic is a smaller and a larger strain, not {elastic}")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.errors import InputError, ResultError, RgbmidicError
+from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
 from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Channels, Histories, Maps, Result, shared_part
 from rgbmidic.results.files import write_complete
@@ -159,6 +159,8 @@ def read_table(template: Path, table: Path, readings: Readings) -> list[BatchTes
         The template is missing or no TOML.
     """
     document = read_toml(template, "settings file")
+    if readings.channels is not None:
+        readings = replace(readings, channels=template.parent / readings.channels)
     try:
         rows = [row for row in csv.reader(io.StringIO(regular(table).read_text(encoding="utf-8-sig"))) if any(row)]
     except (OSError, ValueError, csv.Error) as error:
@@ -285,10 +287,8 @@ def _outcome(
     there = is_result(folder)
     try:
         result = measure(settings, folder, resume=there, workers=workers, progress=count)
-    except ResultError as error:
-        if not there:
-            raise
-        logger.warning("%s is measured again: %s", test.name, error)
+    except AnotherTestError as error:
+        logger.warning("%s is measured again: %s", test.name, str(error).rpartition("; ")[0])
         result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
     if conclude is not None:
         conclude(result, settings, moved)

@@ -382,12 +382,12 @@ def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path:
     page = Page("Tests of a batch")
     failed = [(row[0], row[2]) for row in rows if row[1] == "failed"]
     page.text(f"{len([row for row in rows if row[1]])} tests, {len(failed)} failed; written by rgbmidic {__version__}.")
-    table = []
-    for name, state, _, folder, *values in rows:
+    names = []
+    for name, _, _, folder, *_ in rows:
         report = Path(folder) / REPORT
         link = report.relative_to(path.parent).as_posix() if folder and report.is_file() else ""
-        table.append([f"[{name}]({quote(link)})" if link else name, state, *values])
-    page.table([header[0], header[1], *header[4:]], table)
+        names.append(f"[{name}]({quote(link)})" if link else name)
+    page.table(["", *names], [[header[place], *(row[place] for row in rows)] for place in (1, *range(4, len(header)))])
     if failed:
         page.heading("Failed")
         page.bullets([f"{name}: {reason}" for name, reason in failed])
