@@ -175,6 +175,66 @@ def run(
 
 
 @app.command()
+def batch(
+    tests: Annotated[
+        list[Path], typer.Argument(metavar="TEST.toml...", help="Settings of the tests; one with --table.")
+    ],
+    out: Out,
+    table: Annotated[
+        Path | None, typer.Option("--table", help="CSV: a column test, and keys of TEST.toml that its values replace.")
+    ] = None,
+    channels: Annotated[
+        Path | None, typer.Option("--channels", help="CSV beside each TEST.toml: time_s, then a column each.")
+    ] = None,
+    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
+    area: Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")] = None,
+    force: Annotated[str | None, typer.Option("--force", help="Channel with the force (_N or _kN).")] = None,
+    elastic: Annotated[
+        str, typer.Option("--elastic", metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
+    ] = "0.0005:0.0025",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
+    reports: Annotated[bool, typer.Option("--reports/--no-reports", help="Write a report of each test.")] = True,
+) -> None:
+    """Measure a series of tests, each into DIR/NAME, with one summary table and page.
+
+    A test that fails does not stop the rest; one that is measured already with the same settings is not measured again.
+    """
+    from rgbmidic.pipeline import batch as series
+    from rgbmidic.report import REPORT, write_batch_page, write_report
+    from rgbmidic.results.files import writing
+
+    readings = series.Readings(channels=channels, offset=offset, area=area, force=force)
+    if table is not None and len(tests) != 1:
+        raise InputError(f"--table goes with one TEST.toml, the template, not with {len(tests)}")
+    chosen = series.read_tests(tests, readings) if table is None else series.read_table(tests[0], table, readings)
+    limits = command.read_pair(elastic, "--elastic")
+    if not 0 <= limits[0] < limits[1]:
+        raise InputError(f"--elastic is a smaller and a larger strain, not {elastic}")
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+
+    def conclude(result: Result, settings: TestSettings, measured: bool) -> None:
+        if reports and (measured or not (result.path / REPORT).is_file()):
+            write_report(result, result.path / REPORT, settings=settings, overwrite=True)
+
+    _explain_first_run()
+    outcomes = []
+    with _progress("batch") as progress:
+        for outcome in series.run_batch(
+            chosen, out, workers=workers or None, elastic=limits, conclude=conclude, progress=lambda name: progress
+        ):
+            outcomes.append(outcome)
+            series.write_summary(outcomes, out / "summary.csv")
+            write_batch_page(*series.summary_rows(outcomes), out / "summary.html")
+            _note(f"{outcome.name}: {outcome.reason or ('measured' if outcome.measured else 'measured before')}")
+    print(f"table: {out / 'summary.csv'}   page: {out / 'summary.html'}")
+    if failed := [outcome.name for outcome in outcomes if outcome.reason]:
+        raise typer.Exit(
+            command.fail(f"{len(failed)} of {len(outcomes)} tests failed: {', '.join(failed)}", command.FAILURE)
+        )
+
+
+@app.command()
 def finish(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that runs with --frames have filled.")],
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
@@ -372,6 +432,128 @@ def history(
     for remark in histories.remarks:
         _note(f"note: {remark}")
     _print_table(f"{len(histories.frames)} frames", *history_rows(histories))
+    print(f"table: {out}   picture: {picture}")
+
+
+_DERIVED: dict[str, Any] = {
+    "gauge": Annotated[float | None, typer.Option("--gauge", metavar="PX", help="Virtual strain gauge length, px.")],
+    "measure": _PROBE_OPTIONS["measure"],
+    "since": Annotated[int | None, typer.Option("--since", metavar="N", help="Displacement and strain since frame N.")],
+    "rigid_removed": Annotated[bool, typer.Option("--rigid-removed", help="Remove the motion as a whole.")],
+    "window": Annotated[int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more.")],
+}
+"""Options that state how fields are derived, by the keys of `rgbmidic.results.Maps.of`."""
+_derived_options = command.gather("derived", _DERIVED, lambda options: options, rigid_removed=False)
+
+
+def _chosen_frames(result: Result, text: str) -> list[int] | None:
+    """The measured frames of a range that ``--frames`` states; None where it states none."""
+    from rgbmidic.settings import read_range
+
+    if not text:
+        return None
+    chosen = [frame for frame in read_range(text, "--frames") if frame < len(result) and result.finished[frame]]
+    if not chosen:
+        raise InputError(f"--frames {text}: none of them is measured; {result.path} has frames 0 to {len(result) - 1}")
+    return chosen
+
+
+@app.command()
+@_derived_options
+def movie(
+    folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    out: Annotated[Path, typer.Option("--out", help="File to write: .mp4, .webm or .gif.")],
+    derived: dict[str, Any],
+    field: Annotated[str, typer.Option("--field", help="Fields side by side, such as u,exx,velocity.")] = "u",
+    range_: Annotated[
+        str, typer.Option("--range", metavar="LOW:HIGH", help="Ends of the colour bars; else those of all frames.")
+    ] = "",
+    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 10:200; by default all.")] = "",
+    fps: Annotated[float, typer.Option("--fps", help="Frames per second of the movie.")] = 15.0,
+    over: Annotated[str, typer.Option("--over", help="reference, or frame: the raw frames, deformed.")] = "reference",
+    curve: Annotated[
+        Path | None, typer.Option("--curve", help="CSV of `rgbmidic history` or of channels: a curve with a cursor.")
+    ] = None,
+    column: Annotated[str | None, typer.Option("--column", help="Column of --curve; by default the first.")] = None,
+    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
+    colours: Annotated[str | None, typer.Option("--colours", help="matplotlib's name of the colours.")] = None,
+    opacity: Annotated[float, typer.Option("--opacity", help="Of the fields over the image, 0 to 1.")] = 1.0,
+    width: Annotated[int, typer.Option("--width", help="Of the movie, px.")] = 1280,
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
+    test: Reading = None,
+    overwrite: Overwrite = False,
+    partial: Partial = False,
+) -> None:
+    """Write a movie of one field or several side by side, over the reference image or the raw frames."""
+    from rgbmidic._kernels.threads import threads
+    from rgbmidic.report import Curve, write_movie
+    from rgbmidic.results import Maps, Result
+    from rgbmidic.view.picture import RawPictures
+
+    result, settings = Result.open(folder, partial=partial), _settings(test)
+    if over not in ("reference", "frame"):
+        raise InputError(f"--over is reference or frame, not {over!r}")
+    with _progress("movie") as progress:
+        write_movie(
+            Maps.of(result, None if settings is None else settings.scale, **derived),
+            out,
+            [name.strip() for name in field.split(",")],
+            frames=_chosen_frames(result, frames),
+            limits=None if not range_ else command.read_pair(range_, "--range"),
+            fps=fps,
+            images=RawPictures(result=result) if over == "frame" else None,
+            curve=None if curve is None else Curve.read(curve, column, offset),
+            colours=colours,
+            opacity=opacity,
+            width=width,
+            processes=workers or threads(),
+            overwrite=overwrite,
+            progress=progress,
+        )
+    print(out)
+
+
+@app.command()
+@_derived_options
+def profile(
+    folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    line: Annotated[str, typer.Option("--line", metavar="X0,Y0:X1,Y1", help="Ends of the line on the reference, px.")],
+    out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
+    derived: dict[str, Any],
+    field: Annotated[str, typer.Option("--field", help="One field, such as exx, u or u_velocity.")] = "u",
+    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 10:200; by default all.")] = "",
+    curves: Annotated[str, typer.Option("--curves", help="Frames drawn as curves, such as 10,20,30.")] = "",
+    speed: Annotated[
+        str, typer.Option("--speed", metavar="WHAT", help="Fit the speed of the front, or of the peak.")
+    ] = "",
+    level: Annotated[float, typer.Option("--level", help="Fraction of the peak at which the front is taken.")] = 0.5,
+    test: Reading = None,
+    overwrite: Overwrite = False,
+    partial: Partial = False,
+) -> None:
+    """A field along a line in every frame: table, position-time picture, curves, and the speed of a front or peak."""
+    from rgbmidic.report import profile_figure, save_figure, wave_text
+    from rgbmidic.results import Maps, Result, read_profile, write_profile
+    from rgbmidic.results.files import check_file
+    from rgbmidic.results.histories import arrivals_file
+
+    picture, place = out.with_suffix(".png"), command.read_place(line, "--line", "X0,Y0:X1,Y1")
+    for file in (out, picture, *([arrivals_file(out)] if speed else [])):
+        check_file(file, overwrite=overwrite)
+    result, settings = Result.open(folder, partial=partial), _settings(test)
+    maps = Maps.of(result, None if settings is None else settings.scale, **derived)
+    read = read_profile(maps, field, place, _chosen_frames(result, frames))
+    rows = [list(read.frames).index(frame) for frame in _frames(curves) or [] if frame in read.frames]
+    wave = read.wave(speed, level) if speed else None
+    write_profile(read, out, wave, overwrite=overwrite)
+    save_figure(profile_figure(read, wave, rows), picture)
+    if wave is not None:
+        print(f"{wave_text(read, wave)}; arrival times: {arrivals_file(out)}")
+        if not wave.front.straight:
+            _note(
+                "note: the arrival times do not lie on a line within their uncertainty: the wave changes its speed or "
+                "form, or the mesh does not follow it; the uncertainty of the speed includes that scatter"
+            )
     print(f"table: {out}   picture: {picture}")
 
 

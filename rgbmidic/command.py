@@ -29,6 +29,7 @@ __all__ = [
     "help_where_alone",
     "main",
     "optional",
+    "read_pair",
     "read_place",
     "read_shape",
     "read_statement",
@@ -181,6 +182,15 @@ _EXAMPLES = {
     "X,Y:LENGTH": "120,85:75",
     "X0,Y0,X1,Y1": "40,60,200,160",
 }
+
+
+def read_pair(text: str, option: str) -> tuple[float, float]:
+    """The two numbers of ``LOW:HIGH``; an `InputError` where it is something else."""
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        raise InputError(f"{option} is LOW:HIGH, such as -0.01:0.01, not {text!r}") from None
+    return low, high
 
 
 def read_statement(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -78,6 +78,10 @@ class ResultError(RgbmidicError, ValueError):
     """A result folder is missing, damaged, or would be overwritten."""
 
 
+class AnotherTestError(ResultError):
+    """A result is of other settings, calibration or frames than those that are to be gone on with."""
+
+
 @contextmanager
 def disk_faults(kind: type[RgbmidicError], what: str) -> Iterator[None]:
     """Turn what the disk refuses inside the block into an error of a `kind`: `what` could not be done, and why."""

@@ -242,7 +242,7 @@ def _concluded(views: Sequence[View], fit: _Fit, tests: dict[str, float], reject
     warnings += [
         f"{views[index].name}: the points are off by {sizes[index]:.3f} px rms, those of half the views by less than "
         f"{np.median(sizes):.3f}: was the target moved or bent? Leave it out"
-        for index in np.flatnonzero(sizes > _OUTLYING * np.median(sizes))
+        for index in np.flatnonzero(sizes > _OUTLYING * np.median(sizes)).tolist()
     ]
     return LensEstimate(
         lens=fit.lens,

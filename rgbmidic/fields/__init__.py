@@ -14,6 +14,7 @@ from rgbmidic.fields.nodal import (
 )
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import PROBES, Gauge, Mean, StrainGauge, make_probe
+from rgbmidic.fields.profiles import ProfileLine
 from rgbmidic.fields.strain import StrainGauges, shortest_gauge, strain_of
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "NodalCovariance",
     "Places",
     "Probe",
+    "ProfileLine",
     "Rates",
     "Rectification",
     "RigidMotion",

@@ -1,7 +1,7 @@
 """Figures, reports and pages of text and pictures of a result."""
 
-from rgbmidic.report.curves import history_figure
-from rgbmidic.report.document import Page, write_report
+from rgbmidic.report.curves import history_figure, profile_figure, wave_text
+from rgbmidic.report.document import Page, write_batch_page, write_report
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -13,12 +13,15 @@ from rgbmidic.report.figures import (
     residual_figure,
 )
 from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures, write_maps
+from rgbmidic.report.movie import MOVIES, Curve, write_movie
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [
     "MAPS",
+    "MOVIES",
     "REPORT",
     "STYLE",
+    "Curve",
     "Page",
     "brightness_figure",
     "convergence_figure",
@@ -27,12 +30,16 @@ __all__ = [
     "history_figure",
     "map_figure",
     "mask_figure",
+    "profile_figure",
     "reflection_figure",
     "remove_figures",
     "remove_report",
     "residual_figure",
     "save_figure",
+    "wave_text",
+    "write_batch_page",
     "write_figures",
     "write_maps",
+    "write_movie",
     "write_report",
 ]

@@ -8,8 +8,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.report.setup import NoiseFloor, TimeHistory
-from rgbmidic.report.style import GAP, LEGEND, LINES, NUMBERS, OKABE_ITO, draw_figure, finish_plot, literal, time_axis
-from rgbmidic.results import QUANTITIES, Histories, HistoryColumn
+from rgbmidic.report.style import (
+    GAP,
+    LEGEND,
+    LINES,
+    NUMBERS,
+    OKABE_ITO,
+    add_colour_bar,
+    colour_range,
+    draw_figure,
+    finish_plot,
+    literal,
+    ordinary_values,
+    time_axis,
+    time_unit,
+)
+from rgbmidic.results import QUANTITIES, Histories, HistoryColumn, Profile, Wave
+from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -129,6 +144,85 @@ def history_figure(histories: Histories) -> Figure:
 
     count = len(panels) + (histories.stress_strain is not None)
     return draw_figure(draw, count=count, aspect=0.45, beside=LEGEND, tallest=_PANEL * count + 1)
+
+
+def profile_figure(profile: Profile, wave: Wave | None = None, shown: Sequence[int] = ()) -> Figure:
+    """Draw a profile: position against time with the field as colour, and below it curves along the line.
+
+    Parameters
+    ----------
+    profile
+        A field along a line.
+    wave
+        Its arrival times are drawn as points, the line through them as a line.
+    shown
+        Rows of the profile that are drawn as curves; none: six, evenly spaced where the field is largest.
+
+    Returns
+    -------
+    Figure
+        The figure.
+    """
+    times, label_of_times = time_axis(profile.times, profile.numbers)
+    factor = 1.0 if profile.times is None else time_unit(profile.times)[0]
+    position = f"position ({profile.units.length})"
+    rows = list(shown) or _rows_shown(profile.values)
+    colours = "plasma" if profile.field.kind == "positive" else "viridis"
+
+    def draw(axes: list[Axes]) -> None:
+        from matplotlib.colors import Normalize
+
+        above, below = axes
+        known = ordinary_values(profile.values, profile.std)
+        low, high = profile.field.ends or colour_range(known)
+        shape: dict[str, Any] = {"cmap": colours, "vmin": low, "vmax": high, "rasterized": True, "shading": "nearest"}
+        above.pcolormesh(times, profile.positions, profile.values.T, **shape)
+        add_colour_bar(above, Normalize(low, high), colours, beyond=(bool(known.min() < low), bool(known.max() > high)))
+        if wave is not None:
+            used = wave.front.used
+            points = factor * wave.arrivals.times[used], profile.positions[used]
+            bars = 2 * factor * wave.arrivals.std[used]
+            above.errorbar(*points, xerr=bars, fmt="o", ms=2.5, color="w", mec="k", mew=0.5, ecolor="k", elinewidth=0.8)
+            ends = profile.positions[[0, -1]]
+            above.plot(factor * (wave.front.start + ends / wave.front.speed), ends, "r-", linewidth=1)
+            above.set_title(wave_text(profile, wave))
+            above.set_xlim(times[0], times[-1])
+        else:
+            above.set_title(literal(profile.field.label))
+        finish_plot(above, label_of_times, position, whole=profile.times is None)
+        above.grid(visible=False)
+        for row, shade in zip(rows, np.linspace(0, 0.85, len(rows)), strict=True):
+            look: dict[str, Any] = {"color": colormaps["plasma"](shade), "linewidth": 1.1}
+            name = (
+                f"frame {profile.numbers[row]}" if profile.times is None else f"{times[row]:.5g} {label_of_times[6:-1]}"
+            )
+            (line,) = below.plot(profile.positions, profile.values[row], label=name, **look)
+            edges = (profile.values[row] + side * 2 * profile.std[row] for side in (-1, 1))
+            below.fill_between(profile.positions, *edges, color=line.get_color(), alpha=0.2, linewidth=0)
+        finish_plot(below, position, literal(profile.field.label), whole=False)
+        below.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
+
+    from matplotlib import colormaps
+
+    return draw_figure(draw, count=2, aspect=0.45, beside=LEGEND / 1.6)
+
+
+def _rows_shown(values: FloatArray) -> list[int]:
+    """Choose six rows of a profile (T, P), evenly spaced over the frames in which its extreme lies above half."""
+    size = np.nan_to_num(np.abs(values)).max(axis=1)
+    busy = np.flatnonzero(size > 0.5 * size.max(initial=0))
+    return sorted({int(busy[int(i)]) for i in np.linspace(0, len(busy) - 1, 6).round()}) if len(busy) else [0]
+
+
+def wave_text(profile: Profile, wave: Wave) -> str:
+    """Return the speed of a wave with its uncertainty and chi-square as text."""
+    front, unit = wave.front, f"{profile.units.length}/{profile.units.time}"
+    speed, std = front.speed, front.speed_std
+    if unit == "mm/s":
+        speed, std, unit = speed / 1000, std / 1000, "m/s"
+    digits = max(0, 1 - int(np.floor(np.log10(std)))) if std > 0 else 3
+    fit = f"chi-square {front.chi_square:.3g} of {front.freedom}"
+    return f"{wave.what} of {profile.field.name}: {speed:,.{digits}f} ± {std:,.{digits}f} {unit} ({fit})"
 
 
 def _kind(quantity: HistoryColumn) -> str:

@@ -7,13 +7,16 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 import numpy as np
 
+from rgbmidic._version import __version__
 from rgbmidic.errors import legible
 from rgbmidic.report import figures
 from rgbmidic.report import setup as tables
 from rgbmidic.report.curves import field_history_figure, history_figure, status_figure, uncertainty_figure
+from rgbmidic.report.gallery import REPORT
 from rgbmidic.report.style import PAGE_DPI, embedded, time_text
 from rgbmidic.results import QUANTITIES, Result, channels_of, probes_of
 from rgbmidic.results.files import check_file, write_complete
@@ -397,5 +400,32 @@ class Page:
         return markdown, page
 
 
+def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> None:
+    """Write the table of a batch (`rgbmidic.pipeline.batch.summary_rows`) as a page with links to the tests' reports.
+
+    Parameters
+    ----------
+    header, rows
+        Of the table; the fourth column is a test's folder.
+    path
+        HTML file to write.
+    """
+    page = Page("Tests of a batch")
+    failed = [(row[0], row[2]) for row in rows if row[1] == "failed"]
+    page.text(f"{len([row for row in rows if row[1]])} tests, {len(failed)} failed; written by rgbmidic {__version__}.")
+    names = []
+    for name, _, _, folder, *_ in rows:
+        report = Path(folder) / REPORT
+        link = report.relative_to(path.parent).as_posix() if folder and report.is_file() else ""
+        names.append(f"[{name}]({quote(link)})" if link else name)
+    page.table(["", *names], [[header[place], *(row[place] for row in rows)] for place in (1, *range(4, len(header)))])
+    if failed:
+        page.heading("Failed")
+        page.bullets([f"{name}: {reason}" for name, reason in failed])
+    write_complete(path, lambda file: file.write(page.html.encode()))
+
+
 def _inline(text: str) -> str:
-    return re.sub("`([^`]*)`", r"<code>\1</code>", html.escape(text))
+    """Return text as HTML, with words between backquotes as code and ``[name](page.html)`` as a link."""
+    text = re.sub("`([^`]*)`", r"<code>\1</code>", html.escape(text))
+    return re.sub(r"\[([^\[\]]*)\]\(([\w%./+-]+\.html)\)", r'<a href="\2">\1</a>', text)

@@ -396,9 +396,10 @@ class MapDrawer:
         -------
         Figure
         """
-        x, y = _view(self.result, self.result.nodes)
+        x, y = picture_limits(self.result, self.result.nodes)
         every = np.concatenate([values for _, values in maps])
-        norm = style.colour_scale(every[np.isfinite(every)]) if np.isfinite(every).any() else None
+        known = every[np.isfinite(every)]
+        norm = style.colour_scale(known) if known.size else None
 
         def draw(axes: list[Axes]) -> None:
             for axis, (title, values) in zip(axes, maps, strict=False):
@@ -437,7 +438,7 @@ class MapDrawer:
 
     def _panels(self, count: int) -> Figure:
         """Draw what is the same in all figures of `count` maps: axes and reference image."""
-        result, (x, y) = self.result, _view(self.result, self.result.nodes)
+        result, (x, y) = self.result, picture_limits(self.result, self.result.nodes)
 
         def draw(axes: list[Axes]) -> None:
             reference = None if result.reference is None else result.reference.mean(axis=0, dtype=np.float32)
@@ -500,7 +501,7 @@ def _shaded(
         return None
     step, origin = -(-reference.shape[1] // cover.shape[1]), result.reference_origin
     moved = result.nodes + np.stack([record.u, record.v], axis=1)
-    x, y = _view(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
+    x, y = picture_limits(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
     columns, rows = (
         slice(int((low - first + 0.5) // step), math.ceil((high - first + 0.5) / step))
         for (low, high), first in zip((x, y), origin, strict=True)
@@ -517,7 +518,7 @@ def _shaded(
     return style.draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=style.GAP, title=title)
 
 
-def _view(result: Result, points: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
+def picture_limits(result: Result, points: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the limits in x and in y of a picture around points (N, 2), inside the image."""
     low, high = style.view_limits(points)
     if result.reference is not None:

@@ -3,7 +3,16 @@
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
+from rgbmidic.results.histories import (
+    Histories,
+    HistoryColumn,
+    Profile,
+    Wave,
+    history_rows,
+    read_profile,
+    write_histories,
+    write_profile,
+)
 from rgbmidic.results.maps import MapField, Maps, MapValues
 from rgbmidic.results.physical import (
     Channels,
@@ -34,9 +43,11 @@ __all__ = [
     "MapValues",
     "Maps",
     "Origin",
+    "Profile",
     "Result",
     "ResultQuantity",
     "ResultStore",
+    "Wave",
     "channels_of",
     "export_result",
     "exposure",
@@ -44,10 +55,12 @@ __all__ = [
     "frame_times",
     "history_rows",
     "probes_of",
+    "read_profile",
     "reference_frames",
     "scale_of",
     "shared_part",
     "speckle_diameter",
     "units_of",
     "write_histories",
+    "write_profile",
 ]

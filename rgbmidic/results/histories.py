@@ -1,16 +1,17 @@
-"""Histories: what probes laid on a result measure over the frames, in physical units, and as a table or a CSV file.
+"""Histories and profiles: what probes measure over the frames, and a field along a line, as tables and CSV files.
 
-A probe is read frame by frame; its rates, and the channels recorded beside the test, go with it.
+A probe is read frame by frame; its rates, and the channels recorded beside the test, go with it. A profile is read off
+the maps of a result, with the speed of a front that travels along it.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -22,19 +23,24 @@ from rgbmidic.fields import (
     Nodal,
     NodalCovariance,
     Probe,
+    ProfileLine,
     Rectification,
     RigidMotion,
     Units,
+    column,
     make_probe,
     rates,
 )
+from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
 from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.maps import MapField, Maps
 from rgbmidic.results.physical import Channels, exposure, frame_times, rectification_of, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 
-__all__ = ["Histories", "HistoryColumn", "history_csv", "history_rows", "read_histories", "write_histories"]
+__all__ = ["Histories", "HistoryColumn", "Profile", "Wave", "history_csv", "history_rows"]
+__all__ += ["read_histories", "read_profile", "write_histories", "write_profile"]
 
 
 _BLURRED = 1.0
@@ -196,12 +202,12 @@ def read_histories(
     read = [*rigid, *(history for part in by_probe.values() for history in part)]
     references = reference_frames(result)[there]
     quantities = [
-        column
+        quantity
         for history in read
-        for column in _in_units(history, units, clock, probes.window, shared_part(result), references)
+        for quantity in _in_units(history, units, clock, probes.window, shared_part(result), references)
     ]
     beside, stress, clocks = _beside(channels or ChannelSettings(), times, quantities)
-    strain = next((column.name for column in quantities if column.name.endswith(("_strain", "_e1"))), None)
+    strain = next((each.name for each in quantities if each.name.endswith(("_strain", "_e1"))), None)
     return Histories(
         frames=there,
         numbers=result.number[there],
@@ -257,12 +263,12 @@ def _in_units(
     length = history.unit == "px"
     unit = units.length if length else history.unit
 
-    def column(name: str, unit: str, values: FloatArray, std: FloatArray) -> HistoryColumn:
+    def entry(name: str, unit: str, values: FloatArray, std: FloatArray) -> HistoryColumn:
         values, std = units.lengths(values, std) if length else (values, std)
         return HistoryColumn(name=name, unit=unit, values=values, std=std)
 
     assert history.std is not None
-    yield column(history.name, unit, history.values, history.std)
+    yield entry(history.name, unit, history.values, history.std)
     if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
@@ -272,7 +278,7 @@ def _in_units(
             values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")
             if not side or np.isfinite(values).any():  # else no kink
                 title = f"{history.name}_{name if length else 'rate'}{side}"
-                yield column(title, units.per_time(unit, power), values, std)
+                yield entry(title, units.per_time(unit, power), values, std)
 
 
 def _beside(
@@ -341,3 +347,217 @@ def _remarks(
     for channel in beside:
         if missing := int(np.isnan(channel.values).sum()):
             yield f"the channel {channel.name} has no value in {missing} of {len(frames)} frames"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Wave:
+    """A front or peak along a profile, in the profile's units.
+
+    Attributes
+    ----------
+    what, level
+        As of `rgbmidic.fields.profiles.arrival_times`.
+    arrivals, front
+        When it is at each position, and the straight line through that. The uncertainty of the speed includes the
+        scale's.
+    """
+
+    what: str
+    level: float
+    arrivals: Arrivals
+    front: Front
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Profile:
+    """A field along a line in some frames.
+
+    Attributes
+    ----------
+    field
+        What it is.
+    line
+        The points; its positions are in rectified px.
+    frames, numbers : ndarray, shape (T,), int
+        Place in the result and number of each frame.
+    times : ndarray, shape (T,), or None
+        In seconds.
+    units
+        Of lengths and time.
+    values, std : ndarray, shape (T, P)
+        At each point in each frame; NaN where not measured.
+    common_fraction
+        Fraction of the variance that all frames have in common.
+    rate_window
+        Time that a rate is taken over; 0 for what is no rate.
+    """
+
+    field: MapField
+    line: ProfileLine
+    frames: npt.NDArray[np.int64]
+    numbers: npt.NDArray[np.int64]
+    times: FloatArray | None
+    units: Units
+    values: FloatArray
+    std: FloatArray
+    common_fraction: float
+    rate_window: float
+
+    @property
+    def positions(self) -> FloatArray:
+        """Distance (P,) of the points from the first end, in the unit of lengths."""
+        return self.line.positions * (self.units.mm_per_pixel or 1.0)
+
+    @property
+    def clock(self) -> FloatArray:
+        """Times (T,) in s, or numbers of the frames where no time is known."""
+        return np.asarray(self.numbers if self.times is None else self.times, dtype=np.float64)
+
+    @property
+    def kind(self) -> str:
+        """Key of `ProfileLine.correlations`: how the errors of the field hang together."""
+        if self.field.name[:3] in ("exx", "eyy"):
+            return self.field.name[:3]
+        return "strain" if self.field.unit in ("", "deg") or "_rate" in self.field.name else ""
+
+    def wave(self, what: str = "front", level: float = 0.5) -> Wave:
+        """Fit the speed of a front or peak.
+
+        Parameters
+        ----------
+        what, level
+            As of `rgbmidic.fields.profiles.arrival_times`.
+
+        Raises
+        ------
+        InputError
+            Nothing travels along the line, or `what` or `level` is none of those allowed.
+        """
+        clock = self.clock
+        between = rate_correlation(clock, self.rate_window) if self.rate_window else None
+        more: dict[str, Any] = {
+            "common_fraction": 0.0 if self.rate_window else self.common_fraction,
+            "between_frames": between,
+        }
+        arrivals = arrival_times(clock, self.values, self.std, what=what, level=level, **more)
+        correlation = self.line.correlation(self.kind)
+        front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.even, **more)
+        scale = self.units.mm_per_pixel_std / (self.units.mm_per_pixel or 1.0)
+        front = replace(front, speed_std=float(np.hypot(front.speed_std, scale * front.speed)))
+        return Wave(what=what, level=level, arrivals=arrivals, front=front)
+
+
+def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | None = None) -> Profile:
+    """Read a field along a line in every frame.
+
+    Parameters
+    ----------
+    maps
+        The result and how its fields are derived.
+    field
+        Name of the field.
+    place
+        Ends x0, y0, x1, y1 of the line in px of the image.
+    frames
+        Indices of the frames; None: all that are measured.
+
+    Raises
+    ------
+    InputError
+        There is no such field or frame, it has no uncertainty, or half of the line is outside the mesh.
+    """
+    found, result, physical = maps.field(field), maps.result, maps.physical
+    if f"{field}_std" not in maps.all:
+        raise InputError(
+            f'a profile is of a field with an uncertainty, not of "{field}"; these are '
+            + ", ".join(name for name in maps.all if f"{name}_std" in maps.all)
+        )
+    chosen = np.flatnonzero(result.finished) if frames is None else np.asarray(frames, dtype=np.int64)
+    if not len(chosen):
+        raise InputError(f"no frame of {result.path} is measured yet")
+    line = ProfileLine.between(physical.covariance, physical.gauges, *physical.rectified.place(place))
+    times = frame_times(result, physical.scale)
+    values, std = np.full((2, len(chosen), len(line.points)), np.nan)
+    profile = Profile(
+        field=found,
+        line=line,
+        frames=chosen,
+        numbers=result.number[chosen],
+        times=None if times is None else times[chosen],
+        units=replace(physical.units, timed=times is not None),
+        values=values,
+        std=std,
+        common_fraction=shared_part(result),
+        rate_window=0.0,
+    )
+    for row, each in enumerate(maps.read(field, frame) for frame in chosen.tolist()):
+        values[row], std[row] = line.read(each.values, each.std, profile.kind)
+    if not np.isfinite(values).any():
+        raise InputError(f"{field} is measured in no frame along the line; place it elsewhere")
+    rated = "velocity" in field or "acceleration" in field or "_rate" in field
+    interval = float(np.median(np.diff(profile.clock))) if len(chosen) > 1 else 0.0
+    return replace(profile, rate_window=(maps.window - 1) * interval if rated else 0.0)
+
+
+def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *, overwrite: bool = False) -> None:
+    """Write a profile as CSV, one row for each frame and point; with a wave its arrival times beside it.
+
+    Parameters
+    ----------
+    profile
+        What is written: frame, number, time, position along the line, place, value and uncertainty.
+    out
+        File to write.
+    wave
+        Its arrival times and residuals go into a file whose name ends in ``_arrivals.csv``, one row a position.
+    overwrite
+        Replace files that are already there.
+
+    Raises
+    ------
+    ResultError
+        A file exists, its folder does not, or it cannot be written.
+    """
+    out = Path(out)
+    beside = arrivals_file(out)
+    for file in (out, *([beside] if wave else [])):
+        check_file(file, overwrite=overwrite)
+    unit, name = profile.units.length, profile.field
+    places = profile.line.points * (profile.units.mm_per_pixel or 1.0)
+    head = [column(part, unit) for part in ("position", "x", "y")]
+    at = np.column_stack([profile.positions, places]).tolist()
+    value = column(name.name, name.unit)
+
+    def table(file: BinaryIO) -> None:
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        writer = csv.writer(text)
+        timed = [] if profile.times is None else ["time_s"]
+        writer.writerow(["frame", "number", *timed, *head, value, f"{value}_std"])
+        for row, (frame, number, clock) in enumerate(zip(profile.frames, profile.numbers, profile.clock, strict=True)):
+            start = [frame, number, *([f"{clock:.12g}"] if timed else [])]
+            for place, *pair in zip(at, profile.values[row], profile.std[row], strict=True):
+                writer.writerow([*start, *map(_number, (*place, *pair))])
+        text.detach()  # leaves the file open for whoever opened it
+
+    write_complete(out, table)
+    if wave is None:
+        return
+    clock = "s" if profile.times is not None else "frame"
+    columns = {
+        **dict(zip(head, np.array(at).T, strict=True)),
+        f"arrival_{clock}": wave.arrivals.times,
+        f"arrival_{clock}_std": wave.arrivals.std,
+        f"residual_{clock}": wave.front.residuals,
+        "used": wave.front.used.astype(float),
+    }
+    rows = "".join(",".join(map(_number, row)) + "\r\n" for row in np.column_stack([*columns.values()]).tolist())
+    write_complete(beside, lambda file: file.write((",".join(columns) + "\r\n" + rows).encode()))
+
+
+def arrivals_file(out: Path) -> Path:
+    """Return the file of arrival times beside that of a profile."""
+    return out.with_name(f"{out.stem}_arrivals.csv")
+
+
+def _number(value: float) -> str:
+    return "" if value != value else f"{value:.9g}"

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._version import __version__
-from rgbmidic.errors import ResultError
+from rgbmidic.errors import AnotherTestError, ResultError
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import file_hash
 from rgbmidic.results.files import read_json
@@ -128,7 +128,7 @@ def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> No
 
     Raises
     ------
-    ResultError
+    AnotherTestError
         Settings, calibration, inputs, frames, mesh, lights, references, or a version differ; the message says which.
     """
     before, after = dict(_compared(was)), dict(_compared(now))
@@ -138,7 +138,7 @@ def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> No
             f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:_NAMED]
         )
         more = f"; and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        raise ResultError(
+        raise AnotherTestError(
             f"{path} is of another test and is not gone on with: {differences}{more}; give another folder"
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -11,12 +11,16 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.interpolation import paint_field
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.series import FrameSeries, open_series
+from rgbmidic.results import Result
+from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
 __all__ = [
     "AROUND",
     "Overlay",
     "Picture",
+    "RawPictures",
     "Window",
     "element_at",
     "grey_picture",
@@ -209,6 +213,29 @@ def grey_picture(frame: Mosaic | ChannelFrame) -> Picture:
     if isinstance(frame, Mosaic):
         return stretched(cv2.blur(frame.values.astype(np.float32), (2, 2)))
     return stretched(frame.values.mean(axis=0, dtype=np.float32))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawPictures:
+    """Pictures of the raw frames of a result, read where they still exist; picklable until the first is read.
+
+    Attributes
+    ----------
+    result
+        The result.
+    """
+
+    result: Result
+
+    @cached_property
+    def _series(self) -> FrameSeries:
+        provenance = self.result.provenance
+        settings = TestSettings.from_mapping(provenance["settings"], provenance["base"])
+        return open_series(settings.frames, settings.base)
+
+    def __call__(self, index: int) -> Picture:
+        """Read the frame of an index in the result; errors as those of the frames' reader."""
+        return grey_picture(self._series.read(self._series.chosen[index])[0])
 
 
 def stretched(image: AnyArray) -> Picture:

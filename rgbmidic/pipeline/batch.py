@@ -1,0 +1,415 @@
+"""A series of tests measured one after the other, and one table of what each of them gave.
+
+A test that fails stays in the table with its reason, and the rest goes on. A test that is already measured with the
+same settings, calibration and frames is not measured again: its provenance tells.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
+from rgbmidic.pipeline.run import measure
+from rgbmidic.results import Channels, Histories, Maps, Result, shared_part
+from rgbmidic.results.files import write_complete
+from rgbmidic.results.histories import read_histories
+from rgbmidic.results.provenance import is_result
+from rgbmidic.settings import TestSettings, read_toml, regular
+from rgbmidic.typing import FloatArray
+
+__all__ = ["BatchTest", "Outcome", "Readings", "modulus", "read_table", "read_tests", "run_batch", "summary_rows"]
+
+logger = logging.getLogger(__name__)
+
+_NAME = re.compile(r"[\w][\w .+-]{0,79}")
+"""What a test may be called: it names a folder."""
+_QUANTILE = 99
+"""Percentile of the nodes that stands for the largest value in a frame: single outliers do not count."""
+_FIELDS = ("magnitude", "e1", "equivalent")
+_LARGE_PART = 0.5
+"""Fraction of the deformed frames that must converge, as of `rgbmidic run`."""
+ELASTIC = (0.0005, 0.0025)
+"""Strains between which a modulus is fitted where none are stated: those of ISO 527-1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Readings:
+    """How channels beside a test are read.
+
+    Attributes
+    ----------
+    channels
+        CSV file with the force; None: none.
+    offset
+        Seconds added to its times.
+    area
+        Cross-section in square mm; None: no stress.
+    force
+        Name of the channel with the force, where there are several.
+    """
+
+    channels: Path | None = None
+    offset: float = 0.0
+    area: float | None = None
+    force: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchTest:
+    """A test of a batch.
+
+    Attributes
+    ----------
+    name
+        Its name and that of its folder.
+    document, base
+        Sections of its settings, and the folder that relative paths start from.
+    readings
+        Channels beside it.
+    """
+
+    name: str
+    document: Mapping[str, Any]
+    base: Path
+    readings: Readings = Readings()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outcome:
+    """What a test gave.
+
+    Attributes
+    ----------
+    name
+        The test.
+    folder
+        Its result.
+    reason
+        Why it failed; empty where it did not.
+    measured
+        Whether it was measured now, and not before.
+    values
+        Quantities by the name of their column, standard uncertainties as ``_std``.
+    """
+
+    name: str
+    folder: Path
+    reason: str = ""
+    measured: bool = False
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+def read_tests(paths: Sequence[Path], readings: Readings) -> list[BatchTest]:
+    """Name the tests of TEST.toml files, by the file, or by its folder where several are called alike.
+
+    Parameters
+    ----------
+    paths
+        The files.
+    readings
+        Of all tests; a relative path of channels starts from each test's folder.
+
+    Raises
+    ------
+    InputError
+        Two tests would have one name.
+    """
+    stems = [path.stem for path in paths]
+    names = [stem if stems.count(stem) == 1 else path.resolve().parent.name for path, stem in zip(paths, stems)]  # noqa: B905
+    tests = []
+    for path, name in zip(paths, names, strict=True):
+        beside = readings.channels and path.parent / readings.channels
+        document: dict[str, Any] = {"path": str(path)}  # read when its turn comes: a damaged one does not stop the rest
+        tests.append(
+            BatchTest(name=name, document=document, base=path.parent, readings=replace(readings, channels=beside))
+        )
+    return _checked(tests)
+
+
+def read_table(template: Path, table: Path, readings: Readings) -> list[BatchTest]:
+    """Make tests from a template and a table: a row a test, with values that replace keys of the template.
+
+    Parameters
+    ----------
+    template
+        A TEST.toml; paths in it and in the table are relative to it.
+    table
+        CSV file. Its first column is ``test``, the name; the others are keys such as ``frames.path``, with values as
+        TOML writes them (a text may go without quotes; an empty field leaves the template's), or ``channels``,
+        ``offset``, ``area`` and ``force``.
+    readings
+        Where the table states none.
+
+    Raises
+    ------
+    InputError
+        The table is missing, has another first column, a row of another length, or two tests of one name.
+    ConfigurationError
+        The template is missing or no TOML.
+    """
+    document = read_toml(template, "settings file")
+    if readings.channels is not None:
+        readings = replace(readings, channels=template.parent / readings.channels)
+    try:
+        rows = [row for row in csv.reader(io.StringIO(regular(table).read_text(encoding="utf-8-sig"))) if any(row)]
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"the table {table} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    head = [name.strip() for name in rows[0]] if rows else []
+    odd = [name for name in head[1:] if "." not in name and name not in _READINGS]
+    if head[:1] != ["test"] or odd:
+        raise InputError(
+            f'the table {table} needs a first column "test" and keys such as "frames.path", or {", ".join(_READINGS)}; '
+            f"its columns are {', '.join(head) or 'none'}"
+        )
+    tests = []
+    for number, row in enumerate(rows[1:], 2):
+        if len(row) != len(head):
+            raise InputError(f"row {number} of the table {table} has {len(row)} fields, the header {len(head)}")
+        changed = {section: dict(keys) if isinstance(keys, Mapping) else keys for section, keys in document.items()}
+        stated: dict[str, Any] = {}
+        for name, text in zip(head[1:], map(str.strip, row[1:]), strict=True):
+            if text and name in _READINGS:
+                stated[name] = _reading(name, text, template.parent, f"row {number} of the table {table}")
+            elif text:
+                section, key = name.split(".", 1)
+                changed.setdefault(section, {})[key] = _value(text)
+        tests.append(
+            BatchTest(name=row[0].strip(), document=changed, base=template.parent, readings=replace(readings, **stated))
+        )
+    return _checked(tests)
+
+
+_READINGS = ("channels", "offset", "area", "force")
+
+
+def _reading(name: str, text: str, base: Path, where: str) -> Any:
+    if name == "channels":
+        return base / text
+    if name == "force":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{name} in {where} is not a number: {text!r}") from None
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _checked(tests: list[BatchTest]) -> list[BatchTest]:
+    names = [test.name for test in tests]
+    for name in names:
+        if not _NAME.fullmatch(name) or names.count(name) > 1:
+            why = (
+                "is the name of two tests" if _NAME.fullmatch(name) else "names no test: letters, digits, . _ + - only"
+            )
+            raise InputError(f'"{name}" {why}')
+    if not tests:
+        raise InputError("a batch needs one test or more")
+    return tests
+
+
+def run_batch(
+    tests: Sequence[BatchTest],
+    out: Path,
+    *,
+    workers: int | None = 1,
+    elastic: tuple[float, float] = ELASTIC,
+    conclude: Callable[[Result, TestSettings, bool], None] | None = None,
+    progress: Callable[[str], Callable[[int, int, str], None]] | None = None,
+) -> Iterator[Outcome]:
+    """Measure tests one after the other, each into a folder of its name; yield what each gave as it ends.
+
+    Parameters
+    ----------
+    tests
+        The tests.
+    out
+        Folder of the batch.
+    workers
+        As of `measure`.
+    elastic
+        Strains between which moduli are fitted.
+    conclude
+        Called with each result, its settings, and whether it was measured now.
+    progress
+        Gives for the name of a test what `measure` calls after every frame.
+
+    Yields
+    ------
+    Outcome
+        Of each test.
+    """
+    for test in tests:
+        folder = out / test.name
+        try:
+            yield _outcome(test, folder, workers, elastic, conclude, progress and progress(test.name))
+        except (RgbmidicError, OSError) as error:
+            yield Outcome(name=test.name, folder=folder, reason=str(error))
+
+
+def _outcome(
+    test: BatchTest,
+    folder: Path,
+    workers: int | None,
+    elastic: tuple[float, float],
+    conclude: Callable[[Result, TestSettings, bool], None] | None,
+    progress: Callable[[int, int, str], None] | None,
+) -> Outcome:
+    """Measure a test unless it is measured already, and read it."""
+    document = test.document
+    if set(document) == {"path"}:
+        document = read_toml(Path(document["path"]), "settings file")
+    settings = TestSettings.from_mapping(document, test.base)
+    moved = False
+
+    def count(done: int, total: int, line: str) -> None:
+        nonlocal moved
+        moved = True
+        if progress is not None:
+            progress(done, total, line)
+
+    there = is_result(folder)
+    try:
+        result = measure(settings, folder, resume=there, workers=workers, progress=count)
+    except AnotherTestError as error:
+        logger.warning("%s is measured again: %s", test.name, str(error).rpartition("; ")[0])
+        result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
+    if conclude is not None:
+        conclude(result, settings, moved)
+    ends = result.status[list(result.deformed)]
+    good = float((ends == 0).mean()) if len(ends) else 0.0
+    if good < _LARGE_PART:
+        raise ResultError(f"{int((ends != 0).sum())} of {len(ends)} deformed frames failed or did not converge")
+    values = {"frames": float(len(ends)), "converged": good} | dict(_peaks(result, settings))
+    values |= dict(_probed(result, settings, test.readings, elastic))
+    return Outcome(name=test.name, folder=folder, measured=moved, values=values)
+
+
+def _peaks(result: Result, settings: TestSettings) -> Iterator[tuple[str, float]]:
+    """Yield the peaks over the frames of fields, each that 99 % of the nodes do not exceed, with its uncertainty."""
+    maps = Maps.of(result, settings.scale, measure=settings.probes.measure)
+    frames = [frame for frame in result.deformed if result.finished[frame]]
+    for name in _FIELDS:
+        best = (-math.inf, math.nan)
+        for frame in frames:
+            read = maps.read(name, frame)
+            known = np.flatnonzero(np.isfinite(read.values))
+            if len(known):
+                at = known[np.argsort(read.values[known])[min(len(known) * _QUANTILE // 100, len(known) - 1)]]
+                best = max(best, (float(read.values[at]), float(read.std[at])))
+        if math.isfinite(best[0]):
+            unit = maps.field(name).unit
+            label = f"peak_{name}_{unit}" if unit else f"peak_{name}"
+            yield from {label: best[0], f"{label}_std": best[1]}.items()
+
+
+def _probed(
+    result: Result, settings: TestSettings, readings: Readings, elastic: tuple[float, float]
+) -> Iterator[tuple[str, float]]:
+    """Yield the peak of every quantity of the probes and channels, and the modulus where a stress is known."""
+    if not settings.probes.places and settings.probes.rigid_motion == "none":
+        return
+    channels = None if readings.channels is None else Channels.read(readings.channels, readings.offset)
+    area = readings.area if channels is not None else None
+    read = read_histories(
+        result, settings.probes, scale=settings.scale, channels=channels, area=area, force=readings.force
+    )
+    for quantity in read.quantities:
+        if quantity.name.endswith(("_before", "_after", "_direction")) or not np.isfinite(quantity.values).any():
+            continue
+        at = int(np.nanargmax(np.abs(quantity.values)))
+        yield f"peak_{quantity.column}", float(quantity.values[at])
+        if quantity.std is not None:
+            yield f"peak_{quantity.column}_std", float(quantity.std[at])
+    if read.stress_strain is not None:
+        found = modulus(read, *elastic, shared_part(result))
+        yield from zip(("modulus_MPa", "modulus_MPa_std"), found, strict=True)
+
+
+def modulus(histories: Histories, low: float, high: float, common_fraction: float) -> tuple[float, float]:
+    """Fit the slope of stress over strain while the stress rises, and its standard uncertainty, MPa.
+
+    The strain, whose noise is known, is fitted as a straight line of the stress by weighted least squares; the slope is
+    the inverse. The stress is taken as exact: the uncertainty of force and area is not in it.
+
+    Parameters
+    ----------
+    histories
+        With a stress.
+    low, high
+        Strains between which the frames count.
+    common_fraction
+        Fraction of the strain's variance that all frames have in common, which shifts the line and not its slope.
+
+    Returns
+    -------
+    modulus, std : float
+        NaN where fewer than three frames lie between the strains.
+    """
+    assert histories.stress_strain is not None
+    strain, stress = (histories[name] for name in histories.stress_strain)
+    assert strain.std is not None
+    rising = np.arange(len(stress.values)) <= np.nanargmax(np.abs(np.nan_to_num(stress.values)))
+    size = np.abs(strain.values)
+    used = rising & (size >= low) & (size <= high) & np.isfinite(stress.values + strain.values + strain.std)
+    if used.sum() < 3:
+        return math.nan, math.nan
+    weight = 1 / ((1 - common_fraction) * strain.std[used] ** 2)
+    x, y = stress.values[used], strain.values[used]
+    away = x - (weight * x).sum() / weight.sum()
+    moment = (weight * away**2).sum()
+    slope = float((weight * away * y).sum() / moment) if moment > 0 else math.nan
+    return (1 / slope, float(1 / math.sqrt(moment) / slope**2)) if slope else (math.nan, math.nan)
+
+
+def summary_rows(outcomes: Sequence[Outcome]) -> tuple[list[str], list[list[str]]]:
+    """Write what tests gave as a table, with mean and standard deviation over those that did not fail.
+
+    Returns
+    -------
+    header : list of str
+    rows : list of list of str
+        One a test: name, state, reason, result folder, values; then the mean, the standard deviation (of two tests or
+        more) and the number of tests of each column.
+    """
+    names = list(dict.fromkeys(name for outcome in outcomes for name in outcome.values))
+    rows = []
+    for outcome in outcomes:
+        state = "failed" if outcome.reason else "measured" if outcome.measured else "measured before"
+        cells = [_text(outcome.values.get(name, math.nan)) for name in names]
+        rows.append([outcome.name, state, outcome.reason, str(outcome.folder), *cells])
+    table: FloatArray = np.array([[outcome.values.get(name, math.nan) for name in names] for outcome in outcomes])
+    good = [column[np.isfinite(column)] for column in table.T] if names else []
+    deviations = [part.std(ddof=1) if len(part) > 1 else math.nan for part in good]
+    rows.append(["mean", "", "", "", *(_text(float(part.mean()) if len(part) else math.nan) for part in good)])
+    rows.append(["standard deviation", "", "", "", *map(_text, map(float, deviations))])
+    rows.append(["tests", "", "", "", *(str(len(part)) for part in good)])
+    return ["test", "state", "reason", "result", *names], rows
+
+
+def _text(value: float) -> str:
+    return "" if value != value else f"{value:.6g}"
+
+
+def write_summary(outcomes: Sequence[Outcome], path: Path) -> None:
+    """Write `summary_rows` as a CSV file, in place of an earlier one."""
+    header, rows = summary_rows(outcomes)
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([header, *rows])
+    write_complete(path, lambda file: file.write(text.getvalue().encode()))
