@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rgbmidic.frames import read_frame
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.lab.inspection import Inspection, inspect_frame
-    from rgbmidic.mesh import Region, Tri3Mesh
+    from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
     from rgbmidic.pipeline import correlate, measure, measure_sequence
     from rgbmidic.results import Result
     from rgbmidic.settings import TestSettings, read_test
@@ -26,8 +26,10 @@ from rgbmidic._version import __version__
 __all__ = [
     "Calibration",
     "CameraCalibration",
+    "FiniteElementMesh",
     "Inspection",
     "NodeStatus",
+    "Placement",
     "Region",
     "Result",
     "RgbmidicError",
@@ -41,14 +43,17 @@ __all__ = [
     "measure",
     "measure_sequence",
     "read_frame",
+    "read_mesh",
     "read_test",
 ]
 
 _HOMES = {
     "Calibration": "rgbmidic.illumination.calibration",
     "CameraCalibration": "rgbmidic.fields",
+    "FiniteElementMesh": "rgbmidic.mesh",
     "Inspection": "rgbmidic.lab.inspection",
     "NodeStatus": "rgbmidic.correlation",
+    "Placement": "rgbmidic.mesh",
     "Region": "rgbmidic.mesh",
     "Result": "rgbmidic.results",
     "RgbmidicError": "rgbmidic.errors",
@@ -61,6 +66,7 @@ _HOMES = {
     "measure": "rgbmidic.pipeline",
     "measure_sequence": "rgbmidic.pipeline",
     "read_frame": "rgbmidic.frames",
+    "read_mesh": "rgbmidic.mesh",
     "read_test": "rgbmidic.settings",
 }
 

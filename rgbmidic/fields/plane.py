@@ -162,6 +162,14 @@ class CameraCalibration:
         homogeneous = np.c_[straight - self.centre, np.ones(len(points))] @ np.r_[values[8:], 1.0].reshape(3, 3).T
         return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
 
+    def to_px(self, points: FloatArray) -> FloatArray:
+        """Return the inverse of `to_mm` at points (N, 2) of the plane, px."""
+        values = self.parameters
+        back = np.linalg.inv(np.r_[values[8:], 1.0].reshape(3, 3))
+        homogeneous = np.c_[points, np.ones(len(points))] @ back.T
+        straight = homogeneous[:, :2] / homogeneous[:, 2:] + self.centre
+        return straight if self.lens is None else distorted(values[:8], straight)
+
     def jacobian(self, points: FloatArray) -> FloatArray:
         """Derivative (N, 2, 2) of `to_mm` by the pixel at points (N, 2): ``[n, mm axis, px axis]``, mm per px."""
         values = self.parameters

@@ -1,7 +1,8 @@
-"""Region of interest, TRI3 mesh and pixel map."""
+"""Region of interest, TRI3 mesh and pixel map, and finite-element meshes of files with their placement."""
 
+from rgbmidic.mesh.files import FiniteElementMesh, Placement, read_mesh
 from rgbmidic.mesh.pixel_map import PixelMap
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
 
-__all__ = ["PixelMap", "Region", "Tri3Mesh"]
+__all__ = ["FiniteElementMesh", "PixelMap", "Placement", "Region", "Tri3Mesh", "read_mesh"]
