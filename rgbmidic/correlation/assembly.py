@@ -27,7 +27,16 @@ from rgbmidic.mesh import PixelMap, Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["BLOCK", "Assembly", "Elimination", "RigidMotions", "block_side", "rigid_functions", "unfitted_fraction"]
+__all__ = [
+    "BLOCK",
+    "OF_ELEMENT",
+    "Assembly",
+    "Elimination",
+    "RigidMotions",
+    "block_side",
+    "rigid_functions",
+    "unfitted_fraction",
+]
 
 _SINGULAR = 1e11
 """Entries of a node's own block over what is left of it when the others are eliminated, from which that is rounding:
@@ -339,7 +348,7 @@ class RigidMotions:
 
 BLOCK = 13
 """Least side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
-_OF_ELEMENT = 0.75
+OF_ELEMENT = 0.75
 """Side of a block in sides of an element: what elements cannot follow is alike over about that. With 13 px the error of
 40 px elements on waves of 3 to 5 elements was 1.5 to 2.3 times the stated one, so 0.8 to 1.2 times (DIC Challenge)."""
 _ACROSS = 4
@@ -358,7 +367,7 @@ _LEAST = 0.05
 
 def block_side(pixels: PixelMap, element: float) -> int:
     """Side (px) of the blocks for elements of side `element` (px); a small region has `_ACROSS` of them across."""
-    return max(BLOCK, min(round(_OF_ELEMENT * element), min(pixels.bounds[2:]) // _ACROSS))
+    return max(BLOCK, min(round(OF_ELEMENT * element), min(pixels.bounds[2:]) // _ACROSS))
 
 
 def unfitted_fraction(
