@@ -73,11 +73,7 @@ class Plate:
     @classmethod
     def of(cls, size: float, *, modulus: float = 70e3, strain: float = 4e-3, name: str = "plate") -> Plate:
         """Elements of `size` px, and a traction that strains a plate without hole of 70 GPa by `strain`."""
-        x0, y0, x1, y1 = EDGES
-        angle = np.linspace(0, 2 * np.pi, 41)[:-1]
-        hole = np.array(CENTRE) + RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-        drawn = Tri3Mesh.from_region(Region.from_polygon(corners, SHAPE).without([hole]), size)
+        drawn = Tri3Mesh.from_region(cls.region(), size)
         mesh = FiniteElementMesh(
             name=name,
             points=PLACEMENT.to_mm(drawn.nodes),
@@ -87,6 +83,14 @@ class Plate:
         )
         moved = plane_stress(mesh.points, mesh.elements, modulus=modulus, poisson=0.33, traction=70e3 * strain)
         return cls(mesh=mesh, displacement=moved)
+
+    @staticmethod
+    def region() -> Region:
+        """The pixels of the plate."""
+        x0, y0, x1, y1 = EDGES
+        angle = np.linspace(0, 2 * np.pi, 41)[:-1]
+        hole = np.array(CENTRE) + RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return Region.from_polygon([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], SHAPE).without([hole])
 
     @property
     def nodes(self) -> FloatArray:
