@@ -24,6 +24,7 @@ from rgbmidic.errors import ConfigurationError
 __all__ = [
     "BAYER_PATTERNS",
     "ELEMENT_SIZE",
+    "LENGTH_UNITS",
     "FrameKind",
     "FrameSettings",
     "IlluminationSettings",
@@ -60,6 +61,9 @@ FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]
 
 ELEMENT_SIZE = 25.0
 """Side of the elements in px where nobody states another: the paper's (section 2.2)."""
+
+LENGTH_UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
+"""Millimetres in a length of 1 of a mesh's file."""
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """The four phases of the Bayer colour filter array, named by the top-left 2x2 cell read row by row."""
@@ -200,6 +204,8 @@ class IlluminationSettings(_Checked):
 class RegionSettings(_Checked):
     """The region of interest (``[region]``): exactly one of rectangle, polygon and mask, without the holes.
 
+    With ``mesh.file`` the region is the mesh's area, and these, if stated, restrict it.
+
     Attributes
     ----------
     rectangle
@@ -221,7 +227,7 @@ class RegionSettings(_Checked):
 
     def _check(self) -> None:
         stated = sum(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
-        _require(stated == 1, f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}")
+        _require(stated <= 1, f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}")
         if self.rectangle is not None:
             x0, y0, x1, y1 = self.rectangle
             _require(
@@ -232,6 +238,11 @@ class RegionSettings(_Checked):
             _require_corners("region.polygon", self.polygon, 3, "three")
         for number, hole in enumerate(self.holes):
             _require_corners(f"region.holes[{number}]", hole, 3, "three")
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether there is a rectangle, polygon or mask."""
+        return any(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -474,9 +485,18 @@ class TestSettings(_Checked):
         ``accept`` in ``[calibration]``: checks of the reference frame against the calibration whose contradictions are
         accepted (`rgbmidic.illumination.frame_check`).
     element_size
-        ``element_size`` in ``[mesh]``: side of the elements in px.
+        ``element_size`` in ``[mesh]``: side of the elements in px; None with `mesh_file`, which has its own.
     cracks
         ``cracks`` in ``[mesh]``: paths, each of corners (x, y) in px on the reference, along which the mesh is split.
+    mesh_file
+        ``file`` in ``[mesh]``: finite-element mesh to measure on (`rgbmidic.read_mesh`).
+    mesh_points
+        ``points`` in ``[mesh]``: pairs (x_mm, y_mm, x_px, y_px), two or more, that say where it lies on the image
+        (`rgbmidic.Placement.fit`).
+    mesh_unit
+        ``unit`` in ``[mesh]``: unit of length of the file; the points are in mm.
+    mesh_part
+        ``part`` in ``[mesh]``: set of its elements that is measured; None: all.
     base
         Folder that relative paths start from.
     """
@@ -484,11 +504,17 @@ class TestSettings(_Checked):
     __test__ = False
 
     frames: FrameSettings
-    region: RegionSettings
+    region: RegionSettings = field(default_factory=RegionSettings)
     calibration_file: Path | None = field(default=None, metadata={"key": "calibration.file"})
     accept: tuple[FrameCheck, ...] = field(default=(), metadata={"key": "calibration.accept"})
-    element_size: float = field(default=ELEMENT_SIZE, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
+    element_size: float | None = field(default=None, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
     cracks: tuple[tuple[tuple[float, float], ...], ...] = field(default=(), metadata={"key": "mesh.cracks"})
+    mesh_file: Path | None = field(default=None, metadata={"key": "mesh.file"})
+    mesh_points: tuple[tuple[float, float, float, float], ...] | None = field(
+        default=None, metadata={"key": "mesh.points"}
+    )
+    mesh_unit: Literal["mm", "m", "um", "inch"] | None = field(default=None, metadata={"key": "mesh.unit"})
+    mesh_part: str | None = field(default=None, metadata={"key": "mesh.part"})
     illumination: IlluminationSettings = field(default_factory=IlluminationSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
@@ -500,6 +526,30 @@ class TestSettings(_Checked):
     def _check(self) -> None:
         for number, crack in enumerate(self.cracks):
             _require_corners(f"mesh.cracks[{number}]", crack, 2, "two")
+        if self.mesh_file is None:
+            for key in ("points", "unit", "part"):
+                _require(getattr(self, f"mesh_{key}") is None, f"mesh.{key} is for mesh.file, which is missing")
+            _require(self.region.is_stated, "[region] needs exactly one of rectangle, polygon, mask; given are 0")
+            if self.element_size is None:
+                object.__setattr__(self, "element_size", ELEMENT_SIZE)
+            return
+        for key in ("element_size", "cracks"):
+            _require(
+                not getattr(self, key), f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out"
+            )
+        pairs = self.mesh_points or ()
+        _require(
+            len(pairs) >= 2, f"mesh.file needs mesh.points, two or more [x_mm, y_mm, x_px, y_px], not {len(pairs)}"
+        )
+        _require(
+            self.scale.mm_per_pixel is None,
+            f"scale.mm_per_pixel ({self.scale.mm_per_pixel}) states a scale, mesh.points hold another: leave it out",
+        )
+
+    @property
+    def side(self) -> float:
+        """Side of the elements in px, where the mesh is made here; the default where it is not."""
+        return self.element_size or ELEMENT_SIZE
 
     @classmethod
     def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:

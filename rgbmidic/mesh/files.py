@@ -1,8 +1,9 @@
 """Finite-element meshes from files (Abaqus, gmsh, Nastran, VTU and more), and where they lie on the image.
 
-meshio reads all formats but Abaqus', of which it keeps neither the labels nor more than the last ``*NODE`` block. A
-placement is a similarity of the mesh's plane to the image, or a rigid motion of it to the plane of a calibrated camera,
-fitted to pairs of points (Umeyama, IEEE Transactions on Pattern Analysis and Machine Intelligence 13, 1991).
+meshio reads all formats but two: of Abaqus' it keeps neither the labels nor more than the last ``*NODE`` block, of
+gmsh's no labels, and with numpy 2 it fails on some. A placement is a similarity of the mesh's plane to the image, or
+a rigid motion of it to the plane of a calibrated camera, fitted to pairs of points (Umeyama, IEEE Transactions on
+Pattern Analysis and Machine Intelligence 13, 1991).
 """
 
 from __future__ import annotations
@@ -10,24 +11,25 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.command import optional
-from rgbmidic.errors import InputError, RgbmidicError, first_line
-from rgbmidic.settings import regular
+from rgbmidic.errors import InputError, RegionError, RgbmidicError, first_line
+from rgbmidic.mesh.region import Region
+from rgbmidic.mesh.tri3 import Tri3Mesh
+from rgbmidic.settings import LENGTH_UNITS, regular
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["UNITS", "FiniteElementMesh", "Placement", "Plane", "read_mesh"]
+__all__ = ["FiniteElementMesh", "Placement", "Plane", "on_image", "read_mesh"]
 
 logger = logging.getLogger(__name__)
 
-UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
-"""Millimetres in a length of 1 of the file."""
 _FLAT = 1e-4
 """Distance of nodes from a plane, as a fraction of the mesh's extent, under which they lie on it: single precision and
 the eight columns of Nastran leave 1e-6 to 1e-5 (derived)."""
@@ -81,6 +83,9 @@ class FiniteElementMesh:
         if not np.isfinite(points).all() or not len(elements) or elements.min() < 0 or elements.max() >= len(points):
             raise InputError(f"{self.name}: points must be finite and elements must name existing ones")
         area = _cross(points, elements)
+        if not (np.abs(area) > 1e-12 * np.ptp(points, axis=0).max() ** 2).all():
+            number = np.asarray(self.element_numbers)[np.argmin(np.abs(area))]
+            raise InputError(f"{self.name}: element {number} has no area")
         elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
         for key, values, count in (
             ("points", points, len(points)),
@@ -92,6 +97,18 @@ class FiniteElementMesh:
                 raise InputError(f"{self.name}: {key} needs {count} entries, not {len(values)}")
             values.setflags(write=False)
             object.__setattr__(self, key, values)
+
+    def part(self, chosen: BoolArray) -> Self:
+        """Return the chosen triangles (E,), and their nodes."""
+        used, index = np.unique(self.elements[chosen], return_inverse=True)
+        return replace(
+            self,
+            points=self.points[used],
+            node_numbers=self.node_numbers[used],
+            elements=index.reshape(-1, 3).astype(np.int32),
+            element_numbers=self.element_numbers[chosen],
+            fields={key: values[used] for key, values in self.fields.items()},
+        )
 
     @property
     def areas(self) -> FloatArray:
@@ -291,6 +308,16 @@ class Placement:
         back = np.linalg.inv(self.matrix)
         return np.asarray(back / np.sqrt(abs(np.linalg.det(back))))
 
+    def to_document(self) -> dict[str, Any]:
+        """Return all but the camera in plain values, as the provenance of a result holds it."""
+        return {name: getattr(self, name).tolist() for name in ("matrix", "shift", "pairs")}
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], camera: Plane | None = None) -> Self:
+        """Return the placement of such values, and the `camera` that it was fitted with."""
+        values = {name: np.array(document[name], dtype=np.float64) for name in ("matrix", "shift", "pairs")}
+        return cls(**values, camera=camera)
+
     def summary(self) -> str:
         """Return what it is, in words."""
         turned = np.degrees(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
@@ -299,6 +326,55 @@ class Placement:
         )
         fit = f"{len(self.pairs)} pairs, residuals {self.rms:.2g} px rms"
         return f"{scale}x axis at {turned:.2f} degrees, y axis {'up' if self.reflected else 'down'}; {fit}"
+
+
+def on_image(
+    finite_elements: FiniteElementMesh, placement: Placement, shape: tuple[int, int], inside: Region | None = None
+) -> tuple[FiniteElementMesh, Tri3Mesh, Region]:
+    """Place a mesh on images of `shape` (H, W); the log states how much of it is left out.
+
+    Parameters
+    ----------
+    finite_elements, placement
+        The mesh, and where it lies.
+    shape
+        Rows and columns of the images.
+    inside
+        Only triangles whose centre lies in it.
+
+    Returns
+    -------
+    tuple
+        The part of the mesh that is measured, wholly within the image; the same in px; and the pixels that it covers.
+
+    Raises
+    ------
+    RegionError
+        No element is left.
+    """
+    corners = placement.to_px(finite_elements.points)[finite_elements.elements]
+    last = np.array([shape[1] - 1, shape[0] - 1])
+    within = np.asarray(((corners >= 0) & (corners <= last)).all(axis=(1, 2)), dtype=bool).reshape(-1)
+    kept = within.copy()
+    if inside is not None:
+        column, row = np.clip(np.round(corners[within].mean(axis=1)).astype(int), 0, last).T
+        kept[within] = inside.mask[row, column]
+    if not kept.any():
+        low, high = np.nanmin(corners, axis=(0, 1)), np.nanmax(corners, axis=(0, 1))
+        raise RegionError(
+            f"no element of {finite_elements.name} lies in the {'region' if within.any() else 'image'}: mesh.points "
+            f"place it at x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f} px of an image of "
+            f"{shape[1]} x {shape[0]} px"
+        )
+    every = len(kept)
+    for count, where in ((every - int(within.sum()), "the image"), (int((within & ~kept).sum()), "the region")):
+        if count:
+            logger.warning("%s: %d of %d triangles lie outside %s: left out", finite_elements.name, count, every, where)
+    part = finite_elements.part(kept)
+    mesh = Tri3Mesh(nodes=placement.to_px(part.points), elements=part.elements)
+    owner = np.full(shape, -1, dtype=np.int32)
+    claim_pixels(mesh.nodes, mesh.elements, owner)
+    return part, mesh, Region.from_mask(owner >= 0)
 
 
 _POINTING = 0.5
@@ -356,10 +432,10 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     Parameters
     ----------
     path
-        Abaqus (``.inp``), gmsh (``.msh``), Nastran (``.bdf``, ``.nas``, ``.fem``), VTK (``.vtu``, ``.vtk``), XDMF, and
-        what else meshio reads.
+        Abaqus (``.inp``), gmsh (``.msh``), Nastran (``.bdf``, ``.nas``, ``.fem``), VTK (``.vtu``, ``.vtk``), XDMF
+        (``.xdmf``), Medit (``.mesh``), AVS-UCD (``.avs``) or Netgen (``.vol``).
     unit
-        Unit of length of the file, one of `UNITS`; its numbers are multiplied so that they are mm.
+        Unit of length of the file, one of `rgbmidic.settings.LENGTH_UNITS`.
     part
         Only the elements of this set: an Abaqus element set or part, a gmsh physical group. None: all.
 
@@ -369,8 +445,8 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
         The file is missing or not readable, meshio is missing, or there is no plane.
     """
     path = Path(path)
-    if unit not in UNITS:
-        raise InputError(f'the unit of {path} must be one of {", ".join(UNITS)}, not "{unit}"')
+    if unit not in LENGTH_UNITS:
+        raise InputError(f'the unit of {path} must be one of {", ".join(LENGTH_UNITS)}, not "{unit}"')
     try:
         present = regular(path).is_file()
     except OSError as error:
@@ -389,13 +465,13 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     used, index = np.unique(corners, return_inverse=True)
     return FiniteElementMesh(
         name=str(path),
-        points=content.points[used][:, axes] * UNITS[unit],
+        points=content.points[used][:, axes] * LENGTH_UNITS[unit],
         node_numbers=content.numbers[used],
         elements=index.reshape(-1, 3).astype(np.int32),
         element_numbers=numbers,
         fields={key: values[used] for key, values in content.fields.items()},
         axes=axes,
-        unit_mm=UNITS[unit],
+        unit_mm=LENGTH_UNITS[unit],
         numbering=content.numbering,
     )
 
@@ -497,31 +573,45 @@ def _triangles(places: FloatArray, faces: IntArray, numbers: IntArray) -> tuple[
     return corners[proper], labels[proper]
 
 
+_FORMATS = {
+    ".msh": "gmsh",
+    ".vtu": "vtu",
+    ".vtk": "vtk",
+    ".bdf": "nastran",
+    ".nas": "nastran",
+    ".fem": "nastran",
+    ".xdmf": "xdmf",
+    ".mesh": "medit",
+    ".avs": "avsucd",
+    ".vol": "netgen",
+}
+"""Formats by the files' endings: those of meshio's that were tried with numpy 2 (med and cgns fail, some never end)."""
 _NUMBERS = ("GlobalNodeId", "node_number", "node_id", "NodeId", "GlobalElementId", "element_number", "element_id")
 """Names under which VTK files keep labels: ParaView's of both, this package's own, and those of converters."""
 
 
 def _read_meshio(path: Path) -> _File:
     """Read a file with meshio, and the labels that it leaves out."""
-    meshio = optional("meshio", "fe")
-    kinds = meshio.extension_to_filetypes.get(path.suffix.lower(), [])
-    if not kinds:
-        known = ", ".join(sorted({*meshio.extension_to_filetypes, ".inp"}))
+    kind = _FORMATS.get(path.suffix.lower())
+    if kind is None:
+        known = ", ".join([".inp", *_FORMATS])
         raise InputError(f'{path} has the ending "{path.suffix}"; meshes are read from {known}')
-    reasons = []
-    for kind in kinds:
-        try:
-            mesh = getattr(meshio, kind).read(str(path))
-            break
-        except Exception as error:  # of meshio's readers any may come, from text that is no mesh
-            reasons.append(f"{kind}: {first_line(error)}")
-    else:
-        raise InputError(f"{path} is not a readable mesh ({'; '.join(reasons)})")
+    if kind == "gmsh":
+        with path.open("rb") as file:
+            if not file.read(200).lstrip().startswith(b"$"):
+                raise InputError(f"{path} is not a gmsh file: it does not begin with a section such as $MeshFormat")
+        if (text := _read_gmsh(path)) is not None:
+            return text
+    reader = optional(f"meshio.{kind}", "fe")
+    try:
+        mesh = reader.read(str(path))
+    except Exception as error:  # of meshio's readers any may come, from text that is no mesh
+        raise InputError(f"{path} is not a readable mesh ({kind}: {first_line(error)})") from None
     points = np.zeros((len(mesh.points), 3))
     points[:, : np.shape(mesh.points)[1]] = mesh.points
     sizes = [len(block.data) for block in mesh.cells]
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    numbers, labels, numbering = _labels(path, kind, mesh, len(points), int(starts[-1]))
+    numbers, labels, numbering = _labels(kind, mesh, len(points), int(starts[-1]))
     sets: dict[str, list[BoolArray]] = {}
     for name, members in mesh.cell_sets.items():
         sets[name] = [np.isin(np.arange(size), np.asarray(m)) for size, m in zip(sizes, members, strict=False)]
@@ -546,15 +636,13 @@ def _read_meshio(path: Path) -> _File:
     return _File(points=points, numbers=numbers, blocks=blocks, fields=fields, numbering=numbering)
 
 
-def _labels(path: Path, kind: str, mesh: Any, nodes: int, cells: int) -> tuple[IntArray, IntArray, str]:
+def _labels(kind: str, mesh: Any, nodes: int, cells: int) -> tuple[IntArray, IntArray, str]:
     """Return the labels of points and cells, and where they are from."""
     if hasattr(mesh, "points_id"):  # Nastran
         return np.asarray(mesh.points_id, dtype=np.int64), np.concatenate(mesh.cells_id), "labels of the file"
     first = 0 if kind in ("vtu", "vtk", "xdmf") else 1
     numbers, labels = np.arange(first, first + nodes), np.arange(first, first + cells)
     stated = f"counted from {first} in the order of the file, which has no labels that can be read"
-    if kind == "gmsh" and (tags := _gmsh_tags(path)) is not None and tags[0].size == nodes and tags[1].size == cells:
-        return *tags, "labels of the file"
     for name in _NUMBERS:
         if name in mesh.point_data:
             numbers, stated = np.asarray(mesh.point_data[name]).astype(np.int64).ravel(), f'point data "{name}"'
@@ -563,32 +651,79 @@ def _labels(path: Path, kind: str, mesh: Any, nodes: int, cells: int) -> tuple[I
     return numbers, labels, stated
 
 
-def _gmsh_tags(path: Path) -> tuple[IntArray, IntArray] | None:
-    """Return the tags of nodes and elements of a gmsh file in text, versions 2 and 4; None of any other."""
-    lines = iter(path.read_bytes().split(b"\n"))
-    tags: dict[bytes, list[int]] = {b"$Nodes": [], b"$Elements": []}
-    version = 0.0
+def _read_gmsh(path: Path) -> _File | None:
+    """Read a gmsh file in text, versions 2 and 4, which numpy 2 keeps meshio from; None of one in binary."""
+    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
+    version, names = 0.0, dict[tuple[int, int], str]()
+    groups = dict[tuple[int, int], list[int]]()  # physical groups of the entities of version 4
+    nodes = dict[int, list[float]]()
+    cells = dict[str, list[tuple[int, list[int], list[tuple[int, int]]]]]()
+
+    def add(kind: int, tag: int, corners: Sequence[int], member: list[tuple[int, int]]) -> None:
+        if kind in _GMSH:
+            shape = _GMSH[kind]
+            cells.setdefault(shape, []).append((tag, list(corners[: _CORNERS[shape]]), member))
+
     for line in lines:
         section = line.strip()
-        if section == b"$MeshFormat":
+        if section == "$MeshFormat":
             number, is_binary, *_ = next(lines).split()
             version = float(number)
             if int(is_binary):
                 return None
-        elif section in tags:
-            counts = next(lines).split()
-            if version < 4:
-                tags[section] += [int(next(lines).split()[0]) for _ in range(int(counts[0]))]
-                continue
-            for _ in range(int(counts[0])):
-                count = int(next(lines).split()[-1])
-                tags[section] += [int(next(lines).split()[0]) for _ in range(count)]
-                if section == b"$Nodes":
-                    for _ in range(count):  # the coordinates
-                        next(lines)
-    return np.array(tags[b"$Nodes"], dtype=np.int64), np.array(tags[b"$Elements"], dtype=np.int64)
+        elif section == "$PhysicalNames":
+            for _ in range(int(next(lines))):
+                axis, number, title = next(lines).split(maxsplit=2)
+                names[int(axis), int(number)] = title.strip().strip('"')
+        elif section == "$Entities":
+            for dimension, count in enumerate(map(int, next(lines).split())):
+                for _ in range(count):
+                    entity, *about = next(lines).split()
+                    at = 3 if dimension == 0 else 6
+                    groups[dimension, int(entity)] = [abs(int(n)) for n in about[at + 1 : at + 1 + int(about[at])]]
+        elif section == "$Nodes" and version < 4:
+            for _ in range(int(next(lines))):
+                label, *place = next(lines).split()
+                nodes[int(label)] = [float(x) for x in place]
+        elif section == "$Nodes":
+            for _ in range(int(next(lines).split()[0])):
+                count = int(next(lines).split()[3])
+                labels = [int(next(lines)) for _ in range(count)]
+                nodes.update((label, [float(x) for x in next(lines).split()[:3]]) for label in labels)
+        elif section == "$Elements" and version < 4:
+            for _ in range(int(next(lines))):
+                tag, kind, width, *rest = map(int, next(lines).split())
+                add(kind, tag, rest[width:], [(-1, rest[0])] if width else [])
+        elif section == "$Elements":
+            for _ in range(int(next(lines).split()[0])):
+                level, entity_tag, kind, count = map(int, next(lines).split())
+                member = [(level, group) for group in groups.get((level, entity_tag), ())]
+                for _ in range(count):
+                    tag, *corners = map(int, next(lines).split())
+                    add(kind, tag, corners, member)
+    index = {label: i for i, label in enumerate(nodes)}
+    blocks = []
+    for shape, every in cells.items():
+        sets: dict[str, BoolArray] = {}
+        for row, (_, _, member) in enumerate(every):
+            for dimension, group in member:
+                flat = 2 if shape in ("triangle", "quad") else 3
+                name = names.get((flat if dimension < 0 else dimension, group), str(group))
+                sets.setdefault(name, np.zeros(len(every), dtype=bool))[row] = True
+        connected = np.array([[index[node] for node in corners] for _, corners, _ in every])
+        blocks.append(_Block(kind=shape, nodes=connected, numbers=np.array([tag for tag, _, _ in every]), sets=sets))
+    return _File(points=np.array(list(nodes.values())), numbers=np.array(list(nodes)), blocks=blocks)
 
 
+_GMSH = {
+    **dict.fromkeys((2, 9, 20, 21), "triangle"),
+    **dict.fromkeys((3, 10, 16, 36), "quad"),
+    **dict.fromkeys((4, 11), "tetra"),
+    **dict.fromkeys((5, 12, 17), "hexahedron"),
+    **dict.fromkeys((6, 13, 18), "wedge"),
+    **dict.fromkeys((7, 14, 19), "pyramid"),
+}
+"""Shapes of gmsh's numbers of element types, of first to third order (its manual, "Node ordering")."""
 _PLANES = {
     "CPS",
     "CPE",

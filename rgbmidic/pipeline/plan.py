@@ -29,7 +29,8 @@ from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.illumination.texture import speckle_diameter
-from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
+from rgbmidic.mesh.files import on_image
 from rgbmidic.pipeline.pair import as_weights
 from rgbmidic.pipeline.separation import (
     LightSeparation,
@@ -51,6 +52,7 @@ __all__ = [
     "UpdatedReferences",
     "check_texture",
     "exposure_fault",
+    "finite_elements_of",
     "neighbour_correlation",
     "read_region",
     "too_small",
@@ -120,6 +122,8 @@ class Plan:
         Side of the elements, px.
     window
         Part of the reference frames that is read; all positions (region, mesh, images) count from where it begins.
+    finite_elements, placement
+        The mesh of ``mesh.file``, the part that is measured, and where it lies in the frame; None: there is no file.
     timings
         Whether to tell the time that each stage of a frame takes.
     updates
@@ -136,6 +140,8 @@ class Plan:
     speckle: float | None
     window: Window
     element_size: float
+    finite_elements: FiniteElementMesh | None = None
+    placement: Placement | None = None
     timings: bool = False
     updates: UpdatedReferences = field(default_factory=UpdatedReferences, repr=False, compare=False)
 
@@ -179,15 +185,20 @@ class Plan:
         series, calibration = _series_and_calibration(settings, source)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         whole = any(one is not None for one in (source, weights, mesh, region))
+        finite_elements, placement = None, None
+        if settings.mesh_file is not None:
+            finite_elements, placement, mesh, region = finite_elements_of(settings, series.shape)
         if whole or not isinstance(separate, WindowedSeparation):
             region, window = region or read_region(settings.region, series.shape), Window.whole(series.shape)
         else:
-            region, window = _region_and_window(settings, series.shape)
+            region, window = _region_and_window(settings, region, series.shape)
+            if mesh is not None:
+                mesh = Tri3Mesh(nodes=mesh.nodes - window.origin, elements=mesh.elements)
         rest = _Rest.read(settings, series, separate, window)
         if separation is not None and isinstance(rest.states[0], IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
         rest.check_calibrated(calibration, region, window, settings)
-        size = settings.element_size if mesh is None else mesh.size
+        size = settings.side if mesh is None else mesh.size
         if mesh is None:
             mesh = Tri3Mesh.from_region(region, size, [np.subtract(path, window.origin) for path in settings.cracks])
         weights = weights or prepare_weights(
@@ -208,7 +219,9 @@ class Plan:
             registration=rest.images.registration,
         )
         speckle = _speckle(rest.images, region)
-        if small := too_small(size, speckle, HARDLY_ENOUGH):
+        if finite_elements is not None:
+            _tell_small(mesh, speckle, finite_elements)
+        elif small := too_small(size, speckle, HARDLY_ENOUGH):
             logger.warning("%s", small)
         rest.check_seen(reference, region)
         return cls(
@@ -222,6 +235,8 @@ class Plan:
             speckle=speckle,
             window=window,
             element_size=size,
+            finite_elements=finite_elements,
+            placement=placement,
         )
 
     def lights(self, state: RawState, window: Window) -> IlluminationImages:
@@ -316,6 +331,8 @@ def _check_given(
             f'weights.method = "{settings.weights.method}", and weights are given: state "statistics", with which both '
             'count, or "none"'
         )
+    if mesh is not None and settings.mesh_file is not None:
+        raise ConfigurationError(f"mesh.file names {settings.mesh_file}, and a mesh is given: leave one of them out")
     if mesh is not None and settings.cracks:
         raise ConfigurationError("mesh.cracks splits a mesh that is made here; the mesh that is given has its own")
     kind = settings.frames.kind
@@ -339,9 +356,57 @@ def _series_and_calibration(settings: TestSettings, source: FrameSequence | None
     return series, calibration and calibration.cropped(settings.frames.crop_origin, series.shape)
 
 
-def _region_and_window(settings: TestSettings, frame: tuple[int, int]) -> tuple[Region, Window]:
+def finite_elements_of(
+    settings: TestSettings, frame: tuple[int, int]
+) -> tuple[FiniteElementMesh, Placement, Tri3Mesh, Region]:
+    """The part of ``mesh.file`` that is measured, where it lies on frames of this shape, and its pixels."""
+    assert settings.mesh_file is not None
+    camera = None if settings.scale.camera is None else CameraCalibration.read(settings.scale.camera)
+    placement = Placement.fit(settings.mesh_points or (), camera)
+    logger.info("mesh.points: %s", placement.summary())
+    limits = settings.region
+    allowed = read_region(limits, frame) if limits.is_stated else Region.from_mask(np.ones(frame, dtype=bool))
+    every = read_mesh(settings.mesh_file, unit=settings.mesh_unit or "mm", part=settings.mesh_part)
+    part, mesh, region = on_image(every, placement, frame, allowed.without(limits.holes))
+    return part, placement, mesh, region
+
+
+_ORDINARY = 3.0
+"""Speckles on the side of an element that the uncertainty of smaller ones is compared with (issue 25)."""
+
+
+def _tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteElementMesh) -> None:
+    """Warn of finite elements that are small for the speckle, with the uncertainty to expect.
+
+    It goes with the inverse of the element's side (`rgbmidic.scene.forecast.node_constant`).
+    """
+    sides = np.sqrt(2 * mesh.areas)
+    small = np.zeros(sides.size, dtype=bool) if speckle is None else sides < _ORDINARY * speckle
+    if speckle is None or not small.any():
+        return
+    least = int(np.argmin(sides))
+    typical = float(np.median(sides[small]))
+    logger.warning(
+        "%s: %d of %d triangles have sides under %g speckles of %.1f px, %.1f px in the median (element %d: %.1f px): "
+        "expect %.1f times (%.1f times) the uncertainty of elements of %g speckles; with fewer than %g nodes are lost",
+        finite_elements.name,
+        int(small.sum()),
+        sides.size,
+        _ORDINARY,
+        speckle,
+        typical,
+        finite_elements.element_numbers[least],
+        sides[least],
+        _ORDINARY * speckle / typical,
+        _ORDINARY * speckle / sides[least],
+        _ORDINARY,
+        _ENOUGH,
+    )
+
+
+def _region_and_window(settings: TestSettings, region: Region | None, frame: tuple[int, int]) -> tuple[Region, Window]:
     """The region, counted from where the window begins, and the part of the reference frames that is read."""
-    region = read_region(settings.region, frame)
+    region = region or read_region(settings.region, frame)
     spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (0, 1)]
     corners = np.array([[span[0], span[-1]] for span in spans], dtype=np.float64).T
     window = _window(corners, search_reach(corners), settings, frame)

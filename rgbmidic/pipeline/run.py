@@ -215,6 +215,8 @@ def _store(
         nodes=plan.reference.mesh.nodes + plan.window.origin,
         elements=plan.reference.mesh.elements,
         names=[series.name(index) for index in series.chosen],
+        finite_elements=plan.finite_elements,
+        placement=plan.placement,
         lights=plan.images.names,
         settings=plan.settings,
         inputs={" + ".join(plan.settings.frames.path) or "source": fingerprint, **objects},

@@ -121,6 +121,12 @@ def _coordinates(physical: Physical) -> dict[str, xr.Variable]:
         for axis, way, values in zip("xy", ("to the right", "down"), nodes.T, strict=True):
             about = {"units": unit, "long_name": f"position of the node on {where}, {way}"}
             coordinates[axis if unit == "px" else f"{axis}_{unit}"] = xr.Variable("node", values, about)
+    if result.node_mm is not None:
+        for name, axis in {"node_number": "node", "element_number": "element"}.items():
+            coordinates[name] = xr.Variable(axis, getattr(result, name), SHARED[name].attributes)
+        for axis, values in zip("xy", result.node_mm.T, strict=True):
+            about = {"units": "mm", "long_name": SHARED["node_mm"].meaning}
+            coordinates[f"{axis}_mesh"] = xr.Variable("node", values, about)
     if (times := frame_times(result, physical.scale)) is not None:
         about = {"units": "s", "long_name": "time of the frame from the trigger"}
         coordinates["time"] = xr.Variable("frame", times, about)

@@ -26,7 +26,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields import column
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.physical import Physical
-from rgbmidic.results.quantities import QUANTITIES, ResultQuantity
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
@@ -161,7 +161,11 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     _add(out, "name", np.array(result.names, dtype=text), ("time",), "1", "name of the frame")
     for name, (unit, values) in physical.places.items():
         way, where = ("to the right" if name[0] == "x" else "down"), physical.where(name)
+        way = f"along {name[0]}" if name.endswith("_mesh") else way
         _add(out, name, values, node, unit, f"position of the node on {where}, {way}")
+    for name, axes in {"node_number": node, "element_number": element}.items():
+        if (numbers := getattr(result, name)) is not None:
+            _add(out, name, numbers, axes, "1", SHARED[name].meaning)
     _add(out, "elements", mesh.elements, ("element", "corner"), "1", "nodes of the element, counted from 0")
     _add(out, "x_element", x_element, element, units.length, "middle of the element, to the right")
     _add(out, "y_element", y_element, element, units.length, "middle of the element, down")
@@ -223,6 +227,10 @@ def _declare_grid(group: h5py.Group, physical: Physical) -> None:
             _declare_nodal(data, group.file[entry.name], turned=entry.name in _TURNED)
     for name in data:
         steps[f"PointDataOffsets/{name}"] = nodes * np.arange(frames, dtype=np.int64)
+    if (result := physical.result).node_number is not None:  # the same at every step
+        data["node_number"], steps["PointDataOffsets/node_number"] = result.node_number, first
+        group.create_group("CellData")["element_number"] = result.element_number
+        steps["CellDataOffsets/element_number"] = first
 
 
 def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, turned: bool) -> None:
@@ -243,7 +251,8 @@ def export_result(
 ) -> None:
     """Write all frames of a result into one file.
 
-    ``"npz"`` is the store, in px: nodes (N, 2), elements (E, 3), names (T,), lights (k,) and every quantity of
+    ``"npz"`` is the store, in px: nodes (N, 2), elements (E, 3), names (T,), lights (k,), of a mesh of ``mesh.file``
+    node_number (N,), element_number (E,) and node_mm (N, 2), and every quantity of
     `rgbmidic.results.QUANTITIES` that has one shape in all frames, the frames as first axis.
     ``"csv"`` and ``"hdf5"`` are for engineers: seconds, millimetres where the scale is known, Green-Lagrange
     strain over the shortest virtual strain gauge. csv has a header line, whose names hold the units, and a row per node
@@ -281,7 +290,8 @@ def export_result(
 def _write_npz(physical: Physical, file: BinaryIO) -> None:
     result = physical.result
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in ("nodes", "elements", "names", "lights"):
+        stated = FINITE_ELEMENTS if result.node_number is not None else ()
+        for name in ("nodes", "elements", "names", "lights", *stated):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(getattr(result, name)), allow_pickle=False)
         for quantity in QUANTITIES.values():
@@ -301,7 +311,8 @@ def _write_csv(physical: Physical, file: BinaryIO) -> None:
     del fields["node_status"]  # a whole number
     places, writer = physical.places, csv.writer(text)
     time = ["time_s"] if physical.units.timed else []
-    head = ["frame", "number", "name", *time, "status", "node", "node_status"]
+    label = [] if result.node_number is None else [result.node_number.tolist()]
+    head = ["frame", "number", "name", *time, "status", "node", *(["node_number"] if label else []), "node_status"]
     writer.writerow(
         [
             *head,
@@ -314,7 +325,10 @@ def _write_csv(physical: Physical, file: BinaryIO) -> None:
         start = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if time else []), values["status"]]
         numbers = np.column_stack([*(place for _, place in places.values()), *(values[name] for name in fields)])
         for node, (code, row) in enumerate(zip(values["node_status"].tolist(), numbers.tolist(), strict=True)):
-            writer.writerow([*start, node, code, *("" if number != number else f"{number:.9g}" for number in row)])
+            known = (numbers_of[node] for numbers_of in label)
+            writer.writerow(
+                [*start, node, *known, code, *("" if number != number else f"{number:.9g}" for number in row)]
+            )
     text.detach()  # leaves the file open for whoever opened it
 
 

@@ -31,7 +31,7 @@ from rgbmidic.fields import (
     reference_fraction,
     strain_of_gradient,
 )
-from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh import Placement, Tri3Mesh
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section, regular
@@ -42,6 +42,7 @@ __all__ = [
     "Physical",
     "exposure",
     "frame_times",
+    "placement_of",
     "probes_of",
     "rectification_of",
     "reference_frames",
@@ -95,7 +96,20 @@ def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rect
         camera = CameraCalibration.from_document(kept, str(scale_of(result).camera))
     if camera is not None:
         camera.check(result.frame_shape or camera.shape)
-    return Rectification.of(mesh, scale_of(result) if scale is None else scale, camera)
+    stated = scale_of(result) if scale is None else scale
+    if camera is None and stated.mm_per_pixel is None and (placed := placement_of(result)) is not None:
+        stated = replace(stated, mm_per_pixel=placed.mm_per_pixel, mm_per_pixel_std=placed.mm_per_pixel_std)
+    return Rectification.of(mesh, stated, camera)
+
+
+def placement_of(result: Result) -> Placement | None:
+    """Return where the mesh of ``mesh.file`` lies on the image; None where the result has none."""
+    kept = result.provenance.get("finite_elements")
+    if kept is None:
+        return None
+    document = result.provenance.get("camera")
+    camera = None if document is None else CameraCalibration.from_document(document, str(scale_of(result).camera))
+    return Placement.from_document(kept["placement"], camera)
 
 
 def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
@@ -354,6 +368,8 @@ class Physical:
 
     def where(self, name: str) -> str:
         """Say what one of the `places` lies on."""
+        if name.endswith("_mesh"):
+            return "the mesh of mesh.file, in its own axes"
         plane = self.rectified.camera is not None and not name.endswith("_image")
         return "the plane of the specimen at the reference" if plane else "the reference image"
 
@@ -363,6 +379,8 @@ class Physical:
         found = {name: (self.units.length, self.length * x) for name, x in zip("xy", self.mesh.nodes.T, strict=True)}
         if self.rectified.camera is not None:
             found |= {f"{name}_image": ("px", x) for name, x in zip("xy", self.result.nodes.T, strict=True)}
+        if self.result.node_mm is not None:
+            found |= {f"{name}_mesh": ("mm", x) for name, x in zip("xy", self.result.node_mm.T, strict=True)}
         return found
 
     @cached_property

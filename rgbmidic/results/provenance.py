@@ -20,8 +20,9 @@ from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import file_hash
+from rgbmidic.mesh import FiniteElementMesh, Placement
 from rgbmidic.results.files import read_json
-from rgbmidic.results.quantities import SHARED
+from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray
 
@@ -62,6 +63,8 @@ class Origin:
     ----------
     nodes, elements
         The mesh: (N, 2) positions in px and (E, 3) node indices.
+    finite_elements, placement
+        The same mesh in mm with the numbers of its nodes and elements, and where it lies; None: it is of no file.
     names, lights
         Name of each frame and of each light.
     settings
@@ -82,14 +85,20 @@ class Origin:
     lights: Sequence[str]
     settings: TestSettings | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
+    finite_elements: FiniteElementMesh | None = None
+    placement: Placement | None = None
     references: Sequence[int] = (0,)
     reference: npt.ArrayLike | None = None
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def mesh(self) -> dict[str, AnyArray]:
-        """`nodes` and `elements` in the types of the table."""
-        return {name: SHARED[name].convert(getattr(self, name), {}) for name in ("nodes", "elements")}
+        """`nodes` and `elements`, and what is known of finite elements, in the types of the table."""
+        arrays: dict[str, npt.ArrayLike] = {"nodes": self.nodes, "elements": self.elements}
+        if (stated := self.finite_elements) is not None:
+            numbers = stated.node_numbers, stated.element_numbers, stated.points
+            arrays |= zip(FINITE_ELEMENTS, numbers, strict=True)
+        return {name: SHARED[name].convert(array, {}) for name, array in arrays.items()}
 
     def provenance(self) -> dict[str, Any]:
         """Return the content of ``provenance.json`` at the start of a run, in plain values."""
@@ -106,6 +115,12 @@ class Origin:
                 document["calibration"] = {"file": str(file), "sha256": file_hash(file)}
             if (file := self.settings.scale.camera) is not None:
                 document["camera"] = CameraCalibration.read(file).to_document()
+        if self.finite_elements is not None and self.placement is not None:
+            document["finite_elements"] = {
+                **{key: getattr(self.finite_elements, key) for key in ("name", "axes", "unit_mm", "numbering")},
+                "sha256": file_hash(Path(self.finite_elements.name)),
+                "placement": self.placement.to_document(),
+            }
         document |= {**self.notes, "lights": list(self.lights), "references": list(self.references)}
         document["frames"] = {"count": len(self.names), "sha256": digest(list(self.names))}
         document |= {"mesh": digest(self.mesh), "inputs": dict(self.inputs)}
@@ -152,6 +167,7 @@ def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     yield "the calibration", document.get("calibration", {}).get("sha256")
     yield from ((f"the input {name}", text) for name, text in document["inputs"].items())
     yield "the mesh", document["mesh"]
+    yield "the mesh's file", document.get("finite_elements", {}).get("sha256")
     yield "the number of frames", document["frames"]["count"]
     yield "the list of frames", document["frames"]["sha256"]
     yield from ((name, document[name]) for name in ("lights", "references"))

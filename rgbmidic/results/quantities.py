@@ -18,7 +18,7 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
 
-__all__ = ["QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "ResultQuantity"]
+__all__ = ["FINITE_ELEMENTS", "QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "ResultQuantity"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,12 +178,21 @@ QUANTITIES: dict[str, ResultQuantity] = {quantity.name: quantity for quantity in
 
 _CORNERS = "node indices; `(p1 - p0) x (p2 - p0) > 0` in (x, y)"
 _REFERENCE = "reference image of each light, stretched to 8 bit, for pictures"
+_LABEL = "number of the node in the file of `mesh.file`"
+_CELL = "number of the element in the file of `mesh.file` that the triangle is from"
+_OWN_AXES = "node positions (x, y) in the axes of the file of `mesh.file`"
 SHARED: dict[str, ResultQuantity] = {
     "nodes": ResultQuantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
     "elements": ResultQuantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
+    "node_number": ResultQuantity("node_number", ("node",), "", "", _LABEL, dtype=np.int64, blank=-1),
+    "element_number": ResultQuantity("element_number", ("element",), "", "", _CELL, dtype=np.int64, blank=-1),
+    "node_mm": ResultQuantity("node_mm", ("node", 2), "mm", "", _OWN_AXES, **_EXACT),
     "reference": ResultQuantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
 }
 """What all frames have in common."""
+
+FINITE_ELEMENTS = ("node_number", "element_number", "node_mm")
+"""Those of them that only a mesh of ``mesh.file`` has."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

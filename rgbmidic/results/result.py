@@ -63,6 +63,8 @@ class Result:
         The frames' names.
     lights : tuple of str, length k
         The lights' names.
+    node_number, element_number, node_mm : ndarray, shape (N,), (E,), (N, 2), or None
+        Of a mesh of ``mesh.file``: numbers of nodes and elements in the file, and positions (x, y) in mm in its axes.
     provenance
         Settings, versions and dates, as in ``provenance.json``.
 
@@ -81,6 +83,9 @@ class Result:
     names: tuple[str, ...]
     lights: tuple[str, ...]
     provenance: Mapping[str, Any]
+    node_number: npt.NDArray[np.int64] | None = None
+    element_number: npt.NDArray[np.int64] | None = None
+    node_mm: FloatArray | None = None
 
     @classmethod
     def open(cls, path: Path | str, *, partial: bool = False, check: bool = True) -> Self:

@@ -38,7 +38,7 @@ from rgbmidic.results.provenance import (
     read_provenance,
     sealed,
 )
-from rgbmidic.results.quantities import SHARED, FrameRecord
+from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED, FrameRecord
 from rgbmidic.results.shards import FrameTable, RecordLayout, ShardWriter, discard, shard_files
 from rgbmidic.typing import AnyArray, BoolArray
 
@@ -290,8 +290,15 @@ def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
-    """Read ``nodes`` (N, 2) and ``elements`` (E, 3); a `ResultError` where they are not those of the provenance."""
-    mesh = _read(path / _MESH, ["nodes", "elements"], {})
+    """Read ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `FINITE_ELEMENTS`.
+
+    Raises
+    ------
+    ResultError
+        They are not those of the provenance.
+    """
+    stated = FINITE_ELEMENTS if "finite_elements" in provenance else ()
+    mesh = _read(path / _MESH, ["nodes", "elements", *stated], {})
     if digest(mesh) != provenance["mesh"]:
         raise ResultError(f"{path / _MESH} is damaged or of another result")
     return mesh

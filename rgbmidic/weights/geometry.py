@@ -100,7 +100,7 @@ class GeometryWeights:
             limit_deg=weights.limit_deg,
             instrument=Instrument.of(
                 scene,
-                element_size=settings.element_size,
+                element_size=settings.side,
                 demosaic=settings.illumination.demosaic,
                 prefilter=settings.solver.prefilter,
             ),

@@ -24,7 +24,7 @@ from rgbmidic.lab.inspection.prediction import CONTRAST_WIDTH, LocalContrast, Pr
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture, surroundings
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline import read_region
+from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatImage
 
@@ -74,11 +74,16 @@ def inspect_files(
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     known = known and known.cropped(stated.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
+    sides = None if test is None else test.element_size
     if place is None and test is not None:
-        place = read_region(test.region, shape)
+        if test.mesh_file is None:
+            place = read_region(test.region, shape)
+        else:
+            _, _, mesh, place = finite_elements_of(test, shape)
+            sides = mesh.size
     how: dict[str, Any] = {"name": " + ".join(legible(path.name) for path in paths)}
     if test is not None:
-        how |= {"element_size": test.element_size, "accept": test.accept}
+        how |= {"element_size": sides or test.side, "accept": test.accept}
         how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
     how |= {key: value for key, value in options.items() if value is not None}
     try:
