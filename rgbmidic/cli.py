@@ -358,7 +358,7 @@ def compare(
     from rgbmidic.mesh import read_mesh
     from rgbmidic.report.comparison import PAGE, comparison_files, scale_text, write_comparison
     from rgbmidic.results import Result
-    from rgbmidic.results.comparison import Comparison, Simulation, placement_of
+    from rgbmidic.results.comparison import Comparison, Simulation, measured_mesh, place
 
     if rigid not in ("tell", "remove"):
         raise InputError(f'--rigid is tell or remove, not "{rigid}"')
@@ -366,8 +366,8 @@ def compare(
     pairs = [command.read_place(text, "--points", form) for text in points or ()]
     chosen, settings, result = _frames(frames), _settings(test), Result.open(folder, partial=partial)
     scale = None if settings is None else settings.scale
-    placement = placement_of(result, scale=scale, pairs=pairs or None)
-    numbered = None if mesh is None else read_mesh(mesh, unit=unit)
+    placement = place(result, scale=scale, pairs=pairs)
+    numbered = measured_mesh(result) if mesh is None else read_mesh(mesh, unit=unit)
     simulation = Simulation.read(fe, mesh=numbered, unit=unit, field=field, interval=interval, offset=offset)
     comparison = Comparison(result, simulation, placement, scale=scale, frames=chosen, remove_rigid=rigid == "remove")
     check_folder(out, comparison_files(comparison), overwrite=overwrite)

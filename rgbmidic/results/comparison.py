@@ -26,6 +26,7 @@ from typing import Self
 from xml.etree import ElementTree
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
@@ -35,14 +36,14 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
 from rgbmidic.fields.nodal import Places
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
-from rgbmidic.results.physical import frame_times, rectification_of, shared_part
+from rgbmidic.results.physical import frame_times, placement_of, rectification_of, scale_of, shared_part
 from rgbmidic.results.quantities import QUANTITIES as STORED
 from rgbmidic.results.result import Result
-from rgbmidic.settings import ScaleSettings, regular
+from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, regular
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["QUANTITIES", "WAYS", "Agreement", "Comparison", "Fit", "FrameComparison", "Levelling", "Simulation"]
-__all__ += ["placement_of"]
+__all__ += ["measured_mesh", "place"]
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +61,9 @@ _AT_ONCE = 20_000
 """Points that are looked up at once: some 60 MB (derived)."""
 _SAME = 1e-6
 """Distance over the size of an element under which two nodes are one: rounding of a placement (derived)."""
+_DIFFERENT = 0.01
+"""Relative difference of the scale of points from a stated one above which a warning names both: half a pixel at each
+end of 100 px is .7 % (derived)."""
 _RIGID = 1e-6
 """Least squared ratio to the uncertainty, of a node on average, of what is no rigid motion in a simulation (chosen)."""
 _FAILED = STORED["status"].codes.index("failed")
@@ -202,7 +206,6 @@ def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
 
 def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatArray, FloatArray | None]:
     """Read a table of node numbers, displacements and times onto a mesh."""
-    from rgbmidic.mesh.files import UNITS
 
     try:
         lines = regular(path).read_text(encoding="utf-8-sig").splitlines()
@@ -223,13 +226,16 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
     table = np.array(rows, dtype=np.float64).reshape(-1, len(wanted))
     index = {number: place for place, number in enumerate(mesh.node_numbers.tolist())}
     places = [index.get(int(number), -1) for number in table[:, 0]]
-    if -1 in places or not places:
-        what = f"names node {table[places.index(-1), 0]:g}, which is not in" if places else "has no row for a node of"
-        raise InputError(f"{path} {what} {mesh.name}")
+    known = np.array(places, dtype=np.int64) >= 0
+    if not known.any():
+        raise InputError(f"{path} has no row for a node of {mesh.name}")
+    if not known.all():
+        logger.warning("%s: %d rows name nodes that %s does not have", path, int((~known).sum()), mesh.name)
+        table, places = table[known], np.array(places)[known].tolist()
     times = table[:, 3] * _TIMES[clock.lower()] if clock else np.zeros(len(table))
     steps, state = np.unique(times, return_inverse=True)
     values = np.full((len(steps), len(mesh.points), 2), np.nan)
-    factors = [UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
+    factors = [LENGTH_UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
     values[state, places] = table[:, 1:3] * factors
     return values, steps if clock else None
 
@@ -465,7 +471,7 @@ class Comparison:
     @property
     def gauge(self) -> float:
         """Length of the virtual strain gauges, mm."""
-        return self._gauges.length
+        return self._gauges[0].length
 
     def each(self) -> Iterator[FrameComparison]:
         """Compare one frame after the other."""
@@ -571,16 +577,26 @@ class Comparison:
         return fit, np.tensordot(rigid, motions, 1), taken
 
     @cached_property
-    def _shares_nodes(self) -> bool:
-        """Whether the measurement has the simulation's own nodes, in their order."""
-        nodes, points = self.mesh.nodes, self.simulation.mesh.points
-        return nodes.shape == points.shape and bool(np.abs(nodes - points).max() < _SAME * self.mesh.size)
+    def _own(self) -> npt.NDArray[np.int64]:
+        """Node (M,) of the measurement that is each of the simulation's, by number and place; -1 where there is none.
+
+        All are -1 where the measurement has nodes of its own.
+        """
+        points, numbers = self.simulation.mesh.points, self.result.node_number
+        own = np.arange(len(points)) if len(points) == len(self.mesh.nodes) else np.full(len(points), -1)
+        if numbers is not None:
+            index = {number: place for place, number in enumerate(numbers.tolist())}
+            own = np.array([index.get(number, -1) for number in self.simulation.mesh.node_numbers.tolist()])
+        away = np.abs(self.mesh.nodes[own] - points).max(axis=1)
+        own = np.where(away < _SAME * self.mesh.size, own, -1)
+        return own if len(np.unique(own[own >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
 
     @cached_property
     def _read(self) -> tuple[sp.csr_matrix, BoolArray]:
         """Matrix (M, N) that reads the measurement at the simulation's nodes, and which of them lie in it (M,)."""
-        if self._shares_nodes:
-            return sp.eye(len(self.mesh.nodes), format="csr"), np.ones(len(self.mesh.nodes), dtype=bool)
+        if (inside := self._own >= 0).any():
+            entries = np.ones(inside.sum()), (np.flatnonzero(inside), self._own[inside])
+            return sp.csr_matrix(entries, shape=(len(inside), len(self.mesh.nodes))), inside
         matrix, depth = _reading(self.mesh, self.simulation.mesh.points)
         inside = depth > -_SAME
         if not inside.any():
@@ -588,18 +604,20 @@ class Comparison:
         return sp.csr_matrix(sp.diags(1.0 * inside) @ matrix), inside
 
     @cached_property
-    def _gauges(self) -> StrainGauges:
-        """The shortest strain gauges around the simulation's nodes that lie in the measurement."""
-        if self._shares_nodes:
-            return StrainGauges.at_nodes(self.covariance)
-        return StrainGauges.at_points(self.covariance, self.simulation.mesh.points[self._read[1]])
+    def _gauges(self) -> tuple[StrainGauges, sp.csr_matrix]:
+        """The shortest strain gauges, and the matrix (M, G) that gives each node of the simulation its own."""
+        read, inside = self._read
+        if (self._own >= 0).any():
+            return StrainGauges.at_nodes(self.covariance), read
+        gauges = StrainGauges.at_points(self.covariance, self.simulation.mesh.points[inside])
+        return gauges, sp.eye(len(inside), format="csr")[:, inside]
 
     @cached_property
     def _correlations(self) -> list[tuple[sp.csr_matrix, sp.csr_matrix]]:
         """Correlation (M, M) of each of the `QUANTITIES` between the nodes, and its squares, entry by entry."""
-        (read, inside), gauges, whole = self._read, self._gauges, self.covariance.correlation
-        rows = np.flatnonzero(inside)[gauges.rows]
-        slopes = [sp.csr_matrix((part, (rows, gauges.nodes)), shape=read.shape) for part in gauges.whole]
+        read, (gauges, given), whole = self._read[0], self._gauges, self.covariance.correlation
+        shape, entries = (given.shape[1], read.shape[1]), (gauges.rows, gauges.nodes)
+        slopes = [given @ sp.csr_matrix((part, entries), shape=shape) for part in gauges.whole]
         moved, x, y = (_unit(matrix @ whole @ matrix.T) for matrix in (read, *slopes))
         shear = _unit(sum(slope @ whole @ slope.T for slope in slopes))
         return [(one, sp.csr_matrix(one.multiply(one))) for one in (moved, moved, x, y, shear)]
@@ -615,8 +633,10 @@ class Comparison:
             variance = np.asarray((scaled @ self.covariance.correlation).multiply(scaled).sum(axis=1)).ravel()
             values[row] = np.where(there, read @ np.where(known, part, 0), np.nan)
             std[row] = np.where(there, np.sqrt(np.maximum(variance, 0)), np.nan)
-        strain = self._gauges.strain(*displacement, *noise)
-        values[2:, inside], std[2:, inside] = strain.components.T, strain.components_std.T
+        gauges, given = self._gauges
+        strain = gauges.strain(*displacement, *noise)
+        node, gauge = given.nonzero()
+        values[2:, node], std[2:, node] = strain.components[gauge].T, strain.components_std[gauge].T
         return values, std
 
     def _agreement(
@@ -656,7 +676,21 @@ def _unit(covariance: sp.csr_matrix) -> sp.csr_matrix:
     return sp.csr_matrix(scale @ covariance @ scale)
 
 
-def placement_of(
+def measured_mesh(result: Result) -> FiniteElementMesh | None:
+    """Return the part of ``mesh.file`` that a result was measured on; None where it has none."""
+    if result.node_number is None or result.element_number is None or result.node_mm is None:
+        return None
+    kept = result.provenance["finite_elements"]
+    return FiniteElementMesh(
+        name=kept["name"],
+        points=result.node_mm,
+        node_numbers=result.node_number,
+        elements=result.elements,
+        element_numbers=result.element_number,
+    )
+
+
+def place(
     result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence[Sequence[float]] | None = None
 ) -> Placement:
     """Place a simulation's mesh on the image of a result.
@@ -668,21 +702,33 @@ def placement_of(
     scale
         It replaces the ``[scale]`` that was kept with the result; None: that one.
     pairs
-        Points (x_mm, y_mm, x_px, y_px), two or more; None: ``[mesh] points`` of the result.
+        Points (x_mm, y_mm, x_px, y_px), two or more; None: ``mesh.points`` of the result.
 
     Raises
     ------
     InputError
         No points are known, or they place no mesh.
     """
-    kept = result.setting("mesh", "points") if pairs is None else pairs
-    if not kept:
+    placed = placement_of(result)
+    if not pairs and placed is None:
         raise InputError(
             f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
             "--points X_MM,Y_MM:X_PX,Y_PX each"
         )
-    camera = rectification_of(result, scale).camera
-    return Placement.fit(kept, camera, where="mesh.points" if pairs is None else "--points")
+    camera, stated = rectification_of(result, scale).camera, scale or scale_of(result)
+    if not pairs:
+        assert placed is not None
+        return Placement.fit(placed.pairs, camera)
+    found = Placement.fit(pairs, camera, where="--points")
+    if found.mm_per_pixel is not None and stated.mm_per_pixel is not None:
+        away = found.mm_per_pixel / stated.mm_per_pixel - 1
+        if abs(away) > _DIFFERENT:
+            logger.warning(
+                "--points state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken",
+                found.mm_per_pixel,
+                stated.mm_per_pixel,
+            )
+    return found
 
 
 def _matched(
