@@ -206,7 +206,6 @@ def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
 
 def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatArray, FloatArray | None]:
     """Read a table of node numbers, displacements and times onto a mesh."""
-
     try:
         lines = regular(path).read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
@@ -690,9 +689,7 @@ def measured_mesh(result: Result) -> FiniteElementMesh | None:
     )
 
 
-def place(
-    result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence[Sequence[float]] | None = None
-) -> Placement:
+def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence[Sequence[float]] = ()) -> Placement:
     """Place a simulation's mesh on the image of a result.
 
     Parameters
@@ -702,7 +699,7 @@ def place(
     scale
         It replaces the ``[scale]`` that was kept with the result; None: that one.
     pairs
-        Points (x_mm, y_mm, x_px, y_px), two or more; None: ``mesh.points`` of the result.
+        Points (x_mm, y_mm, x_px, y_px), two or more; none: ``mesh.points`` of the result.
 
     Raises
     ------
