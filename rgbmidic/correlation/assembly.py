@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
@@ -30,6 +31,7 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 __all__ = [
     "BLOCK",
     "OF_ELEMENT",
+    "SCORE_RANGE",
     "Assembly",
     "Elimination",
     "RigidMotions",
@@ -360,6 +362,10 @@ most."""
 _ANCHOR = 1e-6
 """Multiple of the identity, over the texture of an unknown, that holds nodes without: it takes 1e-6 of the projection
 of the others (derived)."""
+SCORE_RANGE = 30.0
+"""Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to 12 %
+(derived). With half or twice of it lights differ by 2e-3 px at most, beside a gap by 1e-2, their uncertainty by 10 %
+(benchmarks/constants.py)."""
 _LEAST = 0.05
 """Fraction below which the residual holds no information on the noise: a region of one block (elements of 4 px leave
 0.1)."""
@@ -371,8 +377,8 @@ def block_side(pixels: PixelMap, element: float) -> int:
 
 
 def unfitted_fraction(
-    pixels: PixelMap, assembly: Assembly, gradient: FloatImage, weights: FloatImage, side: int
-) -> float:
+    mesh: Tri3Mesh, pixels: PixelMap, assembly: Assembly, gradient: FloatImage, weights: FloatImage, side: int
+) -> float | FloatArray:
     """Return the fraction of the variance of a block's score that a fit of the displacement to white noise leaves.
 
     The residual is the noise less its projection P on the columns ``J = grad f phi`` of the least-squares problem. The
@@ -381,10 +387,13 @@ def unfitted_fraction(
     together, with random signs. It falls from 0.85 for elements of 40 px to 0.1 for 4 px, and is not known (NaN) where
     nothing is left, in a region of about one block.
 
+    On a graded mesh it is taken around each element, (E,): each node has its part of both products, and they are summed
+    over the window in which the scores are averaged.
+
     Parameters
     ----------
-    pixels, assembly
-        Of the mesh.
+    mesh, pixels, assembly
+        The mesh, its pixels and equations.
     gradient, weights : ndarray, shape (2, k, P), (k, P), float32
         Of the reference images.
     side
@@ -409,5 +418,20 @@ def unfitted_fraction(
         projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
     sides, anchor = np.stack(projected, axis=1), _ANCHOR * total / assembly.size
     solve = assembly.factorise(assembly.matrix(hessian, anchor * assembly.diagonal))
-    fraction = 1 - float((sides * solve(sides)).sum()) / total
-    return fraction if fraction > _LEAST else float("nan")
+    if not mesh.is_graded:
+        fraction = 1 - float((sides * solve(sides)).sum()) / total
+        return fraction if fraction > _LEAST else float("nan")
+    fitted = (sides * solve(sides)).reshape(len(mesh.nodes), -1).sum(axis=1)
+    parts = np.ascontiguousarray(hessian[..., (0, 2)].sum(axis=(2, 3)).ravel())
+    whole = np.bincount(mesh.elements.ravel(), weights=parts, minlength=len(mesh.nodes))
+    limits = np.array([side * rows, side * columns]) - 1
+    row, column = (np.clip(mesh.nodes[:, ::-1] - (top, left), 0, limits) // side).astype(int).T
+    here = [np.zeros((rows, columns)), np.zeros((rows, columns))]
+    for grid, values in zip(here, (fitted, whole), strict=True):
+        np.add.at(grid, (row, column), values)
+    around = [cv2.GaussianBlur(grid, (0, 0), SCORE_RANGE / side, borderType=cv2.BORDER_CONSTANT) for grid in here]
+    centre = mesh.nodes[mesh.elements].mean(axis=1)[:, ::-1] - (top, left)
+    row, column = (np.clip(centre, 0, limits) // side).astype(int).T
+    known = np.maximum(around[1][row, column], np.finfo(float).tiny)
+    local = 1 - around[0][row, column] / known
+    return np.where(local > _LEAST, local, np.nan)

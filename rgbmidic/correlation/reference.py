@@ -185,7 +185,7 @@ class Reference:
     registration : Registration or None
         Where in its own image, of this state and of the deformed ones, a light shows what the first one shows at a
         pixel of the frame: there it is read; None: at the same pixel.
-    unfitted : float
+    unfitted : float, or ndarray of shape (E,) on a graded mesh
         Fraction of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
     values, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels.
@@ -200,7 +200,7 @@ class Reference:
     """
 
     geometry: ReferenceGeometry
-    unfitted: float
+    unfitted: float | FloatArray
     images: FloatImage
     weights: FloatImage
     values: FloatImage
@@ -273,7 +273,9 @@ class Reference:
         gradient = _common_gradient(own, weighted, pixels)
         return cls(
             geometry=geometry,
-            unfitted=unfitted_fraction(pixels, geometry.assembly, gradient, weighted, block_side(pixels, mesh.size)),
+            unfitted=unfitted_fraction(
+                geometry.mesh, pixels, geometry.assembly, gradient, weighted, block_side(pixels, mesh.size)
+            ),
             images=ready,
             weights=usable,
             values=values,

@@ -15,6 +15,7 @@ import numpy as np
 
 from rgbmidic._kernels.lights import scores
 from rgbmidic.correlation.assembly import BLOCK, RigidMotions, block_side
+from rgbmidic.correlation.assembly import SCORE_RANGE as _SCORE_RANGE
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.recovery import Functional, Recovery, displacement_functionals, functional_std
 from rgbmidic.correlation.reference import Reference
@@ -32,10 +33,6 @@ _LEAST_FRACTION = 0.05
 _EVEN = 0.6
 """Standard deviation (blocks) of the window in which the information of a block is taken. Chosen; with half or twice of
 it lights differ by 1e-4 px at most, beside a gap by 4e-3, their uncertainty by 4 % (benchmarks/constants.py)."""
-_SCORE_RANGE = 30.0
-"""Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to 12 %
-(derived). With half or twice of it lights differ by 2e-3 px at most, beside a gap by 1e-2, their uncertainty by 10 %
-(benchmarks/constants.py)."""
 _LEAST_FREEDOM = 0.25
 """Least number of blocks, less one, that is taken, where a region has one block: the variance is stated 4 times larger
 then, for it is hardly known (derived)."""
@@ -105,7 +102,9 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     fields = np.empty((4, weights.shape[1]), dtype=np.float32)
     scores(residual.difference, weights, *slopes, fields)
     common = np.divide(fields[:2], fields[2], out=np.zeros_like(fields[:2]), where=fields[2] > 0)
-    lost = np.float32(1 / np.sqrt(reference.unfitted) - 1)
+    lost = np.asarray(1 / np.sqrt(reference.unfitted) - 1, dtype=np.float32)
+    if lost.ndim:
+        lost = np.repeat(lost, np.diff(reference.pixels.offsets))
     own, roots = [], []
     for difference, weight, gx, gy in zip(residual.difference, weights, *slopes, strict=True):
         whole = difference + lost * (gx * common[0] + gy * common[1])

@@ -254,7 +254,7 @@ def quadratic_fit(
     weighted = weight[:, None] * basis
     normal = weighted @ basis.transpose(0, 2, 1)
     normal[:, range(1, 6), range(1, 6)] += _RIDGE
-    fits = (np.linalg.inv(normal) / mesh.size ** np.array([0, 1, 1, 2, 2, 2])[:, None]) @ weighted
+    fits = (np.linalg.inv(normal) / (mesh.sizes[:, None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]) @ weighted
     return tuple(with_data(structure, fits[:, term].ravel()[known]) for term in range(6))
 
 
@@ -301,7 +301,7 @@ def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.c
     known = np.arange(number.max()) < number[:, None]
     other = np.repeat(np.arange(number.size)[:, None], known.shape[1], axis=1)
     other[known] = reach.indices
-    square = sum((axis[other] - axis[:, None]) ** 2 for axis in mesh.nodes.T) / mesh.size**2
+    square = sum((axis[other] - axis[:, None]) ** 2 for axis in mesh.nodes.T) / mesh.sizes[:, None] ** 2
     # at an edge the window holds as much of the mesh as inside
     weight = np.where(known, np.exp(-square * surrounded[:, None] / (2 * _WIDTH**2)), 0.0)
     return other, np.flatnonzero(known), weight, reach
@@ -321,11 +321,12 @@ def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
 def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
     """Evaluate 1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element: (N, 6, W)."""
     other = _window(mesh, used)[0]
-    x, y = ((axis[other] - axis[:, None]) / mesh.size for axis in mesh.nodes.T)
+    sizes = mesh.sizes[:, None]
+    x, y = ((axis[other] - axis[:, None]) / sizes for axis in mesh.nodes.T)
     basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)
     if offset is not None:
-        for term, beyond in enumerate(np.frombuffer(offset).reshape(-1, 3).T / mesh.size**2):
-            basis[:, 3 + term] += beyond[other]
+        for term, beyond in enumerate(np.frombuffer(offset).reshape(-1, 3).T):
+            basis[:, 3 + term] += beyond[other] / sizes**2
     return basis
 
 
