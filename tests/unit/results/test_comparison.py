@@ -19,7 +19,7 @@ from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.results import FrameRecord, Result
-from rgbmidic.results.comparison import Comparison, Levelling, Simulation, place
+from rgbmidic.results.comparison import Comparison, Levelling, Simulation, measured_mesh, place
 
 NODES, STD, MM = len(MESH.nodes), 0.01, 0.05
 PLACEMENT = Placement.fit([[0, 0, 10, 170], [10, 0, 210, 170], [0, 8, 10, 10]])
@@ -36,10 +36,10 @@ def finite_elements(mesh: Tri3Mesh = MESH, name: str = "plate.vtu") -> FiniteEle
     )
 
 
-def stretch(mesh: Tri3Mesh = MESH, strain: float = 0.01) -> np.ndarray:
+def stretch(mesh: Tri3Mesh = MESH, strain: float = 0.01, bend: float = 0.05) -> np.ndarray:
     """Displacement (N, 2) in mm of a plate that is pulled along y and fixed at its lower edge."""
     x, y = PLACEMENT.to_mm(mesh.nodes).T
-    return np.stack([-0.3 * strain * x, strain * (y + 0.05 * y**2)], axis=1)
+    return np.stack([-0.3 * strain * x, strain * (y + bend * y**2)], axis=1)
 
 
 def measured(path: Path, displacement: np.ndarray, std: float = STD, **options: object) -> Result:
@@ -67,7 +67,7 @@ def compared(result: Result, displacement: np.ndarray, mesh: Tri3Mesh = MESH, **
 
 @pytest.mark.parametrize("mesh", [MESH, OTHER], ids=["own nodes", "other nodes"])
 def test_chi_square_is_1_and_scatters_as_its_degrees_of_freedom_state(tmp_path, mesh):
-    comparison = compared(measured(tmp_path / "r", noise(80)), np.zeros((len(mesh.nodes), 2)), mesh)
+    comparison = compared(measured(tmp_path / "r", noise(60)), np.zeros((len(mesh.nodes), 2)), mesh)
     frames = list(comparison.each())
     for name in ("displacement", "u", "exx", "eyy", "exy"):
         agreements = [made.agreement["levelled", name] for made in frames]
@@ -80,8 +80,8 @@ def test_chi_square_is_1_and_scatters_as_its_degrees_of_freedom_state(tmp_path, 
 
 def test_the_scale_of_several_frames_holds_its_uncertainty(tmp_path):
     """The noise of the reference is in all frames: that the stated mean is not too certain is what is tested."""
-    field, pulls, alone = stretch(strain=0.002), [], []
-    for seed in range(25):
+    field, pulls, alone = stretch(strain=0.002, bend=0), [], []
+    for seed in range(16):
         own = noise(5, seed)
         made = (own[1:] - own[:1]) / np.sqrt(2) + np.linspace(0.25, 1, 4)[:, None, None] * 1.05 * field
         result = measured(tmp_path / f"{seed}", np.concatenate([0 * own[:1], made]), references=[0])
@@ -131,7 +131,7 @@ def test_a_finer_simulation_is_levelled_to_what_least_squares_makes_of_it():
     """Naive twin: a dense fit to many points within the mesh, then the recovery."""
     fine = Tri3Mesh.from_region(Region.from_rectangle((5, 5, 215, 175), (200, 240)), 6)
     wave = np.stack([np.sin(fine.nodes[:, 0] / 12), np.cos(fine.nodes[:, 1] / 15)], axis=1)
-    y, x = np.mgrid[10.25:170:0.5, 10.25:210:0.5]
+    y, x = np.mgrid[10.5:170, 10.5:210]
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     from matplotlib.tri import LinearTriInterpolator, Triangulation
 
@@ -146,17 +146,17 @@ def test_a_finer_simulation_is_levelled_to_what_least_squares_makes_of_it():
 
 
 def test_a_rigid_motion_is_stated_and_taken_off(tmp_path):
-    field, angle = stretch(), 1e-3
+    field, angle = stretch(bend=0), 1e-3  # levelling changes nothing of a linear field
     points = PLACEMENT.to_mm(MESH.nodes)
     x, y = (points - points.mean(axis=0)).T
     moved = field + 0.03 + angle * np.stack([-y, x], axis=1)
-    result = measured(tmp_path / "r", moved + noise(20))
+    result = measured(tmp_path / "r", moved + noise(40))
     kept, taken = (list(compared(result, field, remove_rigid=one).each()) for one in (False, True))
     pulls = [(made.fit.rigid - [0.03, 0.03, np.degrees(angle)]) / made.fit.rigid_std for made in kept]
-    assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.35
+    assert 0.85 < np.sqrt(np.mean(np.square(pulls))) < 1.2
     assert kept[0].agreement["nodes", "displacement"].chi_square > 100
     squares = [made.agreement["levelled", "displacement"].chi_square for made in taken]
-    assert np.mean(squares) == pytest.approx(1, abs=0.06)
+    assert np.mean(squares) == pytest.approx(1, abs=0.025)
 
 
 def test_nodes_without_data_are_left_out_and_so_is_their_strain(tmp_path):
@@ -227,6 +227,7 @@ def test_the_command_writes_what_it_found_with_the_simulation_s_numbers(tmp_path
     result = measured(tmp_path / "r", np.arange(5)[:, None, None] * 1.03 * stretch() + noise(5))
     out = tmp_path / "out"
     command = ["compare", str(result.path), "--fe", str(states.parent / "all.pvd"), "--out", str(out), *POINTS]
+    command += ["--frames", "3"]
     assert execute(cli.app, command) == 0
     assert "1.03" in capsys.readouterr().out
     assert {file.suffix for file in out.iterdir()} == {".html", ".csv", ".pvd", ".vtu"}
@@ -239,10 +240,10 @@ def test_the_command_writes_what_it_found_with_the_simulation_s_numbers(tmp_path
     assert written.fields["displacement"][:, 0] == pytest.approx(made.measured["u"])
     assert written.fields["displacement_ratio_levelled"][:, 1] == pytest.approx(made.ratio("levelled", "v"))
     again = Simulation.read(out / "comparison.pvd")  # the measurement, as a simulation's boundary conditions
-    assert again.displacement[3][:, 1] == pytest.approx(made.measured["v"])
+    assert again.displacement[0][:, 1] == pytest.approx(made.measured["v"])
     rows = (out / "nodes.csv").read_text().splitlines()
-    assert len(rows) == 1 + 5 * NODES
-    assert [float(part) for part in rows[1].split(",")[:6]] == pytest.approx([0, 0, 0, 100, 0, 8])
+    assert len(rows) == 1 + NODES
+    assert [float(part) for part in rows[1].split(",")[:6]] == pytest.approx([3, 3, 3e-3, 100, 0, 8])
     assert execute(cli.app, command) == 2
     assert "is already there" in capsys.readouterr().err
 
@@ -255,11 +256,41 @@ def test_a_result_of_mesh_file_is_compared_by_number_where_the_simulation_has_an
     order = np.random.default_rng(0).permutation(NODES)
     rows = [f"{mesh.node_numbers[i]},{stretch()[i, 0]},{stretch()[i, 1]}" for i in order]
     (tmp_path / "t.csv").write_text("\n".join(["node,u_mm,v_mm", *rows]))
-    out = tmp_path / "out"
-    assert execute(cli.app, ["compare", str(result.path), "--fe", str(tmp_path / "t.csv"), "--out", str(out)]) == 0
-    made = Comparison(result, Simulation.read(tmp_path / "plate.vtu"), place(result)).frame(1)
+    simulation = Simulation.read(tmp_path / "t.csv", mesh=measured_mesh(result))
+    made = Comparison(result, simulation, place(result)).frame(1)
     assert np.abs(made.difference("nodes", "u")).max() < 1e-9
     assert np.abs(made.ratio("nodes", "v")).max() < 1e-6
+
+
+def test_nodes_on_two_sides_of_a_crack_are_told_apart_by_their_numbers(tmp_path):
+    cracked = Tri3Mesh.from_region(Region.from_rectangle((10, 10, 210, 170), (200, 240)), 20, [[(0, 95), (110, 95)]])
+    assert len(cracked.copies) > 2
+    mesh = finite_elements(cracked, str(tmp_path / "plate.vtu"))
+    jump = 0.02 * np.isin(
+        np.arange(len(cracked.nodes)), cracked.elements[cracked.nodes[cracked.elements].mean(axis=1)[:, 1] < 95]
+    )
+    field = np.stack([0 * jump, jump], axis=1)
+    order = np.random.default_rng(0).permutation(len(jump))
+    place_of = np.argsort(order)
+    shuffled = FiniteElementMesh(
+        name=mesh.name,
+        points=mesh.points[order],
+        node_numbers=mesh.node_numbers[order],
+        elements=place_of[mesh.elements],
+        element_numbers=mesh.element_numbers,
+    )
+    write_state(tmp_path / "plate.vtu", field[order], shuffled)
+    count, known = len(jump), {"finite_elements": mesh, "placement": PLACEMENT, "references": []}
+
+    def record(index: int) -> FrameRecord:
+        u, v = PLACEMENT.vectors_to_px(mesh.points, field).T
+        stated = {"u_std": np.full(count, STD), "v_std": np.full(count, STD)}
+        return FrameRecord.of(nodes=count, lights=3, number=index, status=0, u=u, v=v, **stated)
+
+    options = {"nodes": cracked.nodes, "elements": cracked.elements, **known}
+    result = make_result(tmp_path / "r", frames=1, record=record, **options)
+    made = Comparison(result, Simulation.read(tmp_path / "plate.vtu"), place(result)).frame(0)
+    assert np.abs(made.difference("nodes", "v")).max() < 1e-8
 
 
 def no_points(arguments: list[str]) -> None:
@@ -307,7 +338,7 @@ def test_the_examples_of_the_page_run_as_written(tmp_path, states, monkeypatch, 
     (tmp_path / "all.pvd").rename("simulation.pvd")
     (tmp_path / "table.csv").rename("simulation.csv")
     known = {"finite_elements": mesh, "placement": PLACEMENT, "references": [0]}
-    measured(tmp_path / "my_result", np.arange(3)[:, None, None] * stretch() + noise(3), **known)
+    measured(tmp_path / "my_result", np.arange(2)[:, None, None] * stretch() + noise(2), **known)
     commands = re.findall(r"```bash\n(.*?)```", page, flags=re.DOTALL)[0].replace("\\\n", " ").splitlines()
     assert len(commands) == 2
     for line in commands:
