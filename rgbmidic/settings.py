@@ -529,7 +529,10 @@ class TestSettings(_Checked):
         if self.mesh_file is None:
             for key in ("points", "unit", "part"):
                 _require(getattr(self, f"mesh_{key}") is None, f"mesh.{key} is for mesh.file, which is missing")
-            _require(self.region.is_stated, "[region] needs exactly one of rectangle, polygon, mask; given are 0")
+            _require(
+                self.region.is_stated,
+                "[region] is missing or empty: it needs exactly one of rectangle, polygon, mask; given are 0",
+            )
             if self.element_size is None:
                 object.__setattr__(self, "element_size", ELEMENT_SIZE)
             return

@@ -107,7 +107,7 @@ class Plate:
         y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float64)
         spatial = np.stack([x.ravel(), y.ravel()], axis=1)
         drawn, material = Tri3Mesh(nodes=self.nodes, elements=self.mesh.elements), spatial
-        for _ in range(3):  # the strain is 1e-2: each step gains two digits
+        for _ in range(3 if amount else 0):  # the strain is 1e-2: each step gains two digits
             places = Places.of(drawn, material)
             values = amount * self.moved[drawn.elements[places.element]]
             material = spatial - np.einsum("pc,pcd->pd", places.barycentric, values)

@@ -84,7 +84,8 @@ class StrainGauges:
     Attributes
     ----------
     length
-        In px.
+        In px. On a graded mesh each gauge has three elements as they are around it, and this length where that is more
+        and the length is stated; if it is not, this is that of elements of the mesh's size.
     centres : ndarray, shape (G, 2)
         In px on the reference.
     points : ndarray, shape (N, 2)
@@ -140,13 +141,18 @@ class StrainGauges:
         cls, covariance: NodalCovariance, centres: FloatArray, length: float | None, needed: sp.csr_matrix
     ) -> Self:
         mesh = covariance.mesh
+        stated = length is not None
         length = shortest_gauge(mesh) if length is None else float(length)
         if not (np.isfinite(length) and length >= _ROUND * shortest_gauge(mesh)):
             raise InputError(
                 f"a strain gauge must be at least {shortest_gauge(mesh):.4g} px long, {SHORTEST:g} elements; given are "
                 f"{length:g} px"
             )
-        pattern = _reach(mesh, centres, length / 2, needed)
+        lengths = np.full(len(centres), length)
+        if mesh.is_graded:
+            around = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
+            lengths = np.maximum(SHORTEST * around, length if stated else 0)
+        pattern = _reach(mesh, centres, lengths / 2, needed)
         rows = np.repeat(np.arange(len(centres)), np.diff(pattern.indptr))
         away = np.hypot(*(mesh.nodes[pattern.indices] - centres[rows]).T)
         gauges = cls(
@@ -155,7 +161,7 @@ class StrainGauges:
             points=mesh.nodes,
             rows=rows,
             nodes=pattern.indices.astype(np.int64),
-            fractions=np.clip((length / 2 - away) / mesh.size, 0, 1),
+            fractions=np.clip((lengths[rows] / 2 - away) / mesh.sizes[pattern.indices], 0, 1),
             needed=needed,
             whole=np.zeros((2, len(rows))),
             inflation=np.ones((len(centres), 3)),
@@ -231,11 +237,11 @@ def _ring(mesh: Tri3Mesh) -> sp.csr_matrix:
     return sp.csr_matrix(edges + edges.T + sp.eye(count))
 
 
-def _reach(mesh: Tri3Mesh, centres: FloatArray, radius: float, needed: sp.csr_matrix) -> sp.csr_matrix:
-    """Find the nodes (G, N) within `radius` px of each centre that are joined with it by edges inside the circle."""
+def _reach(mesh: Tri3Mesh, centres: FloatArray, radius: FloatArray, needed: sp.csr_matrix) -> sp.csr_matrix:
+    """Find the nodes (G, N) within its `radius` (G,) px of each centre that are joined with it inside the circle."""
     from scipy.spatial import cKDTree
 
-    near = cKDTree(centres).query_ball_tree(cKDTree(mesh.nodes), radius)
+    near = cKDTree(mesh.nodes).query_ball_point(centres, radius)
     starts = np.cumsum([0, *map(len, near)])
     columns = np.concatenate([np.asarray(some, dtype=np.int64) for some in near])
     inside = sp.csr_matrix((np.ones(len(columns)), columns, starts), shape=needed.shape)

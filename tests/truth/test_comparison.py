@@ -23,7 +23,7 @@ COARSE, FINE = 30, 10  # sides of the measurement's and of the simulation's elem
 @pytest.fixture(scope="module")
 def comparisons(tmp_path_factory: pytest.TempPathFactory) -> dict[float, list[FrameComparison]]:
     """Pairs of noisy photographs of a simulated plate, compared with its simulation and with one that is too stiff."""
-    plate, texture, random = Plate.of(FINE), Texture.random(3), np.random.default_rng(1)
+    plate, texture, random = Plate.of(FINE), Texture.random(3, waves=150), np.random.default_rng(1)
     pair = [plate.image(texture, amount) for amount in (0.0, 1.0)]
     solutions = [
         correlate(

@@ -63,6 +63,9 @@ frame_rate = 12000
 """
 
 
+PLACED = LEAST + '[mesh]\nfile = "a.inp"\npoints = [[0, 0, 1, 1], [1, 0, 2, 1]]\n'
+
+
 def _read(tmp_path: Path, text: str) -> TestSettings:
     path = tmp_path / "test.toml"
     path.write_text(text, encoding="utf-8")
@@ -179,6 +182,13 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
             LEAST + '[weights]\nmethod = "geometry"\ngeometry = "s.toml"\nlimit_deg = 180',
             r"weights\.limit_deg must be below 180",
         ),
+        (LEAST + "[mesh]\npoints = [[0, 0, 1, 1], [1, 0, 2, 1]]", r"mesh\.points is for mesh\.file"),
+        (LEAST + '[mesh]\nfile = "a.inp"', r"mesh\.file needs mesh\.points, two or more"),
+        (LEAST + '[mesh]\nfile = "a.inp"\npoints = [[0, 0, 1, 1]]', r"two or more .*, not 1"),
+        (PLACED + "element_size = 20", r"mesh\.element_size is for a mesh made here"),
+        (PLACED + "cracks = [[0, 5], [9, 5]]", r"mesh\.cracks is for a mesh made here"),
+        (PLACED + "[scale]\nmm_per_pixel = 0.1", r"scale\.mm_per_pixel \(0\.1\) states a scale, mesh\.points"),
+        (PLACED + 'unit = "ft"', r'mesh\.unit must be one of "mm"'),
         (LEAST + 'mask = "m.png"', r"exactly one of rectangle, polygon, mask; given are 2"),
         (LEAST.replace("rectangle = [10, 20, 110, 220]", ""), r"exactly one of .*; given are 0"),
         (LEAST.replace("10, 20, 110", "110, 20, 10"), r"rectangle is \[x0, y0, x1, y1\] with x0 < x1"),
@@ -312,6 +322,13 @@ BUILT["test"] = TestSettings(
     cracks=(SQUARE,),
     base=Path("/data"),
 )
+BUILT["test on finite elements"] = TestSettings(
+    frames=BUILT["frames"],
+    mesh_file=Path("specimen.inp"),
+    mesh_points=((0.0, 0.0, 10.0, 90.0), (5.0, 0.0, 60.0, 90.0)),
+    mesh_unit="m",
+    mesh_part="PLATE",
+)
 """Settings of every kind with a value in every field."""
 STATED = [
     pytest.param(built, entry.name, id=f"{name}.{entry.name}")
@@ -365,6 +382,7 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
     prefix = "" if section == "test" else rf"{section}\."
     key = {"calibration_file": r"calibration\.file", "element_size": r"mesh\.element_size", "cracks": r"mesh\.cracks"}
     key |= {"accept": r"calibration\.accept"}
+    key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part")}
     for instead in wrong:
         with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:
             replace(built, **{name: instead})
