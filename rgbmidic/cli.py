@@ -558,6 +558,66 @@ def profile(
 
 
 @app.command()
+def compare(
+    folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    fe: Annotated[
+        Path, typer.Option("--fe", help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")
+    ],
+    out: Out,
+    mesh: Annotated[Path | None, typer.Option("--mesh", help="Mesh file of the nodes of a .csv.")] = None,
+    points: Annotated[
+        list[str] | None,
+        typer.Option("--points", metavar="X_MM,Y_MM:X_PX,Y_PX", help="Where a point of the mesh lies; twice or more."),
+    ] = None,
+    unit: Annotated[str, typer.Option("--unit", help="Of length in these files: mm, m, um or inch.")] = "mm",
+    field: Annotated[str | None, typer.Option("--field", help="Name of the displacement in the files.")] = None,
+    interval: Annotated[
+        float | None, typer.Option("--interval", metavar="S", help="Time between the numbers of a folder's files.")
+    ] = None,
+    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the simulation's times.")] = 0.0,
+    frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10; by default all.")] = "",
+    rigid: Annotated[str, typer.Option("--rigid", help="Motion as a whole: tell or remove.")] = "tell",
+    test: Reading = None,
+    overwrite: Overwrite = False,
+    partial: Partial = False,
+) -> None:
+    """Measured minus simulated displacement and strain, in mm and in units of the stated uncertainty.
+
+    Page, tables and the fields at the simulation's nodes are written into a folder.
+    """
+    from rgbmidic.lab import check_folder
+    from rgbmidic.mesh import read_mesh
+    from rgbmidic.report.comparison import PAGE, comparison_files, scale_text, write_comparison
+    from rgbmidic.results import Result
+    from rgbmidic.results.comparison import Comparison, Simulation, measured_mesh, place
+
+    if rigid not in ("tell", "remove"):
+        raise InputError(f'--rigid is tell or remove, not "{rigid}"')
+    form = "X_MM,Y_MM:X_PX,Y_PX"
+    pairs = [command.read_place(text, "--points", form) for text in points or ()]
+    chosen, settings, result = _frames(frames), _settings(test), Result.open(folder, partial=partial)
+    scale = None if settings is None else settings.scale
+    placement = place(result, scale=scale, pairs=pairs)
+    numbered = measured_mesh(result) if mesh is None else read_mesh(mesh, unit=unit)
+    simulation = Simulation.read(fe, mesh=numbered, unit=unit, field=field, interval=interval, offset=offset)
+    comparison = Comparison(result, simulation, placement, scale=scale, frames=chosen, remove_rigid=rigid == "remove")
+    check_folder(out, comparison_files(comparison), overwrite=overwrite)
+    out.mkdir(parents=True, exist_ok=True)
+    with _progress("comparing") as progress:
+        done = write_comparison(comparison, out, progress)
+    _note(f"placed: {placement.summary()}")
+    headings = ["frame", "scale", "uncertainty", "chi-square at nodes", "levelled", "after the scale"]
+    rows = []
+    for made in done:
+        squares = [made.agreement[way, "displacement"].chi_square for way in ("nodes", "levelled")]
+        numbers = (made.fit.scale, made.fit.scale_std, *squares, made.fit.chi_square)
+        rows.append([f"{made.frame}", *(f"{number:.4g}" for number in numbers)])
+    _print_table(f"{len(done)} frames against {fe}", headings, rows)
+    print(scale_text(*comparison.best_scale([made.fit for made in done])))
+    print(f"page: {out / PAGE}")
+
+
+@app.command()
 def scale(
     points: Annotated[str, typer.Argument(metavar="X0,Y0:X1,Y1", help="Two points of a known distance, px.")],
     length: Annotated[float, typer.Option("--length", metavar="MM", help="Their distance in mm.")],

@@ -171,7 +171,8 @@ def read_place(text: str, option: str, form: str) -> tuple[float, ...]:
     except ValueError:
         numbers = []
     if [len(group) for group in numbers] != [len(group.split(",")) for group in form.split(":")]:
-        raise InputError(f"{option} is {form} in px, such as {_EXAMPLES[form]}, not {text!r}")
+        unit = "" if "MM" in form else " in px"
+        raise InputError(f"{option} is {form}{unit}, such as {_EXAMPLES[form]}, not {text!r}")
     return tuple(number for group in numbers for number in group)
 
 
@@ -181,6 +182,7 @@ _EXAMPLES = {
     "X,Y:R": "120,85:30",
     "X,Y:LENGTH": "120,85:75",
     "X0,Y0,X1,Y1": "40,60,200,160",
+    "X_MM,Y_MM:X_PX,Y_PX": "0,12.5:40,610",
 }
 
 

@@ -30,6 +30,7 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = [
     "BLOCK",
+    "OF_ELEMENT",
     "SCORE_RANGE",
     "Assembly",
     "Elimination",
@@ -349,7 +350,7 @@ class RigidMotions:
 
 BLOCK = 13
 """Least side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
-_OF_ELEMENT = 0.75
+OF_ELEMENT = 0.75
 """Side of a block in sides of an element: what elements cannot follow is alike over about that. With 13 px the error of
 40 px elements on waves of 3 to 5 elements was 1.5 to 2.3 times the stated one, so 0.8 to 1.2 times (DIC Challenge)."""
 _ACROSS = 4
@@ -372,7 +373,7 @@ _LEAST = 0.05
 
 def block_side(pixels: PixelMap, element: float) -> int:
     """Side (px) of the blocks for elements of side `element` (px); a small region has `_ACROSS` of them across."""
-    return max(BLOCK, min(round(_OF_ELEMENT * element), min(pixels.bounds[2:]) // _ACROSS))
+    return max(BLOCK, min(round(OF_ELEMENT * element), min(pixels.bounds[2:]) // _ACROSS))
 
 
 def unfitted_fraction(

@@ -334,14 +334,16 @@ def shade(axis: Axes, cover: FloatImage, step: int = 1, origin: tuple[int, int] 
     axis.imshow(colours, extent=_extent(origin, columns, rows), interpolation="nearest")
 
 
-def finish_picture(axis: Axes, x: tuple[float, float], y: tuple[float, float], *, first: bool) -> None:
-    """Set the limits of pixel axes, y down, at one scale in both directions."""
+def finish_picture(
+    axis: Axes, x: tuple[float, float], y: tuple[float, float], *, first: bool, unit: str = "px"
+) -> None:
+    """Set the limits of axes in px, or in another `unit`, at one scale in both directions: y down where y[0] < y[1]."""
     axis.set_aspect("equal")
     axis.set_xlim(*x)
     axis.set_ylim(y[1], y[0])
-    axis.set_xlabel("x (px)")
+    axis.set_xlabel(f"x ({unit})")
     if first:
-        axis.set_ylabel("y (px)")
+        axis.set_ylabel(f"y ({unit})")
     axis.tick_params(labelleft=first)
     axis.locator_params(nbins=5)
     _space_out(axis, 5, whole=False)

@@ -1,0 +1,758 @@
+"""Comparison of a measurement with a finite-element simulation, at the nodes of the simulation's mesh.
+
+Differences are stated in two ways. At the *nodes* the simulation stands as it is, and what the measurement does not
+resolve counts as difference. *Levelled*, the simulation is put through the measurement first: the best linear fit of
+its displacement on the measurement's mesh, the recovery of the nodal values, and the same strain gauges. What is left
+is neither noise nor resolution (levelling: Lava, Jones, Wittevrongel and Pierron, Strain 56, 2020, e12340).
+
+Chi-square per degree of freedom is the mean square of the ratios of difference to standard uncertainty. Its expectation
+under the stated covariance is the mean of the diagonal of the correlation matrix R, which is 1 whatever the correlation
+of neighbouring nodes; that reduces the degrees of freedom to ``n^2 / tr(R^2)`` (Satterthwaite, Biometrics Bulletin 2,
+1946). The stated variance is itself estimated, from blocks of pixels, so that the quotient is distributed like
+Fisher's F. The form with the inverse of R is not taken: docs/compare.md.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from rgbmidic.correlation.assembly import BLOCK, OF_ELEMENT
+from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
+from rgbmidic.errors import InputError
+from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
+from rgbmidic.fields.nodal import Places
+from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
+from rgbmidic.results.physical import frame_times, placement_of, rectification_of, scale_of, shared_part
+from rgbmidic.results.quantities import QUANTITIES as STORED
+from rgbmidic.results.result import Result
+from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, regular
+from rgbmidic.typing import BoolArray, FloatArray
+
+__all__ = ["QUANTITIES", "WAYS", "Agreement", "Comparison", "Fit", "FrameComparison", "Levelling", "Simulation"]
+__all__ += ["measured_mesh", "place"]
+
+logger = logging.getLogger(__name__)
+
+QUANTITIES = ("u", "v", "exx", "eyy", "exy")
+"""What is compared: displacement in mm and Green-Lagrange strain, along the axes of the simulation's mesh."""
+WAYS = ("nodes", "levelled")
+"""The simulation as it is at its nodes, and put through the measurement."""
+_FEWEST, _MOST = 3, 12
+"""Parts of an element's side over which the simulation is averaged: elements of half the simulation's, within these
+bounds. The rule's error falls as the square of their number: 1 % of what levelling changes at 3 (derived)."""
+_BEYOND = 0.5
+"""How far beyond an element of the simulation, in its barycentric coordinates, it is continued linearly: the outline of
+a region that was drawn by hand differs by some px (chosen)."""
+_AT_ONCE = 20_000
+"""Points that are looked up at once: some 60 MB (derived)."""
+_SAME = 1e-6
+"""Distance over the size of an element under which two nodes are one: rounding of a placement (derived)."""
+_DIFFERENT = 0.01
+"""Relative difference of the scale of points from a stated one above which a warning names both: half a pixel at each
+end of 100 px is .7 % (derived)."""
+_RIGID = 1e-6
+"""Least squared ratio to the uncertainty, of a node on average, of what is no rigid motion in a simulation (chosen)."""
+_FAILED = STORED["status"].codes.index("failed")
+_FIELDS = ("displacement", "displacements", "u", "disp")
+"""Names, in small letters, under which a displacement is written: by ParaView and CalculiX, by Abaqus, by others."""
+_COMPONENT = re.compile(r"(?:u|v|u[xy12]|u_[xy12])(?:_(mm|m|um|inch))?", re.IGNORECASE)
+_TIMES = {"time": 1.0, "time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Simulation:
+    """Displacement that a simulation has at its nodes, over time.
+
+    Attributes
+    ----------
+    mesh
+        Its mesh.
+    displacement : ndarray, shape (S, M, 2)
+        Of S states, in mm along the mesh's axes; NaN where a table has no row for a node.
+    times : ndarray, shape (S,), or None
+        In seconds (or in frames, where these have no times), rising; None for one state without a time.
+    name : str
+        The file or folder, for messages.
+    """
+
+    mesh: FiniteElementMesh
+    displacement: FloatArray
+    times: FloatArray | None = None
+    name: str = "simulation"
+
+    @classmethod
+    def read(
+        cls,
+        path: Path | str,
+        *,
+        mesh: FiniteElementMesh | None = None,
+        unit: str = "mm",
+        field: str | None = None,
+        interval: float | None = None,
+        offset: float = 0.0,
+    ) -> Self:
+        """Read a simulation.
+
+        Parameters
+        ----------
+        path
+            One state as a mesh file with a nodal displacement (such as ``.vtu``); a ``.pvd`` that names such files with
+            their times, or a folder with one; a folder of such files, whose last number counts them; or a ``.csv``
+            with the columns ``node``, ``u``, ``v`` and, of several states, ``time_s``.
+        mesh
+            Of the nodes of a ``.csv``.
+        unit
+            Unit of length of the files.
+        field
+            Name of the displacement in the files; None: the first of displacement, u, disp.
+        interval
+            Time between the numbers of the files of a folder.
+        offset
+            Added to the simulation's times.
+
+        Raises
+        ------
+        InputError
+            A file is missing, not readable, or has no displacement; its nodes differ from the first one's; the times do
+            not rise.
+        """
+        path = Path(path)
+        if path.suffix.lower() == ".csv":
+            if mesh is None:
+                raise InputError(f"{path} has numbers of nodes only: state the mesh that they belong to (--mesh FILE)")
+            values, times = _read_table(path, mesh, unit)
+        else:
+            states = list(_listed(path, interval))
+            meshes = [read_mesh(file, unit=unit) for _, file in states]
+            mesh = meshes[0]
+            for other in meshes[1:]:
+                if not np.array_equal(mesh.node_numbers, other.node_numbers):
+                    raise InputError(f"{other.name} has other nodes than {mesh.name}: the states must have one mesh")
+            values = np.stack([_displacement(one, field) for one in meshes])
+            times = None if states[0][0] is None else np.array([time for time, _ in states], dtype=np.float64)
+        if times is not None and not (np.diff(times) > 0).all():
+            raise InputError(f"the times of the simulation {path} must rise, not {times[:5].tolist()} ...")
+        return cls(mesh=mesh, displacement=values, times=None if times is None else times + offset, name=str(path))
+
+    def at(self, time: float) -> FloatArray:
+        """Interpolate the displacement (M, 2) linearly between the states before and after a time within theirs."""
+        if self.times is None or len(self.times) == 1:
+            return np.asarray(self.displacement[0])
+        after = int(np.clip(np.searchsorted(self.times, time), 1, len(self.times) - 1))
+        part = (time - self.times[after - 1]) / (self.times[after] - self.times[after - 1])
+        return np.asarray((1 - part) * self.displacement[after - 1] + part * self.displacement[after])
+
+
+def _listed(path: Path, interval: float | None) -> Iterator[tuple[float | None, Path]]:
+    """Yield time and file of every state; None for the time of a single file."""
+    if path.is_dir():
+        indices = sorted(path.glob("*.pvd"))
+        if len(indices) > 1:
+            raise InputError(f"{path} holds {len(indices)} .pvd files: name one of them")
+        if not indices:
+            yield from _numbered(path, interval)
+            return
+        path = indices[0]
+    if path.suffix.lower() != ".pvd":
+        yield None, path
+        return
+    try:
+        sets = list(ElementTree.fromstring(regular(path).read_bytes()).iter("DataSet"))
+        states = [(float(one.attrib["timestep"]), path.parent / one.attrib["file"]) for one in sets]
+    except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
+        raise InputError(f"{path} is not a readable .pvd file: {error}") from None
+    if not states:
+        raise InputError(f"{path} names no file: a .pvd has a DataSet with timestep and file for each state")
+    yield from states
+
+
+def _numbered(path: Path, interval: float | None) -> Iterator[tuple[float, Path]]:
+    """Yield the files of a folder by the last number in their names, times the `interval`."""
+    files = {file: re.findall(r"\d+", file.stem) for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")}
+    if not files or not all(files.values()):
+        raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
+    if interval is None or not interval > 0:
+        raise InputError(
+            f"the times of the files in {path} are not known: state --interval, the time between two numbers (above 0)"
+        )
+    yield from sorted((interval * int(numbers[-1]), file) for file, numbers in files.items())
+
+
+def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
+    """Displacement (M, 2) in mm of a mesh's nodal data."""
+    names = {name.lower(): name for name in mesh.fields}
+    name = field if field is not None else next((names[one] for one in _FIELDS if one in names), None)
+    values = None if name is None else mesh.fields.get(name)
+    if values is None or values.ndim != 2 or values.shape[1] <= max(mesh.axes):
+        there = ", ".join(f"{name} {one.shape[1:]}" for name, one in mesh.fields.items()) or "none"
+        wanted = f'"{field}"' if field is not None else f"one of {', '.join(_FIELDS)}"
+        raise InputError(f"{mesh.name} has no nodal vector {wanted} (--field); its nodal data: {there}")
+    return np.asarray(values[:, mesh.axes], dtype=np.float64) * mesh.unit_mm
+
+
+def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatArray, FloatArray | None]:
+    """Read a table of node numbers, displacements and times onto a mesh."""
+    try:
+        lines = regular(path).read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
+    names = [name.strip() for name in next(csv.reader(lines[:1]), [])]
+    moved = [name for name in names if _COMPONENT.fullmatch(name)]
+    clock = next((name for name in names if name.lower() in _TIMES), None)
+    if "node" not in names or len(moved) != 2:
+        raise InputError(f'{path} needs a header line with "node", "u_mm" and "v_mm" (and "time_s"), not {names}')
+    wanted = [names.index(name) for name in ("node", *moved, *([clock] if clock else []))]
+    rows = []
+    for number, row in enumerate(csv.reader(lines[1:]), 2):
+        try:
+            rows.append([float(row[place]) for place in wanted])
+        except (ValueError, IndexError):
+            raise InputError(f"row {number} of {path} is not numbers: {row}") from None
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(wanted))
+    index = {number: place for place, number in enumerate(mesh.node_numbers.tolist())}
+    places = [index.get(int(number), -1) for number in table[:, 0]]
+    known = np.array(places, dtype=np.int64) >= 0
+    if not known.any():
+        raise InputError(f"{path} has no row for a node of {mesh.name}")
+    if not known.all():
+        logger.warning("%s: %d rows name nodes that %s does not have", path, int((~known).sum()), mesh.name)
+        table, places = table[known], np.array(places)[known].tolist()
+    times = table[:, 3] * _TIMES[clock.lower()] if clock else np.zeros(len(table))
+    steps, state = np.unique(times, return_inverse=True)
+    values = np.full((len(steps), len(mesh.points), 2), np.nan)
+    factors = [LENGTH_UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
+    values[state, places] = table[:, 1:3] * factors
+    return values, steps if clock else None
+
+
+class Levelling:
+    """What a measurement on a mesh makes of a simulated displacement field.
+
+    The solve is a least-squares fit of linear elements, in which the texture counts alike everywhere on average, and
+    the nodal values are recovered from it by quadratics. Both are applied here.
+
+    Parameters
+    ----------
+    mesh
+        The measurement's mesh.
+    simulated
+        The simulation's, in the same axes and unit.
+
+    Raises
+    ------
+    InputError
+        The simulation covers no element of the measurement.
+    """
+
+    def __init__(self, mesh: Tri3Mesh, simulated: Tri3Mesh) -> None:
+        inner = _middles(int(np.clip(math.ceil(2 * mesh.size / simulated.size), _FEWEST, _MOST)))
+        points = np.einsum("qc,ecd->eqd", inner, mesh.nodes[mesh.elements])
+        read, depth = _reading(simulated, points.reshape(-1, 2))
+        used: BoolArray = np.asarray((depth.reshape(points.shape[:2]) > -_BEYOND).all(axis=1))
+        if not used.any():
+            raise InputError("the simulation's mesh covers no element of the measurement's: check where it is placed")
+        row = np.arange(len(depth))
+        columns, values = np.repeat(mesh.elements, len(inner), axis=0), np.tile(inner, (len(mesh.elements), 1))
+        shape = sp.csr_matrix((values.ravel(), (np.repeat(row, 3), columns.ravel())), shape=(len(row), len(mesh.nodes)))
+        weighted = sp.csr_matrix(sp.diags(np.repeat(used * mesh.areas / len(inner), len(inner))) @ shape).T
+        self._covered: BoolArray = np.asarray(mesh.to_nodes(np.asarray(used, dtype=np.float64)) > 0)
+        self._factors = splu(sp.csc_matrix(weighted @ shape + sp.diags(1.0 * ~self._covered)))
+        self._moments = sp.csr_matrix(weighted @ read)
+        self._recovery = Recovery.over(mesh, used, self._covered.astype(np.float64), linear_fit_offset(mesh))
+
+    def __call__(self, displacement: FloatArray) -> FloatArray:
+        """Displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN where that does not reach."""
+        moments = self._moments @ np.nan_to_num(displacement)
+        unknown: FloatArray = np.asarray(np.isnan(displacement).any(axis=1), dtype=np.float64)
+        lost = (abs(self._moments) @ unknown) > 0
+        recovered = self._recovery.displacement(self._factors.solve(moments)).T
+        return np.where(self._covered & ~lost, recovered, np.nan)
+
+
+def _middles(parts: int) -> FloatArray:
+    """Barycentric coordinates (parts^2, 3) of the middles of equal parts of a triangle."""
+    up = [(i + 1 / 3, j + 1 / 3) for i in range(parts) for j in range(parts - i)]
+    down = [(i + 2 / 3, j + 2 / 3) for i in range(parts - 1) for j in range(parts - 1 - i)]
+    first, second = np.array(up + down).T / parts
+    return np.stack([first, second, 1 - first - second], axis=1)
+
+
+def _reading(mesh: Tri3Mesh, points: FloatArray) -> tuple[sp.csr_matrix, FloatArray]:
+    """Matrix (P, N) that reads a nodal field at points (P, 2), and the least barycentric coordinate there (P,)."""
+    parts = [Places.of(mesh, points[start : start + _AT_ONCE]) for start in range(0, len(points), _AT_ONCE)]
+    values = np.concatenate([part.barycentric for part in parts])
+    nodes = mesh.elements[np.concatenate([part.element for part in parts])]
+    row = np.repeat(np.arange(len(points)), 3)
+    matrix = sp.csr_matrix((values.ravel(), (row, nodes.ravel())), shape=(len(points), len(mesh.nodes)))
+    return matrix, values.min(axis=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agreement:
+    """How one quantity of a frame agrees with the simulation.
+
+    Attributes
+    ----------
+    nodes
+        Number n of values: nodes with data, of the displacement those of u and v.
+    mean, rms
+        Of the differences, measured minus simulated.
+    std
+        Median standard uncertainty.
+    beyond
+        Fraction of the differences above two standard uncertainties; .046 is ordinary.
+    chi_square
+        Per degree of freedom: 1 is expected where the simulation is right.
+    freedom
+        Degrees of freedom.
+    probability
+        Of a larger chi-square where the simulation is right.
+    """
+
+    nodes: int
+    mean: float
+    rms: float
+    std: float
+    beyond: float
+    chi_square: float
+    freedom: float
+    probability: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """Multiple of the levelled simulation that fits a measured displacement best, with any shift and rotation.
+
+    Where the loads are stated, a modulus that is too large by 3 % reads as a scale of 1.03.
+
+    Attributes
+    ----------
+    scale, scale_std
+        NaN where the simulation is no more than a rigid motion.
+    rigid, rigid_std : ndarray, shape (3,)
+        Shift (mm) of the middle of the measured nodes, and rotation (degrees, from x towards y), measured minus
+        simulated.
+    chi_square
+        Of what the best multiple, shift and rotation leave, per degree of freedom.
+    template : ndarray, shape (2, N)
+        The simulation without a rigid motion over the standard uncertainty, at the measurement's nodes.
+    projection, information
+        Sums of the template times the measured displacement over its uncertainty, and times itself: their quotient is
+        the scale.
+    """
+
+    scale: float
+    scale_std: float
+    rigid: FloatArray
+    rigid_std: FloatArray
+    chi_square: float
+    template: FloatArray
+    projection: float
+    information: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameComparison:
+    """One frame and the simulation at its time, at the M nodes of the simulation.
+
+    Attributes
+    ----------
+    frame
+        Index in the result.
+    time
+        Of the frame, on the simulation's clock.
+    measured, std : mapping of str to ndarray, shape (M,)
+        `QUANTITIES` and their standard uncertainty; NaN where a node has no data.
+    simulated : mapping of str to mapping
+        The same of the simulation, in each of the `WAYS`.
+    agreement : mapping of (str, str) to Agreement
+        By way and quantity; "displacement" is u and v together.
+    fit
+        Of the displacement.
+    """
+
+    frame: int
+    time: float
+    measured: Mapping[str, FloatArray]
+    std: Mapping[str, FloatArray]
+    simulated: Mapping[str, Mapping[str, FloatArray]]
+    agreement: Mapping[tuple[str, str], Agreement]
+    fit: Fit
+
+    def difference(self, way: str, name: str) -> FloatArray:
+        """Measured minus simulated (M,)."""
+        return np.asarray(self.measured[name] - self.simulated[way][name])
+
+    def ratio(self, way: str, name: str) -> FloatArray:
+        """Difference over its standard uncertainty (M,)."""
+        return np.asarray(self.difference(way, name) / self.std[name])
+
+
+class Comparison:
+    """A result and a simulation of the same test, compared frame by frame.
+
+    Parameters
+    ----------
+    result
+        The measurement.
+    simulation
+        The simulation.
+    placement
+        Where the simulation's mesh lies on the image.
+    scale
+        It replaces the ``[scale]`` that was kept with the result; None: that one.
+    frames
+        Indices of the frames to compare; None: all deformed ones that did not fail, or the last of them where the
+        simulation is one state.
+    remove_rigid
+        Whether shift and rotation of the difference are taken off the measured displacement.
+
+    Attributes
+    ----------
+    frames : tuple of int
+        Those that are compared.
+    left_out : tuple of int
+        Those beyond the simulation's times.
+    timed
+        Whether times are in seconds; else they are numbers of frames.
+    relative_std
+        Standard uncertainty of the scale of the image over the scale: it is one factor in all displacements.
+
+    Raises
+    ------
+    InputError
+        The simulation covers none of the measurement, or none of its times; a frame that is asked for is not measured
+        or beyond its times.
+    """
+
+    def __init__(
+        self,
+        result: Result,
+        simulation: Simulation,
+        placement: Placement,
+        *,
+        scale: ScaleSettings | None = None,
+        frames: Sequence[int] | None = None,
+        remove_rigid: bool = False,
+    ) -> None:
+        self.result, self.simulation, self.placement, self.remove_rigid = result, simulation, placement, remove_rigid
+        times = frame_times(result, scale)
+        self.timed = times is not None
+        self.times, self.frames, self.left_out = _matched(result, simulation, times, frames)
+        self.mesh = Tri3Mesh(nodes=placement.to_mm(result.nodes), elements=result.elements)
+        self.simulated_mesh = Tri3Mesh(nodes=simulation.mesh.points, elements=simulation.mesh.elements)
+        self.levelling = Levelling(self.mesh, self.simulated_mesh)
+        self.covariance = NodalCovariance.from_mesh(self.mesh)
+        units = rectification_of(result, scale).units
+        exact, std = (
+            (units.mm_per_pixel, units.mm_per_pixel_std)
+            if placement.camera is not None
+            else (placement.mm_per_pixel, placement.mm_per_pixel_std)
+        )
+        self.relative_std = std / exact if exact else 0.0
+        image = Tri3Mesh(nodes=result.nodes, elements=result.elements)
+        self._blocks = image.areas.sum() / max(BLOCK, OF_ELEMENT * image.size) ** 2
+
+    @property
+    def gauge(self) -> float:
+        """Length of the virtual strain gauges, mm."""
+        return self._gauges[0].length
+
+    def each(self) -> Iterator[FrameComparison]:
+        """Compare one frame after the other."""
+        return (self.frame(index) for index in self.frames)
+
+    def frame(self, index: int) -> FrameComparison:
+        """Compare one of the `frames`; errors as `Result.frame`."""
+        record, nodes, time = self.result.frame(index), self.result.nodes, float(self.times[index])
+        moved = np.stack([record.u, record.v], axis=1).astype(np.float64)
+        measured = self.placement.vectors_to_mm(nodes, moved).T
+        slopes = self.placement.jacobian(np.where(np.isfinite(moved), nodes + moved, nodes))
+        variance = np.square(np.stack([record.u_std, record.v_std], axis=1), dtype=np.float64)
+        noise = np.sqrt(np.einsum("nij,nj->in", slopes**2, variance))
+        simulated = self.simulation.at(time)
+        levelled = np.where(np.isfinite(measured), self.levelling(simulated), np.nan)
+        fit, rigid, taken = self._fit(index, measured, noise, levelled)
+        if self.remove_rigid:
+            measured = measured - rigid
+        gradient = self.simulated_mesh.nodal_gradient(simulated)
+        strain = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4))).components
+        values, own = self._at_nodes(measured, noise)
+        ways = {"nodes": np.concatenate([simulated.T, strain.T]), "levelled": self._at_nodes(levelled, noise)[0]}
+        common = self.relative_std * values * np.array([1, 1, 0, 0, 0])[:, None]
+        std = np.hypot(own, common)
+        agreement = {}
+        for way, of_simulation in ways.items():
+            for name, rows in {"displacement": [0, 1], **{name: [row] for row, name in enumerate(QUANTITIES)}}.items():
+                left = taken * len(rows) / 2 if self.remove_rigid and max(rows) < 2 else 0.0
+                difference = (values - of_simulation)[rows]
+                agreement[way, name] = self._agreement(rows, difference, own[rows], common[rows], left)
+        return FrameComparison(
+            frame=index,
+            time=time,
+            measured=dict(zip(QUANTITIES, values, strict=True)),
+            std=dict(zip(QUANTITIES, std, strict=True)),
+            simulated={way: dict(zip(QUANTITIES, rows, strict=True)) for way, rows in ways.items()},
+            agreement=agreement,
+            fit=fit,
+        )
+
+    def best_scale(self, fits: Iterable[Fit]) -> tuple[float, float]:
+        """Return the multiple of the simulation that fits several frames best, and its standard uncertainty.
+
+        The fraction of the variance that all frames have in common, the reference's, does not average out.
+        """
+        shared, known = shared_part(self.result), [fit for fit in fits if np.isfinite(fit.scale)]
+        information = sum(fit.information for fit in known)
+        if not information:
+            return math.nan, math.nan
+        scale = sum(fit.projection for fit in known) / information
+        total = np.sum([fit.template for fit in known], axis=0)
+        variance = (1 - shared) * sum(self._energy(fit.template) for fit in known) + shared * self._energy(total)
+        return scale, math.hypot(math.sqrt(variance) / information, scale * self.relative_std)
+
+    def _energy(self, rows: FloatArray) -> float:
+        """Variance of the sum of some rows (2, N) times errors of the standard deviation 1."""
+        return float(sum(row @ self.covariance.correlation @ row for row in rows))
+
+    def _fit(
+        self, index: int, measured: FloatArray, noise: FloatArray, levelled: FloatArray
+    ) -> tuple[Fit, FloatArray, float]:
+        """Fit a multiple of the simulation and a rigid motion; return also the latter's displacement (2, N).
+
+        The third value is what the rigid motion is expected to take of the sum of squared ratios.
+        """
+        known = np.isfinite(measured + noise + levelled).all(axis=0) & (noise > 0).all(axis=0)
+        if known.sum() < 3:
+            raise InputError(
+                f"frame {index} has data at {known.sum()} nodes that the simulation covers, 3 are needed: leave it out "
+                "(--frames)"
+            )
+        x, y = self.mesh.nodes.T - self.mesh.nodes[known].mean(axis=0)[:, None]
+        motions = np.array([[np.ones_like(x), 0 * x], [0 * x, np.ones_like(x)], [-y, x]])
+        weighted = np.where(known, motions / np.where(known, noise, 1), 0)
+        ratios, template = (np.where(known, part / np.where(known, noise, 1), 0) for part in (measured, levelled))
+        flat = weighted.reshape(3, -1)
+        inverse = np.linalg.inv(flat @ flat.T)
+        found, simulated = (inverse @ flat @ part.ravel() for part in (ratios, template))
+        spread = sum(weighted[:, axis] @ self.covariance.correlation @ weighted[:, axis].T for axis in range(2))
+        left, template = (
+            part - np.tensordot(motion, weighted, 1) for part, motion in ((ratios, found), (template, simulated))
+        )
+        information, projection = float((template**2).sum()), float((template * left).sum())
+        rigid, taken = found - simulated, float(np.trace(inverse @ spread))
+        std = np.sqrt(np.diag(inverse @ spread @ inverse))
+        scale = scale_std = math.nan
+        energy, rest = self._energy(template), left
+        if information > _RIGID * 2 * known.sum():
+            scale = projection / information
+            scale_std = math.hypot(math.sqrt(energy) / information, scale * self.relative_std)
+            rest, energy = left - scale * template, energy / information
+        unit = np.array([1, 1, 180 / np.pi])
+        fit = Fit(
+            scale=scale,
+            scale_std=scale_std,
+            rigid=rigid * unit,
+            rigid_std=std * unit,
+            chi_square=float((rest**2).sum() / (2 * known.sum() - taken - energy * np.isfinite(scale))),
+            template=template,
+            projection=projection,
+            information=information,
+        )
+        return fit, np.tensordot(rigid, motions, 1), taken
+
+    @cached_property
+    def _own(self) -> npt.NDArray[np.int64]:
+        """Node (M,) of the measurement that is each of the simulation's, by number and place; -1 where there is none.
+
+        All are -1 where the measurement has nodes of its own.
+        """
+        points, numbers = self.simulation.mesh.points, self.result.node_number
+        own = np.arange(len(points)) if len(points) == len(self.mesh.nodes) else np.full(len(points), -1)
+        if numbers is not None:
+            index = {number: place for place, number in enumerate(numbers.tolist())}
+            own = np.array([index.get(number, -1) for number in self.simulation.mesh.node_numbers.tolist()])
+        away = np.abs(self.mesh.nodes[own] - points).max(axis=1)
+        own = np.where(away < _SAME * self.mesh.size, own, -1)
+        return own if len(np.unique(own[own >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
+
+    @cached_property
+    def _read(self) -> tuple[sp.csr_matrix, BoolArray]:
+        """Matrix (M, N) that reads the measurement at the simulation's nodes, and which of them lie in it (M,)."""
+        if (inside := self._own >= 0).any():
+            entries = np.ones(inside.sum()), (np.flatnonzero(inside), self._own[inside])
+            return sp.csr_matrix(entries, shape=(len(inside), len(self.mesh.nodes))), inside
+        matrix, depth = _reading(self.mesh, self.simulation.mesh.points)
+        inside = depth > -_SAME
+        if not inside.any():
+            raise InputError(f"no node of {self.simulation.name} lies in the region that was measured")
+        return sp.csr_matrix(sp.diags(1.0 * inside) @ matrix), inside
+
+    @cached_property
+    def _gauges(self) -> tuple[StrainGauges, sp.csr_matrix]:
+        """The shortest strain gauges, and the matrix (M, G) that gives each node of the simulation its own."""
+        read, inside = self._read
+        if (self._own >= 0).any():
+            return StrainGauges.at_nodes(self.covariance), read
+        gauges = StrainGauges.at_points(self.covariance, self.simulation.mesh.points[inside])
+        return gauges, sp.eye(len(inside), format="csr")[:, inside]
+
+    @cached_property
+    def _correlations(self) -> list[tuple[sp.csr_matrix, sp.csr_matrix]]:
+        """Correlation (M, M) of each of the `QUANTITIES` between the nodes, and its squares, entry by entry."""
+        read, (gauges, given), whole = self._read[0], self._gauges, self.covariance.correlation
+        shape, entries = (given.shape[1], read.shape[1]), (gauges.rows, gauges.nodes)
+        slopes = [given @ sp.csr_matrix((part, entries), shape=shape) for part in gauges.whole]
+        moved, x, y = (_unit(matrix @ whole @ matrix.T) for matrix in (read, *slopes))
+        shear = _unit(sum(slope @ whole @ slope.T for slope in slopes))
+        return [(one, sp.csr_matrix(one.multiply(one))) for one in (moved, moved, x, y, shear)]
+
+    def _at_nodes(self, displacement: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Displacement (2, N) and the strain of it at the simulation's nodes, and their noise, (5, M) each."""
+        read, inside = self._read
+        values, std = np.full((2, len(QUANTITIES), len(inside)), np.nan)
+        for row, (part, error) in enumerate(zip(displacement, noise, strict=True)):
+            known = np.isfinite(part + error)
+            there = inside & (abs(read) @ ~known == 0)
+            scaled = sp.csr_matrix(read @ sp.diags(np.where(known, error, 0)))
+            variance = np.asarray((scaled @ self.covariance.correlation).multiply(scaled).sum(axis=1)).ravel()
+            values[row] = np.where(there, read @ np.where(known, part, 0), np.nan)
+            std[row] = np.where(there, np.sqrt(np.maximum(variance, 0)), np.nan)
+        gauges, given = self._gauges
+        strain = gauges.strain(*displacement, *noise)
+        node, gauge = given.nonzero()
+        values[2:, node], std[2:, node] = strain.components[gauge].T, strain.components_std[gauge].T
+        return values, std
+
+    def _agreement(
+        self, rows: list[int], difference: FloatArray, own: FloatArray, common: FloatArray, taken: float
+    ) -> Agreement:
+        """Compare some rows of the `QUANTITIES`, (r, M) each, of which a fit took a part of the squared ratios."""
+        from scipy.stats import f as fisher
+
+        std = np.hypot(own, common)
+        known = np.isfinite(difference) & (std > 0)
+        count, scale = int(known.sum()), np.where(known, std, 1)
+        if not count:
+            blank = dict.fromkeys(("mean", "rms", "std", "beyond", "chi_square", "freedom", "probability"), math.nan)
+            return Agreement(nodes=0, **blank)
+        ratio, noise, shared = (np.where(known, part / scale, 0) for part in (difference, own, common))
+        square = float((shared**2).sum()) ** 2
+        for row, s, b in zip(rows, noise, shared, strict=True):
+            correlation, squares = self._correlations[row]
+            square += float(s**2 @ squares @ s**2 + 2 * (b * s) @ correlation @ (b * s))
+        chi_square, freedom = float((ratio**2).sum() / (count - taken)), count**2 / square
+        return Agreement(
+            nodes=count,
+            mean=float(difference[known].mean()),
+            rms=float(np.sqrt(np.mean(difference[known] ** 2))),
+            std=float(np.median(std[known])),
+            beyond=float(np.mean(np.abs(ratio[known]) > 2)),
+            chi_square=chi_square,
+            freedom=freedom,
+            probability=float(fisher.sf(chi_square, freedom, len(rows) * self._blocks)),
+        )
+
+
+def _unit(covariance: sp.csr_matrix) -> sp.csr_matrix:
+    """Return the correlation of a covariance; a row without variance stays empty."""
+    variance = covariance.diagonal()
+    scale = sp.diags(np.divide(1, np.sqrt(variance), out=np.zeros_like(variance), where=variance > 0))
+    return sp.csr_matrix(scale @ covariance @ scale)
+
+
+def measured_mesh(result: Result) -> FiniteElementMesh | None:
+    """Return the part of ``mesh.file`` that a result was measured on; None where it has none."""
+    if result.node_number is None or result.element_number is None or result.node_mm is None:
+        return None
+    kept = result.provenance["finite_elements"]
+    return FiniteElementMesh(
+        name=kept["name"],
+        points=result.node_mm,
+        node_numbers=result.node_number,
+        elements=result.elements,
+        element_numbers=result.element_number,
+    )
+
+
+def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence[Sequence[float]] = ()) -> Placement:
+    """Place a simulation's mesh on the image of a result.
+
+    Parameters
+    ----------
+    result
+        The result.
+    scale
+        It replaces the ``[scale]`` that was kept with the result; None: that one.
+    pairs
+        Points (x_mm, y_mm, x_px, y_px), two or more; none: ``mesh.points`` of the result.
+
+    Raises
+    ------
+    InputError
+        No points are known, or they place no mesh.
+    """
+    placed = placement_of(result)
+    if not pairs and placed is None:
+        raise InputError(
+            f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
+            "--points X_MM,Y_MM:X_PX,Y_PX each"
+        )
+    camera, stated = rectification_of(result, scale).camera, scale or scale_of(result)
+    if not pairs:
+        assert placed is not None
+        return Placement.fit(placed.pairs, camera)
+    found = Placement.fit(pairs, camera, where="--points")
+    if found.mm_per_pixel is not None and stated.mm_per_pixel is not None:
+        away = found.mm_per_pixel / stated.mm_per_pixel - 1
+        if abs(away) > _DIFFERENT:
+            logger.warning(
+                "--points state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken",
+                found.mm_per_pixel,
+                stated.mm_per_pixel,
+            )
+    return found
+
+
+def _matched(
+    result: Result, simulation: Simulation, times: FloatArray | None, asked: Sequence[int] | None
+) -> tuple[FloatArray, tuple[int, ...], tuple[int, ...]]:
+    """Find the time (T,) of each frame, the frames to compare, and those beyond the simulation's times."""
+    for index in asked or ():
+        if result.frame(index).status == _FAILED:
+            raise InputError(f"frame {index} of {result.path} is not measured; compare another one (--frames)")
+    known = [index for index in result.deformed if result.finished[index] and result.status[index] != _FAILED]
+    frames = list(known if asked is None else asked)
+    if not frames:
+        raise InputError(f"no deformed frame of {result.path} is measured")
+    clock = result.number.astype(np.float64) if times is None else times
+    if simulation.times is None:
+        return clock, tuple(frames if asked is not None else frames[-1:]), ()
+    first, last = simulation.times[[0, -1]]
+    slack = _SAME * max(abs(first), abs(last))
+    within = [index for index in frames if first - slack <= clock[index] <= last + slack]
+    beyond = tuple(index for index in frames if index not in within)
+    if not within or (asked is not None and beyond):
+        unit = "s" if times is not None else "frames (their times are not known)"
+        which = f"frame {beyond[0]} is at {clock[beyond[0]]:.9g}" if within else (
+            f"the frames of {result.path} are at {min(clock[frames]):.9g} to {max(clock[frames]):.9g}"
+        )  # fmt: skip
+        raise InputError(
+            f"{which} {unit}, the simulation {simulation.name} spans {first:.9g} to {last:.9g}: state the "
+            "--offset between both clocks, or other --frames"
+        )
+    return np.clip(clock, first, last), tuple(within), beyond
