@@ -25,7 +25,19 @@ _MARKED, _MARKED_OF_PROBE = 40, 60
 """Points up to which each gets a marker, in a panel of half the width and of the whole width: more would touch."""
 _PANEL = 2.4
 """Height of a panel of `history_figure` in inches, its numbers included: four fill a page."""
-_KINDS = ("velocity", "acceleration", "strain_rate", "rate", "strain", "extension", "direction", "stress")
+_KINDS = (
+    "velocity",
+    "acceleration",
+    "strain_rate",
+    "rate",
+    "strain",
+    "extension",
+    "opening",
+    "sliding",
+    "direction",
+    "stress",
+)
+_KIND_OF_UNIT = {"deg": "rotation", "": "strain", "MPa √m": "stress intensity factor", "MPa": "T-stress"}
 
 
 def field_history_figure(physical: Physical, history: TimeHistory) -> Figure:
@@ -137,4 +149,4 @@ def _kind(quantity: HistoryColumn) -> str:
         return quantity.name
     name = quantity.name.removesuffix("_before").removesuffix("_after")
     kind = next((kind for kind in _KINDS if name.endswith(f"_{kind}") or name == kind), "")
-    return kind.replace("_", " ") or {"deg": "rotation", "": "strain"}.get(quantity.unit, "displacement")
+    return kind.replace("_", " ") or _KIND_OF_UNIT.get(quantity.unit, "displacement")

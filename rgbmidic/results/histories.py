@@ -188,7 +188,7 @@ def read_histories(
     made = []
     for kind, place in probes.places:
         counts[kind] = counts.get(kind, 0) + 1
-        made.append(make_probe(covariance, kind, counts[kind], rectified.place(place), probes.measure))
+        made.append(make_probe(rectified, covariance, kind, counts[kind], place, probes))
     clock = result.number[there].astype(np.float64) if times is None else times
     each = result.table.each(["u", "v", "u_std", "v_std"], there.tolist())
     nodal, rigid, speed = _read(each, rectified, covariance, made, probes.rigid_motion, clock)
@@ -267,7 +267,9 @@ def _in_units(
         values, std = units.lengths(values, std) if length else (values, std)
         return HistoryColumn(name=name, unit=unit, values=values, std=std)
 
-    assert history.std is not None
+    if history.std is None:
+        yield history
+        return
     yield column(history.name, unit, history.values, history.std)
     if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
@@ -326,6 +328,7 @@ def _remarks(
         )
     if any(history.name.endswith("_equivalent") for part in read.values() for history in part):
         yield f"equivalent: {EQUIVALENT}"
+    yield from dict.fromkeys(history.note for part in read.values() for history in part if history.note)
     for name, part in read.items():
         if missing := int(np.isnan(part[0].values).sum()):
             yield f"{name} is not measured in {missing} of {len(frames)} frames"
