@@ -238,13 +238,13 @@ def figures(
 @app.command()
 def export(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that `rgbmidic run` wrote.")],
-    out: Annotated[Path, typer.Option("--out", help="File to write.")],
-    to: Annotated[str, typer.Option("--to", help="Format: npz, csv or hdf5.")] = "npz",
+    out: Annotated[Path, typer.Option("--out", help="File to write; of crackpy a folder.")],
+    to: Annotated[str, typer.Option("--to", help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
     test: Reading = None,
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
-    """Write a result into one file for another program: ParaView, MATLAB, xarray, a spreadsheet."""
+    """Write a result for another program: ParaView, MATLAB, xarray, a spreadsheet, CrackPy."""
     from rgbmidic.results import Result, export_result
 
     settings = _settings(test)

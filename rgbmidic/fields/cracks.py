@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -44,6 +45,9 @@ __all__ = [
 _NEAR = 0.5
 """Distance in elements within which a stated point counts as on a crack or at its tip: where a path of `[mesh] cracks`
 is moved, it is by as much."""
+_INNER = 2.0
+"""Least inner radius of an annulus, in elements: from there on K of an image without noise is right to .2 % (measured,
+docs/results.md)."""
 _STRAIGHT = 1.0
 """Distance (px) of a straight crack's nodes from its line: as near as a row of nodes follows a stated path."""
 _MOST_TERMS = 7
@@ -139,7 +143,7 @@ class JumpAlong:
             raise InputError(f"{name} needs two different points of one crack of the mesh, not {_text(place)} px")
         # an element is on the right of its sides as these run: the image has y down
         sides = np.full((len(path), 2, 2), -1, dtype=np.int64)
-        for i, step in enumerate(zip(path[:-1], path[1:], strict=True)):
+        for i, step in enumerate(pairwise(path.tolist())):
             for side, (start, end) in enumerate((step[::-1], step)):
                 face = faces[(places == (start, end)).all(axis=1)][0]
                 sides[i, side, 1], sides[i + 1, side, 0] = face if side else face[::-1]
@@ -240,7 +244,7 @@ def _nearest(
     if away.min() > _NEAR * mesh.size:
         raise InputError(
             f"{name} at ({_text(point)}) px is not {what} of the mesh; the nearest node that is lies at "
-            f"({_text(mesh.nodes[nearest].round(1))}) px, {away.min():.3g} px away, where {_NEAR * mesh.size:.3g} px count"
+            f"({_text(mesh.nodes[nearest].round(1))}) px, {away.min():.3g} px away; {_NEAR * mesh.size:.3g} px count"
         )
     return nearest
 
@@ -278,7 +282,8 @@ class Williams:
         ):
             raise InputError(
                 "Williams' series needs a Young's modulus above 0 MPa, a Poisson's ratio above -1 and at most .5, the "
-                f'plane "stress" or "strain", and 0, 2 or more terms; given are {e:g}, {nu:g}, "{self.plane}", {self.terms}'
+                f'plane "stress" or "strain", and terms 0, 2 or more; given are {e:g}, {nu:g}, "{self.plane}", '
+                f"{self.terms}"
             )
         if self.units.mm_per_pixel is None:
             raise InputError(
@@ -402,10 +407,10 @@ class CrackTip:
         alone = np.setdiff1d(faces, mesh.copies)
         node = _nearest(mesh, name, alone, np.array(place[:2]), "the tip of a crack")
         tip = mesh.nodes[node]
-        if not 2 * mesh.size <= inner < outer:
+        if not _INNER * mesh.size <= inner < outer:
             raise InputError(
-                f"{name} needs an annulus from 2 elements ({2 * mesh.size:.3g} px) on, whose outer radius is the larger "
-                f"one: nearer nodes do not resolve the field at a tip; given are {inner:g} and {outer:g} px"
+                f"{name} needs an inner radius of 2 elements, {_INNER * mesh.size:.3g} px, or more, as nearer nodes do "
+                f"not resolve the field at a tip, and a larger outer one; given are {inner:g} and {outer:g} px"
             )
         near = np.setdiff1d(places[faces], node)
         behind = tip - mesh.nodes[near]
@@ -415,8 +420,9 @@ class CrackTip:
         along, beside = axes @ behind.T
         if np.abs(beside).max() > _STRAIGHT or along.min() < 0 or along.max() < outer - 2 * mesh.size:
             raise InputError(
-                f"{name} needs one crack that is straight from the tip at ({_text(tip.round(1))}) px to the outer radius, "
-                f"{outer:g} px; within that it is {along.max():.4g} px long and leaves its line by {np.abs(beside).max():.3g} px"
+                f"{name} needs one crack that is straight from the tip at ({_text(tip.round(1))}) px to the outer "
+                f"radius, {outer:g} px; it is {along.max():.4g} px long there and leaves its line by "
+                f"{np.abs(beside).max():.3g} px"
             )
         side = np.zeros(len(mesh.nodes))
         forward = (mesh.nodes[faces[:, 1]] - mesh.nodes[faces[:, 0]]) @ ahead > 0
@@ -446,8 +452,8 @@ class CrackTip:
         if (outside > _OUTSIDE).any():
             cut = radii[np.argmax(outside > _OUTSIDE)]
             raise InputError(
-                f"{where} leaves the region (edge or hole) at {100 * outside.max():.0f} % of its angles; it must end below "
-                f"{cut:.4g} px"
+                f"{where} leaves the region (edge or hole) at {100 * outside.max():.0f} % of its angles; it must end "
+                f"below {cut:.4g} px"
             )
         if not self._enough(np.ones(len(self.nodes), dtype=bool)):
             raise InputError(
@@ -466,7 +472,7 @@ class CrackTip:
         return self.williams.terms or min(_MOST_TERMS, len(self.nodes) // _PER_COEFFICIENT - 1)
 
     def series(self, points: FloatArray, face: FloatArray, orders: range) -> FloatArray:
-        """Evaluate terms at points (m, 2), those of a `face` on its side, as ``(r / outer radius)^(n/2)``; (m, 2, p)."""
+        """Evaluate terms at points (m, 2), those of a `face` on its side, in (r / outer radius)^(n/2); (m, 2, p)."""
         angle = np.arctan2(points[:, 1], points[:, 0])
         angle += 2 * np.pi * face * (angle * face < 0)
         return williams_series(np.hypot(*points.T) / self.radii[1], angle, orders, self.williams.kolosov)
@@ -482,9 +488,9 @@ class CrackTip:
         """Fit the series to the displacements of the `nodes` in every frame.
 
         The weights are the inverse covariance of the nodes, neighbours correlated. Where the chi-square is above its
-        degrees of freedom the uncertainty grows by the root of their ratio (Birge, Phys Rev 40, 1932). The terms go up to the least N from
-        which all those beyond it lower no frame's chi-square by more than noise would, once in a thousand tests of the
-        whole series; where the tip is fitted the terms n = -1, which shift it, take part in that.
+        degrees of freedom the uncertainty grows by the root of their ratio (Birge, Phys Rev 40, 1932). The terms go up
+        to the least N from which all those beyond it lower no frame's chi-square by more than noise would, once in a
+        thousand tests; where the tip is fitted the terms n = -1, which shift it, take part in that.
         """
         fields = np.stack([nodal.u, nodal.v, nodal.u_std, nodal.v_std], axis=1)
         known: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
@@ -537,13 +543,13 @@ class CrackTip:
         tip = "its place along the crack is fitted" if w.fit_tip else "its place is that of the mesh"
         note = (
             f"{self.name}: tip at ({_text(self.tip.round(1))}) px, {tip}; Williams' series up to n = {s.terms} "
-            f"({'stated' if w.terms else 'by a test'}), {len(self.nodes)} nodes from {_text(self.radii)} px, plane {w.plane}, "
-            f"E = {w.youngs_modulus:g} MPa, nu = {w.poissons_ratio:g}"
+            f"({'stated' if w.terms else 'by a test'}), {len(self.nodes)} nodes at {_text(self.radii)} px, plane "
+            f"{w.plane}, E = {w.youngs_modulus:g} MPa, nu = {w.poissons_ratio:g}"
         )
         if np.isfinite(s.chi_square).any() and (worst := np.nanmax(s.chi_square)) > _POOR:
             note += (
-                f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: what the series "
-                "does not describe is not in the stated uncertainty"
+                f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: the "
+                "field is not the series' within the noise, and what this makes of the factors is not known"
             )
         parts: list[tuple[str, str, FloatArray, FloatArray | None]] = [
             ("K1", _K_UNIT, s.factors[:, 0], s.factors_std[:, 0]),
@@ -610,19 +616,19 @@ class _Weighted:
         white = whiten(data.T[:, :, None])[:, 0]
         return cls(probe=probe, points=points, face=face, data=white, turned=turned, whiten=whiten)
 
-    def design(self, orders: range, tip: float = 0.0) -> FloatArray:
-        """Evaluate the terms, as (r / outer radius)^(n/2), for a tip so many px ahead, over the errors; (2 m, p)."""
+    def series(self, orders: range, tip: float = 0.0) -> FloatArray:
+        """Evaluate the terms, in (r / outer radius)^(n/2), for a tip so many px ahead; (2, m, p)."""
         series = self.probe.series(self.points - (tip, 0.0), self.face, orders)
-        return self.whiten(np.einsum("mcp,ci->imp", series, self.turned))
+        return np.asarray(np.einsum("mcp,ci->imp", series, self.turned))
 
     def misfits(self, orders: range) -> FloatArray:
         """Chi-square of the best fit of the terms up to each."""
-        taken = np.linalg.qr(self.design(orders))[0].T @ self.data
+        taken = np.linalg.qr(self.whiten(self.series(orders)))[0].T @ self.data
         return np.asarray((self.data**2).sum() - np.cumsum((taken**2).reshape(-1, 2).sum(axis=1)))
 
     def fit(self, orders: range) -> tuple[FloatArray, FloatArray, float]:
         """Fit some terms: coefficients, their covariance, chi-square over its degrees of freedom."""
-        return self._solved(self.design(orders))
+        return self._solved(self.whiten(self.series(orders)))
 
     def _solved(self, design: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         data = self.data
@@ -640,8 +646,9 @@ class _Weighted:
         orders, tip, step = range(terms + 1), 0.0, 1e-3 * self.probe.radii[1]
         values = self.fit(orders)[0]
         for _ in range(_STEPS):
-            slope = (self.design(orders, tip + step) - self.design(orders, tip - step)) @ values / (2 * step)
-            solved, covariance, chi_square = self._solved(np.c_[self.design(orders, tip), slope])
+            slope = (self.series(orders, tip + step) - self.series(orders, tip - step)) @ values / (2 * step)
+            design = np.concatenate([self.series(orders, tip), slope[..., None]], axis=2)
+            solved, covariance, chi_square = self._solved(self.whiten(design))
             values, change = solved[:-1], float(solved[-1])
             tip += change
             if not abs(tip) < self.probe.radii[0] / 2:
