@@ -9,7 +9,7 @@ import pytest
 
 from rgbmidic import Region, Tri3Mesh
 from rgbmidic.errors import InputError
-from rgbmidic.fields import Nodal, Units, Williams, crack_jump, stress_intensity
+from rgbmidic.fields import Nodal, NodalCovariance, Units, Williams, crack_jump, stress_intensity
 from rgbmidic.fields.cracks import williams_series
 
 SIZE = 14
@@ -137,10 +137,8 @@ def test_the_stated_uncertainty_is_that_of_draws_of_the_nodes_noise():
     draws, random = 300, np.random.default_rng(1)
     left = np.isin(np.arange(len(MESH.nodes)), MESH.copies) & (MESH.places[:, 1] < TIP[1])
     field = np.where(left[:, None], (0.0, -6.0), 0.0) + textbook(MESH, MATERIAL, 20.0, 5.0)
-    from rgbmidic.fields import NodalCovariance
-
     root = np.linalg.cholesky(NodalCovariance.from_mesh(MESH).correlation.toarray())
-    noise = STD * np.einsum("nm,tmc->tnc", root, random.normal(size=(draws, *field.shape)))
+    noise = STD * (root @ random.normal(size=(draws, *field.shape)))
     jump = crack_jump(MESH.nodes, MESH.elements, fields(MESH, field + noise), START, TIP)
     for values, std in ((jump.opening, jump.opening_std), (jump.sliding, jump.sliding_std)):
         ratio = values.std(axis=0) / std.mean(axis=0)
