@@ -65,6 +65,8 @@ _STEPS, _EXACT = 20, 1e-3
 """Most Gauss-Newton steps of a tip's place, and the step (px) that ends them."""
 _POOR = 1.5
 """Chi-square over its degrees of freedom from which a remark says that the field is not the series'."""
+_LEAST = 1e-3
+"""Least uncertainty of a node over the median one: a node that is stated without noise does not outweigh all others."""
 _K_UNIT = "MPa √m"
 
 
@@ -450,10 +452,10 @@ class CrackTip:
         outside = 1 - Places.of(mesh, ring.reshape(-1, 2)).inside.reshape(ring.shape[:2]).mean(axis=1)
         where = f"{self.name}: the annulus from {inner:g} to {outer:g} px around ({_text(self.tip.round(1))}) px"
         if (outside > _OUTSIDE).any():
-            cut = radii[np.argmax(outside > _OUTSIDE)]
+            cut = int(np.argmax(outside > _OUTSIDE))
+            most = f"it may reach to {radii[cut - 1]:.4g} px" if cut else "no part of it is within"
             raise InputError(
-                f"{where} leaves the region (edge or hole) at {100 * outside.max():.0f} % of its angles; it must end "
-                f"below {cut:.4g} px"
+                f"{where} leaves the region (edge or hole) at {100 * outside.max():.0f} % of its angles; {most}"
             )
         if not self._enough(np.ones(len(self.nodes), dtype=bool)):
             raise InputError(
@@ -496,7 +498,10 @@ class CrackTip:
         known: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
         frames = np.flatnonzero([self._enough(row) for row in known])
         data = {frame: _Weighted.of(self, fields[frame], known[frame]) for frame in frames.tolist()}
-        fit_tip, terms = self.williams.fit_tip, self.williams.terms or self._terms(list(data.values()))
+        fit_tip, terms = (
+            self.williams.fit_tip,
+            self.williams.terms or self._terms([one for one in data.values() if not one.certain]),
+        )
         found = np.full((len(fields), 4, 2), np.nan)
         chi_square = np.full(len(fields), np.nan)
         for frame, weighted in data.items():
@@ -504,6 +509,8 @@ class CrackTip:
             if fit is not None:
                 values, covariance, chi_square[frame] = fit
                 std = np.sqrt(np.diag(covariance) * max(1.0, chi_square[frame]))
+                if weighted.certain:
+                    std, chi_square[frame] = 0 * std, np.nan
                 found[frame] = np.stack([values, std], axis=1)[[2, 3, 4, -1]]
         outer, units, scale = self.radii[1], self.williams.units, self.williams.shear
         assert units.mm_per_pixel is not None
@@ -581,6 +588,8 @@ class _Weighted:
         The crack's axes as the body has turned: rows.
     whiten
         Divides fields (2, m, p) by their errors, (2 m, p).
+    certain
+        Whether the displacements are stated without uncertainty, as those of the reference: all errors are then 1 px.
     """
 
     probe: CrackTip
@@ -589,11 +598,14 @@ class _Weighted:
     data: FloatArray
     turned: FloatArray
     whiten: Callable[[FloatArray], FloatArray]
+    certain: bool
 
     @classmethod
     def of(cls, probe: CrackTip, field: FloatArray, known: BoolArray) -> Self:
         """Take the measured of the displacements and uncertainties (4, m) of a frame."""
         factor, std = cholesky(probe.correlation[np.ix_(known, known)], lower=True), field[2:, known]
+        level = float(np.median(std))
+        std = np.maximum(std, _LEAST * level) if level > 0 else np.ones_like(std)
 
         def whiten(parts: FloatArray) -> FloatArray:
             scaled = parts / std[:, :, None]
@@ -614,7 +626,9 @@ class _Weighted:
                 rotation = np.linalg.lstsq(series, (data @ turned.T).ravel(), rcond=None)[0][5]
                 angle += (probe.williams.kolosov + 1) * rotation / probe.radii[1]
         white = whiten(data.T[:, :, None])[:, 0]
-        return cls(probe=probe, points=points, face=face, data=white, turned=turned, whiten=whiten)
+        return cls(
+            probe=probe, points=points, face=face, data=white, turned=turned, whiten=whiten, certain=not level > 0
+        )
 
     def series(self, orders: range, tip: float = 0.0) -> FloatArray:
         """Evaluate the terms, in (r / outer radius)^(n/2), for a tip so many px ahead; (2, m, p)."""

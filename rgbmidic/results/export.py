@@ -339,6 +339,8 @@ def _write_nodemaps(physical: Physical, folder: Path, *, overwrite: bool) -> Non
             "[scale] of a TEST.toml and give it as --test"
         )
     stem = result.path.resolve().name
+    if folder.exists() and not folder.is_dir():
+        raise ResultError(f"{folder} already exists and is no folder; nodemaps need one of their own")
     with writing(folder):
         there = list(folder.iterdir()) if folder.exists() else []
         foreign = [file for file in there if not re.fullmatch(rf"{re.escape(stem)}_\d+\.txt", file.name)]

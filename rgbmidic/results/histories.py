@@ -216,7 +216,10 @@ def read_histories(
         quantities=(*quantities, *beside, *stress),
         stress_strain=(strain, stress[0].name) if stress and strain else None,
         units=units,
-        remarks=tuple(_remarks(rectified, speed, exposure(result), there, by_probe, beside)),
+        remarks=(
+            *_remarks(rectified, speed, exposure(result), there, by_probe, beside),
+            *_of_cracks(result, by_probe),
+        ),
     )
 
 
@@ -302,6 +305,17 @@ def _beside(
         return beside, []
     name, newtons = channels.force(force)
     return beside, [HistoryColumn(name="stress", unit="MPa", values=read[name] * newtons / area, std=None)]
+
+
+def _of_cracks(result: Result, read: Mapping[str, list[History]]) -> Iterator[str]:
+    """Report what hurts the nodes at an open crack: the local mean reaches across it and takes the gap in."""
+    width = result.setting("illumination", "normalise", 0.0)
+    if width and (names := [name for name in read if name.startswith("crack_")]):
+        yield (
+            f"{', '.join(names)}: the images were divided by their local mean, which takes in the gap of a crack: "
+            "from half a px of opening on the jump is wrong by more than its uncertainty; measure with normalise = 0 "
+            f"in [illumination], not {width:g}"
+        )
 
 
 def _remarks(

@@ -1,4 +1,4 @@
-"""Cracks on exactly known speckle: both sides measured along a stated path, lost without and found again, K at a tip."""
+"""Cracks on known speckle: both sides measured along a stated path, lost without and found again, K at a tip."""
 
 from __future__ import annotations
 
