@@ -379,6 +379,7 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
     prefix = "" if section == "test" else rf"{section}\."
     key = {"calibration_file": r"calibration\.file", "element_size": r"mesh\.element_size", "cracks": r"mesh\.cracks"}
     key |= {"accept": r"calibration\.accept"}
+    key = key if isinstance(built, TestSettings) else {}
     for instead in wrong:
         with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:
             replace(built, **{name: instead})
