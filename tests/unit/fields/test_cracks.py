@@ -18,7 +18,9 @@ TIP = (200.0, 200.0)
 START = (0.0, 200.0)
 RADII = (30.0, 150.0)
 SCALE = 0.05
-MATERIAL = Williams(youngs_modulus=70_000, poissons_ratio=0.33, plane="stress", units=Units(mm_per_pixel=SCALE))
+NU = 0.33
+KAPPA = {"stress": (3 - NU) / (1 + NU), "strain": 3 - 4 * NU}
+MATERIAL = Williams(youngs_modulus=70_000, poissons_ratio=NU, plane="stress", units=Units(mm_per_pixel=SCALE))
 K1, K2, T = 0.02, -0.007, 0.05
 """Small, so that small and finite rotations are the same: what differs is of their second order."""
 
@@ -45,7 +47,7 @@ def textbook(mesh, williams, k1=K1, k2=K2, t=T, tip=TIP, direction=(1.0, 0.0)):
     above = ((mesh.places - tip) @ axes.T)[:, 1] > 0
     r, angle = np.hypot(x, y), np.arctan2(y, x)
     angle = np.where((x < 0) & np.isin(np.arange(len(x)), mesh.copies), np.where(above, np.pi, -np.pi), angle)
-    shear, kappa = williams.youngs_modulus / 2 / (1 + williams.poissons_ratio), williams.kolosov
+    shear, kappa = williams.youngs_modulus / 2 / (1 + NU), KAPPA[williams.plane]
     s, c = np.sin(angle / 2), np.cos(angle / 2)
     root = np.sqrt(r * SCALE * 1e-3 / (2 * np.pi)) / (2 * shear) / (SCALE * 1e-3)
     u = root * (k1 * c * (kappa - 1 + 2 * s**2) + k2 * s * (kappa + 1 + 2 * c**2)) + t * (kappa + 1) * x / (8 * shear)
@@ -151,6 +153,37 @@ def test_the_stated_uncertainty_is_that_of_draws_of_the_nodes_noise():
     assert 0.75 < ratio.min() < ratio.max() < 1.25  # 60 draws: to 9 %
     assert 0.75 < (found.extension / found.extension_std).std() < 1.25
     np.testing.assert_allclose(found.chi_square.mean(), 1, atol=0.03)
+
+
+def test_values_and_uncertainty_are_those_of_generalised_least_squares_with_the_whole_covariance():
+    random, count = np.random.default_rng(5), len(MESH.nodes)
+    std = random.uniform(0.5, 2, (2, count)) * STD
+    u, v = textbook(MESH, MATERIAL).T + std * random.normal(size=(2, count))
+    nodal = Nodal(u=u[None], v=v[None], u_std=std[:1], v_std=std[1:])
+    found = stress_intensity(MESH.nodes, MESH.elements, nodal, TIP, RADII, replace(MATERIAL, terms=4))
+    x, y = (MESH.nodes - TIP).T
+    used = (np.hypot(x, y) >= RADII[0]) & (np.hypot(x, y) <= RADII[1])
+    face = np.isin(np.arange(count), MESH.copies)
+    angle = np.where(face, np.where(MESH.places[:, 1] < TIP[1], np.pi, -np.pi), np.arctan2(-y, x))
+    series = williams_series(np.hypot(x, y)[used], angle[used], range(5), MATERIAL.kolosov)
+    design = np.concatenate([series[:, 0], -series[:, 1]])
+    correlation = NodalCovariance.from_mesh(MESH).correlation.toarray()[np.ix_(used, used)]
+    zero = np.zeros_like(correlation)
+    inverse = np.linalg.inv(
+        np.block(
+            [[correlation * np.outer(s, s) if i == j else zero for j in (0, 1)] for i, s in enumerate(std[:, used])]
+        )
+    )
+    covariance = np.linalg.inv(design.T @ inverse @ design)
+    data = np.r_[u[used], v[used]]
+    values = covariance @ design.T @ inverse @ data
+    left = data - design @ values
+    chi_square = left @ inverse @ left / (len(data) - len(values))
+    to_k = np.sqrt(2 * np.pi * SCALE * 1e-3) * MATERIAL.youngs_modulus / (1 + NU)
+    stated = np.sqrt(np.diag(covariance) * max(1, chi_square))[2:4]
+    np.testing.assert_allclose(found.chi_square, chi_square, rtol=1e-3)
+    np.testing.assert_allclose(found.factors_std[0], to_k * stated, rtol=1e-3)
+    np.testing.assert_allclose(found.factors[0], to_k * values[2:4], atol=0.02 * to_k * stated.min())
 
 
 def test_the_tip_is_found_where_it_is_ahead_of_the_meshs():
