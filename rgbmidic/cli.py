@@ -63,12 +63,21 @@ _PLACES = {
     "gauges": ("--gauge", "X0,Y0:X1,Y1", "Between two points that move."),
     "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1", "Along the line as it was."),
     "strain_gauges": ("--strain-gauge", "X,Y:LENGTH", "Virtual strain gauge."),
+    "cracks": ("--crack", "X0,Y0:X1,Y1", "Jump along a crack of the mesh."),
+    "tips": ("--tip", "X,Y:R0,R1", "Stress intensity at a crack's tip."),
 }
 """Keys of ``[probes]`` with the option, the form of a place and the help."""
 _PROBE_OPTIONS: dict[str, Any] = {
     key: Annotated[list[str] | None, typer.Option(option, metavar=form, help=text)]
     for key, (option, form, text) in _PLACES.items()
 } | {
+    "youngs_modulus": Annotated[float | None, typer.Option("--youngs-modulus", metavar="MPA", help="For --tip.")],
+    "poissons_ratio": Annotated[float | None, typer.Option("--poissons-ratio", help="For --tip.")],
+    "plane": Annotated[str | None, typer.Option("--plane", help="For --tip: stress or strain.")],
+    "terms": Annotated[int | None, typer.Option("--terms", help="Highest term of Williams' series; 0: by a test.")],
+    "fit_tip": Annotated[
+        bool | None, typer.Option("--fit-tip/--mesh-tip", help="Fit the tip's place along the crack.")
+    ],
     "measure": Annotated[str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")],
     "window": Annotated[
         int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more; 0: no rates.")
@@ -339,13 +348,13 @@ def figures(
 @app.command()
 def export(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that `rgbmidic run` wrote.")],
-    out: Annotated[Path, typer.Option("--out", help="File to write.")],
-    to: Annotated[str, typer.Option("--to", help="Format: npz, csv or hdf5.")] = "npz",
+    out: Annotated[Path, typer.Option("--out", help="File to write; of crackpy a folder.")],
+    to: Annotated[str, typer.Option("--to", help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
     test: Reading = None,
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
-    """Write a result into one file for another program: ParaView, MATLAB, xarray, a spreadsheet."""
+    """Write a result for another program: ParaView, MATLAB, xarray, a spreadsheet, CrackPy."""
     from rgbmidic.results import Result, export_result
 
     settings = _settings(test)

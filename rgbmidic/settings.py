@@ -390,6 +390,16 @@ class ProbeSettings(_Checked):
         The same, along the line as it was on the reference.
     strain_gauges
         (x, y, length): virtual strain gauges.
+    cracks
+        (x0, y0, x1, y1): two points on a crack of the mesh, between which the displacement jump is read.
+    tips
+        (x, y, r0, r1): tip of a crack of the mesh, and the radii of the annulus in which Williams' series is fitted.
+    youngs_modulus, poissons_ratio, plane
+        Of the material, for `tips`: MPa; a number; ``"stress"`` for a thin body, ``"strain"`` for a thick one.
+    terms
+        Highest term of the series; 0: chosen by a test.
+    fit_tip
+        Whether the place of a tip along its crack is fitted in every frame.
     measure
         Strain measure of the strain gauges.
     window
@@ -408,6 +418,13 @@ class ProbeSettings(_Checked):
     gauges: _Place4 = ()
     straight_gauges: _Place4 = ()
     strain_gauges: _Place3 = ()
+    cracks: _Place4 = ()
+    tips: _Place4 = ()
+    youngs_modulus: float | None = bounded(None, above=0)
+    poissons_ratio: float | None = bounded(None, above=-1, at_most=0.5)
+    plane: Literal["stress", "strain"] | None = None
+    terms: int = bounded(0, at_least=0, at_most=20)
+    fit_tip: bool = False
     measure: Literal["green-lagrange", "hencky", "biot", "engineering"] = "green-lagrange"
     window: int = bounded(0, at_least=0)
     rigid_motion: Literal["none", "tell", "remove"] = "none"
@@ -419,6 +436,18 @@ class ProbeSettings(_Checked):
         for key in ("circles", "strain_gauges"):
             sizes = [size for *_, size in getattr(self, key)]
             _require(all(size > 0 for size in sizes), f"probes.{key} are [x, y, size] with a size above 0, not {sizes}")
+        for *_, inner, outer in self.tips:
+            _require(
+                0 < inner < outer,
+                f"probes.tips are [x, y, r0, r1] with radii 0 < r0 < r1 in px, not {inner:g} and {outer:g}",
+            )
+        missing = [key for key in ("youngs_modulus", "poissons_ratio", "plane") if getattr(self, key) is None]
+        _require(
+            not (self.tips and missing),
+            'probes.tips need probes.youngs_modulus (MPa), probes.poissons_ratio and probes.plane ("stress" or '
+            f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}',
+        )
+        _require(self.terms != 1, "probes.terms must be 0 (chosen by a test) or at least 2, not 1")
 
     @property
     def places(self) -> list[tuple[str, tuple[float, ...]]]:
@@ -426,7 +455,7 @@ class ProbeSettings(_Checked):
         return [
             (entry.name[:-1], place)
             for entry in fields(self)
-            if entry.name not in ("measure", "window", "rigid_motion")
+            if isinstance(getattr(self, entry.name), tuple)
             for place in getattr(self, entry.name)
         ]
 

@@ -1,5 +1,6 @@
 """From a solution to what an engineer reads: the field at pixels and nodes, strain, rates, units, probes."""
 
+from rgbmidic.fields.cracks import Jump, StressIntensity, Williams, crack_jump, stress_intensity
 from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, Units, column, high_pass, rates
 from rgbmidic.fields.measures import EQUIVALENT, MEASURES, RigidMotion, Strain, length_of, strain_of_gradient
 from rgbmidic.fields.nodal import (
@@ -25,6 +26,7 @@ __all__ = [
     "CameraCalibration",
     "Gauge",
     "History",
+    "Jump",
     "Mean",
     "Nodal",
     "NodalCovariance",
@@ -37,10 +39,13 @@ __all__ = [
     "Strain",
     "StrainGauge",
     "StrainGauges",
+    "StressIntensity",
     "Units",
+    "Williams",
     "at_nodes",
     "at_pixels",
     "column",
+    "crack_jump",
     "difference_std",
     "field_rms",
     "frame_covariance",
@@ -52,4 +57,5 @@ __all__ = [
     "shortest_gauge",
     "strain_of",
     "strain_of_gradient",
+    "stress_intensity",
 ]

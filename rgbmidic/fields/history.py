@@ -116,7 +116,7 @@ class Units:
 
 def column(name: str, unit: str) -> str:
     """Return the name of a column with its unit in plain letters: `u` in ``"mm/s²"`` is ``"u_mm_per_s2"``."""
-    plain = unit.replace("²", "2")
+    plain = unit.replace("²", "2").replace(" √", "_sqrt_")
     over, _, below = plain.partition("/")
     words = [part for part in ("" if over == "1" else over, f"per_{below}" if below else "") if part]
     return "_".join([name, *words])
@@ -146,13 +146,16 @@ class History:
     values : ndarray, shape (T,)
         NaN where not measured.
     std : ndarray, shape (T,), or None
-        Standard uncertainty; None for what was not measured by the images.
+        Standard uncertainty; None for what was not measured by the images, or has none.
+    note
+        What a reader should know of it, else empty.
     """
 
     name: str
     unit: str
     values: FloatArray
     std: FloatArray | None
+    note: str = ""
 
     @property
     def column(self) -> str:

@@ -400,12 +400,12 @@ class Rectification:
         units = Units(mm_per_pixel=size, mm_per_pixel_std=std)
         return cls(camera=camera, image=mesh, mesh=flat, units=units)
 
-    def place(self, place: Sequence[float]) -> tuple[float, ...]:
-        """Rectify the numbers that place a probe: points (x, y) one after the other, then a length if it is odd."""
+    def place(self, place: Sequence[float], points: int) -> tuple[float, ...]:
+        """Rectify the numbers that place a probe: so many points (x, y) one after the other, then lengths."""
         if self.camera is None or self.units.mm_per_pixel is None:
-            return tuple(place)
-        points = np.array(place[: len(place) // 2 * 2], dtype=np.float64).reshape(-1, 2)
-        return (*(self.camera.to_mm(points) / self.units.mm_per_pixel).ravel().tolist(), *place[2 * len(points) :])
+            return tuple(map(float, place))
+        ends = np.array(place[: 2 * points], dtype=np.float64).reshape(-1, 2)
+        return (*(self.camera.to_mm(ends) / self.units.mm_per_pixel).ravel().tolist(), *place[2 * points :])
 
     def displacement(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray

@@ -1,4 +1,4 @@
-"""Probes: displacement at points and over areas, extensometers between two points, and virtual strain gauges.
+"""Probes: displacement at points and over areas, extensometers between two points, virtual strain gauges, cracks.
 
 A probe knows the nodes that it needs; it takes the displacements of these in some frames and returns named histories
 with their standard uncertainty, from the covariance between the nodes. All probes sit on the material: their places are
@@ -9,15 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
+from rgbmidic.fields.cracks import CrackTip, JumpAlong, Williams
 from rgbmidic.fields.history import History, Nodal, Probe
 from rgbmidic.fields.measures import MEASURES, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import StrainGauges
+from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = ["PROBES", "Gauge", "Mean", "StrainGauge", "make_probe"]
@@ -235,42 +239,65 @@ class StrainGauge:
 
 
 _Make = Callable[..., Probe]
-PROBES: dict[str, tuple[int, _Make]] = {
-    "point": (2, lambda c, name, *place: Mean.over(c, name, [place])),
-    "line": (4, lambda c, name, *place: Mean.over(c, name, _line(*place), _LEAST)),
-    "circle": (3, lambda c, name, *place: Mean.over(c, name, _circle(*place), _LEAST, inside=False)),
-    "region": (4, lambda c, name, *place: Mean.over(c, name, _rectangle(*place), _LEAST, inside=False)),
-    "gauge": (4, Gauge.between),
-    "straight_gauge": (4, lambda *a, **k: Gauge.between(*a, **k, moving=False)),
-    "strain_gauge": (3, StrainGauge.around),
+PROBES: dict[str, tuple[int, int, _Make]] = {
+    "point": (1, 0, lambda c, name, *place: Mean.over(c, name, [place])),
+    "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _LEAST)),
+    "circle": (1, 1, lambda c, name, *place: Mean.over(c, name, _circle(*place), _LEAST, inside=False)),
+    "region": (2, 0, lambda c, name, *place: Mean.over(c, name, _rectangle(*place), _LEAST, inside=False)),
+    "gauge": (2, 0, Gauge.between),
+    "straight_gauge": (2, 0, lambda *a, **k: Gauge.between(*a, **k, moving=False)),
+    "strain_gauge": (1, 1, StrainGauge.around),
+    "crack": (2, 0, JumpAlong.between),
+    "tip": (1, 2, CrackTip.at),
 }
-"""Every kind of probe with how many numbers (px) place it, and what makes it."""
+"""Every kind of probe with how many points and lengths (px) place it, and what makes it."""
 
 
-def make_probe(covariance: NodalCovariance, kind: str, number: int, place: Sequence[float], measure: str) -> Probe:
+def make_probe(
+    rectified: Rectification,
+    covariance: NodalCovariance,
+    kind: str,
+    number: int,
+    place: Sequence[float],
+    settings: ProbeSettings,
+) -> Probe:
     """Make a probe, named by its kind and number.
 
     Parameters
     ----------
+    rectified
+        Change from px of the image, and the scale.
     covariance
-        Of the mesh.
+        Of the mesh in rectified px.
     kind
         One of `PROBES`.
     number
         Counted from 1 within the kind.
     place
-        The numbers of `PROBES`, px.
-    measure
-        Strain measure of a strain gauge.
+        The numbers of `PROBES`, px of the image.
+    settings
+        Strain measure of a strain gauge; material and fit of a crack's tip.
 
     Raises
     ------
     InputError
         The place is outside the region, or no place for it.
     """
-    count, make = PROBES[kind]
+    points, lengths, make = PROBES[kind]
     name = f"{kind}_{number}"
-    if len(place) != count:
-        raise InputError(f"{name} is placed by {count} numbers, not by {list(place)}")
-    more = {"measure": measure} if kind == "strain_gauge" else {}
-    return make(covariance, name, *map(float, place), **more)
+    if len(place) != 2 * points + lengths:
+        raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(place)}")
+    more: dict[str, Any] = {"measure": settings.measure} if kind == "strain_gauge" else {}
+    if kind == "tip":
+        assert settings.youngs_modulus is not None  # as [probes] with tips checks
+        assert settings.poissons_ratio is not None
+        assert settings.plane is not None
+        more["williams"] = Williams(
+            youngs_modulus=settings.youngs_modulus,
+            poissons_ratio=settings.poissons_ratio,
+            plane=settings.plane,
+            units=rectified.units,
+            terms=settings.terms,
+            fit_tip=settings.fit_tip,
+        )
+    return make(covariance, name, *rectified.place(place, points), **more)

@@ -40,7 +40,21 @@ _MARKED, _MARKED_OF_PROBE = 40, 60
 """Points up to which each gets a marker, in a panel of half the width and of the whole width: more would touch."""
 _PANEL = 2.4
 """Height of a panel of `history_figure` in inches, its numbers included: four fill a page."""
-_KINDS = ("velocity", "acceleration", "strain_rate", "rate", "strain", "extension", "direction", "stress")
+_NAMED = 14
+"""Most quantities of a panel that its legend names: more lines of 7 pt are higher than it; a crack has one a node."""
+_KINDS = (
+    "velocity",
+    "acceleration",
+    "strain_rate",
+    "rate",
+    "strain",
+    "extension",
+    "opening",
+    "sliding",
+    "direction",
+    "stress",
+)
+_KIND_OF_UNIT = {"deg": "rotation", "": "strain", "MPa √m": "K", "MPa": "T-stress"}
 
 
 def field_history_figure(physical: Physical, history: TimeHistory) -> Figure:
@@ -124,10 +138,12 @@ def history_figure(histories: Histories) -> Figure:
 
     def draw(axes: list[Axes]) -> None:
         for axis, ((kind, unit), quantities) in zip(axes, panels.items(), strict=False):
-            for quantity in quantities:
+            step = -(-len(quantities) // _NAMED)
+            for number, quantity in enumerate(quantities):
                 known = np.isfinite(quantity.values).sum()
                 shown: dict[str, Any] = {"marker": "o" if known <= _MARKED_OF_PROBE else None, "markersize": 2.5}
-                (line,) = axis.plot(times, quantity.values, linewidth=1, label=literal(quantity.name), **shown)
+                shown["label"] = "_" if number % step else literal(quantity.name)
+                (line,) = axis.plot(times, quantity.values, linewidth=1, **shown)
                 if quantity.std is not None:
                     low, high = quantity.values - 2 * quantity.std, quantity.values + 2 * quantity.std
                     axis.fill_between(times, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
@@ -231,4 +247,4 @@ def _kind(quantity: HistoryColumn) -> str:
         return quantity.name
     name = quantity.name.removesuffix("_before").removesuffix("_after")
     kind = next((kind for kind in _KINDS if name.endswith(f"_{kind}") or name == kind), "")
-    return kind.replace("_", " ") or {"deg": "rotation", "": "strain"}.get(quantity.unit, "displacement")
+    return kind.replace("_", " ") or _KIND_OF_UNIT.get(quantity.unit, "displacement")

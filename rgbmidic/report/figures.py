@@ -278,7 +278,10 @@ class MapDrawer:
         x, y = (np.arange(start + step / 2, end, step) for start, end in zip(low, high, strict=True))
         self._places = np.meshgrid(x, y)
         self._extent = (low[0], low[0] + step * len(x), low[1] + step * len(y), low[1])
-        self._element: npt.NDArray[np.int32] = np.asarray(self._mesh.get_trifinder()(*self._places), dtype=np.int32)
+        # matplotlib finds elements on meshes without two nodes at one place: those of a crack's sides count as one
+        nodes, place = np.unique(result.nodes, axis=0, return_inverse=True)
+        closed = Triangulation(nodes[:, 0], nodes[:, 1], place.reshape(-1)[result.elements])
+        self._element: npt.NDArray[np.int32] = np.asarray(closed.get_trifinder()(*self._places), dtype=np.int32)
 
     def of_kind(self, frame: int, kind: str) -> Figure:
         """Draw one of `MAPS` of a frame, as `map_figure` does."""

@@ -188,7 +188,7 @@ def read_histories(
     made = []
     for kind, place in probes.places:
         counts[kind] = counts.get(kind, 0) + 1
-        made.append(make_probe(covariance, kind, counts[kind], rectified.place(place), probes.measure))
+        made.append(make_probe(rectified, covariance, kind, counts[kind], place, probes))
     clock = result.number[there].astype(np.float64) if times is None else times
     each = result.table.each(["u", "v", "u_std", "v_std"], there.tolist())
     nodal, rigid, speed = _read(each, rectified, covariance, made, probes.rigid_motion, clock)
@@ -216,7 +216,11 @@ def read_histories(
         quantities=(*quantities, *beside, *stress),
         stress_strain=(strain, stress[0].name) if stress and strain else None,
         units=units,
-        remarks=(*_remarks(rectified, speed, exposure(result), there, by_probe, beside), *clocks),
+        remarks=(
+            *_remarks(rectified, speed, exposure(result), there, by_probe, beside),
+            *_of_cracks(result, by_probe),
+            *clocks,
+        ),
     )
 
 
@@ -267,7 +271,9 @@ def _in_units(
         values, std = units.lengths(values, std) if length else (values, std)
         return HistoryColumn(name=name, unit=unit, values=values, std=std)
 
-    assert history.std is not None
+    if history.std is None:
+        yield history
+        return
     yield entry(history.name, unit, history.values, history.std)
     if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
@@ -317,6 +323,17 @@ def _beside(
     return beside, [stress], remarks
 
 
+def _of_cracks(result: Result, read: Mapping[str, list[History]]) -> Iterator[str]:
+    """Report what hurts the nodes at an open crack: the local mean reaches across it and takes the gap in."""
+    width = result.setting("illumination", "normalise", 0.0)
+    if width and (names := [name for name in read if name.startswith("crack_")]):
+        yield (
+            f"{', '.join(names)}: the images were divided by their local mean, which takes in the gap of a crack: "
+            "from half a px of opening on the jump is wrong by more than its uncertainty; measure with normalise = 0 "
+            f"in [illumination], not {width:g}"
+        )
+
+
 def _remarks(
     rectified: Rectification,
     speed: FloatArray,
@@ -341,6 +358,7 @@ def _remarks(
         )
     if any(history.name.endswith("_equivalent") for part in read.values() for history in part):
         yield f"equivalent: {EQUIVALENT}"
+    yield from dict.fromkeys(history.note for part in read.values() for history in part if history.note)
     for name, part in read.items():
         if missing := int(np.isnan(part[0].values).sum()):
             yield f"{name} is not measured in {missing} of {len(frames)} frames"

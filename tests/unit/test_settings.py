@@ -197,6 +197,13 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST.replace("10, 20, 110", "10, nan, 110"), r"region\.rectangle must be finite"),
         (LEAST + "[mesh]\nelement_size = 0", r"mesh\.element_size must be above 0, not 0"),
         (LEAST + "[mesh]\ncracks = [[[0, 5]]]", r"mesh\.cracks\[0\] needs at least two corners \[x, y\]"),
+        (LEAST + "[probes]\ntips = [[1, 2, 60, 30]]", r"probes\.tips .* radii 0 < r0 < r1 in px, not 60 and 30"),
+        (
+            LEAST + "[probes]\ntips = [[1, 2, 30, 60]]\nplane = 'stress'",
+            r"probes\.tips need probes\.youngs_modulus .* --plane; missing: youngs_modulus, poissons_ratio",
+        ),
+        (LEAST + "[probes]\nterms = 1", r"probes\.terms must be 0 .* or at least 2, not 1"),
+        (LEAST + "[probes]\npoissons_ratio = 0.6", r"probes\.poissons_ratio must be .* 0\.5, not 0\.6"),
         (LEAST + "[mesh]\ncracks = [[[0, 5], [nan, 5]]]", r"mesh\.cracks must be finite, not nan"),
         (LEAST + "[mesh]\nelement_size = true", r"mesh\.element_size must be a number, not True"),
         (LEAST + "[mesh]\nelement_size = '25'", r'mesh\.element_size must be a number, not "25"'),
@@ -309,6 +316,13 @@ BUILT: dict[str, Any] = {
         gauges=(PLACE, PLACE),
         straight_gauges=(PLACE,),
         strain_gauges=((1.0, 2.0, 30.0),),
+        cracks=(PLACE,),
+        tips=((1.0, 2.0, 30.0, 60.0),),
+        youngs_modulus=70_000,
+        poissons_ratio=0.3,
+        plane="strain",
+        terms=5,
+        fit_tip=True,
         measure="biot",
         window=7,
         rigid_motion="remove",
@@ -387,6 +401,7 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
     key = {"calibration_file": r"calibration\.file", "element_size": r"mesh\.element_size", "cracks": r"mesh\.cracks"}
     key |= {"accept": r"calibration\.accept"}
     key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part")}
+    key = key if isinstance(built, TestSettings) else {}
     for instead in wrong:
         with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:
             replace(built, **{name: instead})

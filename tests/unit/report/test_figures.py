@@ -58,6 +58,24 @@ def test_map_has_the_right_value_at_every_place(tmp_path: Path, reference: AnyAr
         assert "px" in axis.get_title()
 
 
+def test_a_map_of_a_mesh_with_a_crack_has_the_values_of_both_sides(tmp_path: Path) -> None:
+    mesh = Tri3Mesh.from_region(Region.from_rectangle((10, 5, 110, 75), (80, 120)), 20, [[(0, 40), (60, 40)]])
+    above = mesh.places[:, 1] < 40
+    left = mesh.nodes[:, 0] < 59
+    origin = Origin(nodes=mesh.nodes, elements=mesh.elements, names=["one"], lights=["one"])
+    with ResultStore.create(tmp_path / "out", origin) as store:
+        zero = np.zeros(len(mesh.nodes))
+        jump = np.where(left, np.where(above, -1.0, 1.0), 0.0)
+        store.write_frame(0, FrameRecord.of(nodes=len(mesh.nodes), lights=1, u=zero, v=jump, u_std=zero, v_std=zero))
+    picture = figures.map_figure(Result.open(tmp_path / "out"), 0, "displacement").axes[1].images[-1]
+    x, y = _places(picture)
+    shown = picture.get_array()
+    assert not np.ma.getmaskarray(np.ma.masked_invalid(shown)).any()
+    column = np.argmin(np.abs(x - 20))
+    assert shown[y < 40][:, column].max() == pytest.approx(-1)
+    assert shown[y > 40][:, column].min() == pytest.approx(1)
+
+
 def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_path: Path) -> None:
     x, y = np.meshgrid(np.arange(8, 120), np.arange(4, 80))
     cover = np.zeros((3, 38, 56))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,21 +16,24 @@ from results import MESH, NODES, make_origin
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import InputError
+from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import history_figure
 from rgbmidic.results import (
     UNKNOWN_TIME,
     Channels,
     FrameRecord,
     Histories,
+    Origin,
     Result,
     ResultStore,
     probes_of,
     write_histories,
 )
-from rgbmidic.results.histories import read_histories
+from rgbmidic.results.histories import history_csv, read_histories
 from rgbmidic.settings import (
     ChannelSettings,
     FrameSettings,
+    IlluminationSettings,
     ProbeSettings,
     RegionSettings,
     ScaleSettings,
@@ -367,3 +371,70 @@ def test_the_command_scale_gives_lines_for_the_settings(capsys: pytest.CaptureFi
     assert "two different points" in capsys.readouterr().err
     assert execute(cli.app, ["scale", "10,10:10,20", "--length", "0"]) == 2
     assert "must be above 0 mm, not 0" in capsys.readouterr().err
+
+
+CRACKED = Tri3Mesh.from_region(Region.from_rectangle((5, 5, 194, 194), (200, 200)), 10, [[(0, 100), (100, 100)]])
+MATERIAL = {"youngs_modulus": 70_000, "poissons_ratio": 0.3, "plane": "stress"}
+
+
+def cracked(path: Path, scale: ScaleSettings | None = SCALE, normalise: float = 0.0) -> Result:
+    """Frames 0 to 4 px of opening, of a crack whose sides move apart as they are."""
+    settings = TestSettings(
+        frames=FrameSettings(path=("f*.tif",), kind="monochrome"),
+        region=RegionSettings(rectangle=(5, 5, 194, 194)),
+        scale=scale or ScaleSettings(),
+        illumination=IlluminationSettings(normalise=normalise),
+    )
+    names = [f"frame {index}" for index in range(5)]
+    origin = Origin(nodes=CRACKED.nodes, elements=CRACKED.elements, names=names, lights=("light",), settings=settings)
+    above, behind = CRACKED.places[:, 1] < 100, CRACKED.nodes[:, 0] < 99
+    count = len(CRACKED.nodes)
+    with ResultStore.create(path, origin) as store:
+        for index in range(5):
+            v = np.where(behind, np.where(above, -0.5, 0.5) * index, 0.0)
+            std = np.full(count, 0.01 if index else 0.0)
+            record = {"u": np.zeros(count), "v": v, "u_std": std, "v_std": std}
+            store.write_frame(index, FrameRecord.of(nodes=count, lights=1, status=0, number=index, **record))
+        store.finish()
+    return Result.open(path)
+
+
+def test_cracks_are_read_as_histories_in_mm_with_their_notes(tmp_path: Path) -> None:
+    probes = ProbeSettings(cracks=((10, 100, 95, 101),), tips=((100, 100, 30, 90),), terms=3, window=4, **MATERIAL)
+    found = read_histories(cracked(tmp_path / "a"), probes)
+    opening = found["crack_1_2_opening_mm"]
+    np.testing.assert_allclose(opening.values, 0.05 * np.arange(5), atol=1e-9)
+    assert opening.std is not None
+    np.testing.assert_allclose(opening.std[4], np.hypot(0.05 * 0.01 * np.sqrt(2), 1e-4 * 4), rtol=0.02)
+    np.testing.assert_allclose(found["crack_1_2_opening_velocity_mm_per_frame"].values, 0.05, rtol=1e-3)
+    assert found["crack_1_2_sliding_mm"].values == pytest.approx(0, abs=1e-9)
+    factor = found["tip_1_K1_MPa_sqrt_m"]
+    assert factor.values[4] > 1
+    assert factor.std is not None
+    twice = read_histories(cracked(tmp_path / "b", replace(SCALE, mm_per_pixel_std=0.01)), replace(probes, window=0))[
+        "tip_1_K1"
+    ]
+    assert twice.std is not None
+    np.testing.assert_allclose(twice.std[4], np.hypot(factor.std[4], 0.1 * factor.values[4]), rtol=1e-3)
+    assert found["tip_1_chi_square"].std is None
+    assert "tip_1_chi_square" in history_csv_text(found)
+    remarks = "\n".join(found.remarks)
+    assert "crack_1: jump of the left side" in remarks
+    assert "Williams' series up to n = 3 (stated)" in remarks
+    assert "its chi-square over the degrees of freedom is up to" in remarks
+    assert "K (MPa √m)" in [axis.get_ylabel() for axis in history_figure(found).axes]
+    normalised = cracked(tmp_path / "c", normalise=10.0)
+    said = "crack_1: the images were divided by their local mean"
+    assert said not in remarks
+    assert said in "\n".join(read_histories(normalised, ProbeSettings(cracks=probes.cracks)).remarks)
+
+
+def history_csv_text(histories: Histories) -> str:
+    file = io.BytesIO()
+    history_csv(histories, file)
+    return file.getvalue().decode()
+
+
+def test_factors_without_millimetres_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"need the scale of the image: state mm_per_pixel or camera in \[scale\]"):
+        read_histories(cracked(tmp_path / "a", None), ProbeSettings(tips=((100, 100, 30, 90),), **MATERIAL))
