@@ -20,6 +20,7 @@ from rgbmidic._kernels.correlation import (
 )
 from rgbmidic._kernels.interpolation import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.lights import gradient_of_others
+from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
 from rgbmidic.correlation.images import (
     spline_coefficients,
@@ -155,13 +156,14 @@ class ReferenceGeometry:
         cls, mesh: Tri3Mesh, region: Region, origin: tuple[int, int], first: ReferenceGeometry | None
     ) -> ReferenceGeometry:
         """Prepare the geometry of a mesh and its region; `first` is that of the first frame, None for itself."""
+        pixels = aside(PixelMap.from_mesh, mesh, region)
         return cls(
             mesh=mesh,
-            pixels=PixelMap.from_mesh(mesh, region),
             assembly=Assembly.from_mesh(mesh),
             material=mesh if first is None else first.material,
             colouring=NodeColouring.from_mesh(mesh) if first is None else first.colouring,
             linear_offset=linear_fit_offset(mesh) if first is None else first.linear_offset,
+            pixels=pixels.result(),
             origin=origin,
         )
 

@@ -98,6 +98,8 @@ def _best_fractions(covariance: FloatImage, least: np.float32) -> FloatImage:
     C is the residuals' `covariance` (k, k, h, w), with variances of `least` or more.
     """
     lights = range(len(covariance))
+    if len(covariance) == 1:
+        return np.ones_like(covariance[0])
     matrices = covariance.astype(np.float64)
     matrices[lights, lights] = np.maximum(matrices[lights, lights], least)
     for a, b in combinations(lights, 2):
