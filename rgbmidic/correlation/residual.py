@@ -351,16 +351,15 @@ def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: floa
 
     The first function of the basis is 1; `ridge` holds the slopes back where the points do not determine them.
     """
-    weight = np.ones(basis.shape[:2])
-    held = np.diag([1e-6, ridge, ridge])
+    basis, motion = (np.ascontiguousarray(part.T) for part in (basis, motion))  # one fit beside the other in memory
+    weight, held = np.ones(basis.shape[1:]), np.diag([1e-6, ridge, ridge])
     for _ in range(_TURNS):
         # no BLAS, whose sums may depend on the number of threads
-        weighted = (basis * weight[..., None])[..., None]
-        normal, right = ((weighted * side[:, :, None]).sum(axis=1) for side in (basis, motion))
-        found = np.linalg.solve(normal + held, right)
-        off = np.linalg.norm(motion - np.einsum("tka,tab->tkb", basis, found), axis=2)
-        weight = 1 / (1 + (off / scale) ** 2)
-    return np.asarray(found)
+        sums = np.array([[(part * side).sum(axis=0) for side in (*basis, *motion)] for part in basis * weight])
+        found = np.linalg.solve(sums[:, :3].T + held, sums[:, 3:].transpose(2, 0, 1))
+        fitted = sum(part * slope[:, None] for part, slope in zip(basis, found.transpose(1, 2, 0), strict=True))
+        weight = 1 / (1 + ((motion - fitted) ** 2).sum(axis=0) / scale**2)
+    return found
 
 
 _REDUCTION = 2
