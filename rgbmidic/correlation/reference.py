@@ -320,7 +320,7 @@ class Reference:
         motion = displacement - self.offset(deformed)
         if self.registration is None:
             return motion
-        return np.asarray(motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin)[light])
+        return np.asarray(motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin, light))
 
     def blocks(self, weight: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,)."""
@@ -390,7 +390,7 @@ def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: s
     given = np.ones_like(images) if weights is None else weights
     usable, reach = np.zeros_like(images), usable_reach(prefilter)
     for image, weight, out in zip(images, given, usable, strict=True):
-        if weight.min() > 0 and np.isfinite([image.min(), image.max()]).all():  # NaN spreads to both
+        if weight.min() > 0 and np.isfinite(image.sum()):  # NaN and infinity spread to it
             out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
         else:
             known = np.isfinite(image)
