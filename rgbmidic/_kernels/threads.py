@@ -144,6 +144,8 @@ def aside(function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Fu
     The thread is none of those that share a kernel, which the function may call.
     """
     if threads() > 1:
+        import numba  # noqa: F401  of two threads that import it at once, one may find half of it
+
         return _pool(os.getpid(), 1, "aside").submit(function, *arguments, **named)
     done: Future[T] = Future()
     done.set_result(function(*arguments, **named))
