@@ -121,8 +121,8 @@ def interpolate_at_points(start, stop, out, x, y, nodes, elements, values, box, 
 
 TILE = 16
 """Side in px of the squares within which the filters are the same."""
-_SIZE = 5
-"""Usual side of the square of samples, whose taps are added in one go."""
+_SIZE, _WIDE = 5, 7
+"""Sides of the square of samples: the usual one, whose taps are added in one go, and the wide one."""
 _STRIP = 256
 """Columns at a time: what a core's caches hold of their filters."""
 
@@ -179,15 +179,19 @@ def _filtered(r0, r1, r2, r3, r4, lines, out):
 
 
 @helper(fastmath={"contract"}, forceinline=True)
-def _add_tap(row, line, out):
+def _add_row(row, lines, out):
+    """Add the products of a row of samples with a row of the taps of the wide square, (7, _STRIP)."""
     for j in range(out.size):
-        out[j] += line[j] * row[j]
+        total = out[j]
+        for b in range(_WIDE):
+            total += lines[b, j] * row[j + b]
+        out[j] = total
 
 
 @helper()
 def _spread(taps, parity, channel, index, first, lines):
     """Write the filters of tiles, tap by tap, along the pixels from the tile `first` on."""
-    for tile in range(first, min(first + _STRIP // TILE, index.size)):
+    for tile in range(first, min(first + lines.shape[1] // TILE, index.size)):
         chosen = taps[index[tile], parity, channel]
         for k in range(lines.shape[0]):
             source, line = chosen[k], lines[k, (tile - first) * TILE :]
@@ -205,7 +209,7 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
     start, stop
         Range of rows of tiles that this call does.
     size
-        Side of the square of samples, px.
+        Side of the square of samples, px: 5 or 7.
     padded : (H + 2 pad, 16 w + 2 pad) float32
         Scaled contrast, finite, with pad = size // 2.
     index : (h, w) int32
@@ -223,11 +227,12 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
         Written: the mixtures.
     """
     rows, columns = out.shape[1:]
-    lines, channels = np.empty((size * size, _STRIP), np.float32), np.empty((3, TILE, _STRIP), np.float32)
+    strip = _STRIP if size == _SIZE else _STRIP // 2
+    lines, channels = np.empty((size * size, strip), np.float32), np.empty((3, TILE, strip), np.float32)
     for ti in range(start, stop):
         top, bottom = ti * TILE, min((ti + 1) * TILE, rows)
-        for left in range(0, columns, _STRIP):
-            number = min(_STRIP, columns - left)
+        for left in range(0, columns, strip):
+            number = min(strip, columns - left)
             for c in range(3):
                 for parity in range(2):
                     _spread(taps, parity, c, index[ti], left // TILE, lines)
@@ -246,8 +251,8 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
                         else:
                             for j in range(number):
                                 made[j] = 0
-                            for k in range(size * size):
-                                _add_tap(padded[i + k // size, left + k % size :], lines[k], made)
+                            for k in range(_WIDE):
+                                _add_row(padded[i + k, left:], lines[k * _WIDE : (k + 1) * _WIDE], made)
                         low, high, part = between(i, mean_block, mean.shape[1])
                         above, below = mean[c, low, left:], mean[c, high, left:]
                         low, high, ahead = between(i, scale_block, scale.shape[1])

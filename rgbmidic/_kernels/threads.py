@@ -10,18 +10,31 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, cached_property, partial, update_wrapper, wraps
 from itertools import pairwise
 from threading import Barrier
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
 from rgbmidic.errors import InputError
 
-__all__ = ["Kernel", "compiled", "helper", "one_blas_thread", "over_ranges", "set_threads", "start_threads", "threads"]
+__all__ = [
+    "Kernel",
+    "aside",
+    "compiled",
+    "helper",
+    "one_blas_thread",
+    "over_ranges",
+    "set_threads",
+    "start_threads",
+    "threads",
+]
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _VARIABLE = "RGBMIDIC_THREADS"
 _chosen: list[int] = []
@@ -125,10 +138,24 @@ def _share(kernel: Callable[..., None], arguments: tuple[Any, ...], items: int, 
         other.result()
 
 
+def aside(function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Future[T]:
+    """Call a function in a thread of its own where there are several, at once where there is but one.
+
+    The thread is none of those that share a kernel, which the function may call.
+    """
+    if threads() > 1:
+        import numba  # noqa: F401  of two threads that import it at once, one may find half of it
+
+        return _pool(os.getpid(), 1, "aside").submit(function, *arguments, **named)
+    done: Future[T] = Future()
+    done.set_result(function(*arguments, **named))
+    return done
+
+
 @cache
-def _pool(process: int, workers: int) -> ThreadPoolExecutor:
+def _pool(process: int, workers: int, name: str = "kernels") -> ThreadPoolExecutor:
     """Return the pool of a process: a forked one inherits no threads and makes its own."""
-    return ThreadPoolExecutor(workers, thread_name_prefix="rgbmidic")
+    return ThreadPoolExecutor(workers, thread_name_prefix=f"rgbmidic-{name}")
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from rgbmidic._kernels.correlation import (
 )
 from rgbmidic._kernels.interpolation import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.lights import gradient_of_others
+from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
 from rgbmidic.correlation.images import (
     spline_coefficients,
@@ -155,13 +156,14 @@ class ReferenceGeometry:
         cls, mesh: Tri3Mesh, region: Region, origin: tuple[int, int], first: ReferenceGeometry | None
     ) -> ReferenceGeometry:
         """Prepare the geometry of a mesh and its region; `first` is that of the first frame, None for itself."""
+        pixels = aside(PixelMap.from_mesh, mesh, region)
         return cls(
             mesh=mesh,
-            pixels=PixelMap.from_mesh(mesh, region),
             assembly=Assembly.from_mesh(mesh),
             material=mesh if first is None else first.material,
             colouring=NodeColouring.from_mesh(mesh) if first is None else first.colouring,
             linear_offset=linear_fit_offset(mesh) if first is None else first.linear_offset,
+            pixels=pixels.result(),
             origin=origin,
         )
 
@@ -320,7 +322,7 @@ class Reference:
         motion = displacement - self.offset(deformed)
         if self.registration is None:
             return motion
-        return np.asarray(motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin)[light])
+        return np.asarray(motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin, light))
 
     def blocks(self, weight: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,)."""
@@ -390,7 +392,7 @@ def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: s
     given = np.ones_like(images) if weights is None else weights
     usable, reach = np.zeros_like(images), usable_reach(prefilter)
     for image, weight, out in zip(images, given, usable, strict=True):
-        if weight.min() > 0 and np.isfinite([image.min(), image.max()]).all():  # NaN spreads to both
+        if weight.min() > 0 and np.isfinite(image.sum()):  # NaN and infinity spread to it
             out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
         else:
             known = np.isfinite(image)

@@ -11,11 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic._kernels.correlation import element_squares, interpolate_nodal, subtract_quadratic
+from rgbmidic._kernels.correlation import (
+    element_squares,
+    interpolate_nodal,
+    patch_correlations,
+    subtract_quadratic,
+)
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
@@ -351,16 +355,15 @@ def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: floa
 
     The first function of the basis is 1; `ridge` holds the slopes back where the points do not determine them.
     """
-    weight = np.ones(basis.shape[:2])
-    held = np.diag([1e-6, ridge, ridge])
+    basis, motion = (np.ascontiguousarray(part.T) for part in (basis, motion))  # one fit beside the other in memory
+    weight, held = np.ones(basis.shape[1:]), np.diag([1e-6, ridge, ridge])
     for _ in range(_TURNS):
         # no BLAS, whose sums may depend on the number of threads
-        weighted = (basis * weight[..., None])[..., None]
-        normal, right = ((weighted * side[:, :, None]).sum(axis=1) for side in (basis, motion))
-        found = np.linalg.solve(normal + held, right)
-        off = np.linalg.norm(motion - np.einsum("tka,tab->tkb", basis, found), axis=2)
-        weight = 1 / (1 + (off / scale) ** 2)
-    return np.asarray(found)
+        sums = np.array([[(part * side).sum(axis=0) for side in (*basis, *motion)] for part in basis * weight])
+        found = np.linalg.solve(sums[:, :3].T + held, sums[:, 3:].transpose(2, 0, 1))
+        fitted = sum(part * slope[:, None] for part, slope in zip(basis, found.transpose(1, 2, 0), strict=True))
+        weight = 1 / (1 + ((motion - fitted) ** 2).sum(axis=0) / scale**2)
+    return found
 
 
 _REDUCTION = 2
@@ -398,27 +401,24 @@ def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
     top, left = pixels.bounds[:2]
     at = np.round((mesh.nodes - (left, top) - (_REDUCTION - 1) / 2) / _REDUCTION).astype(int) + reach
     at = np.clip(at, reach, np.array(f.shape)[::-1] - reach - 1)
-    shift, score = np.zeros((len(at), 2)), np.zeros(len(at))
-    for node, (column, row) in enumerate(at):
-        patch = f[row - _PATCH : row + _PATCH + 1, column - _PATCH : column + _PATCH + 1]
-        around = g[row - reach : row + reach + 1, column - reach : column + reach + 1]
-        found = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
-        i, j = divmod(int(found.argmax()), 2 * _SHIFT + 1)
-        if 0 < i < 2 * _SHIFT and 0 < j < 2 * _SHIFT:
-            score[node] = found[i, j]
-            shift[node] = j - _SHIFT + _crest(*found[i, j - 1 : j + 2]), i - _SHIFT + _crest(*found[i - 1 : i + 2, j])
+    found = np.empty((len(at), 2 * _SHIFT + 1, 2 * _SHIFT + 1), dtype=np.float32)
+    patch_correlations(f, g, at[:, ::-1], _PATCH, found)
+    i, j = np.divmod(found.reshape(len(at), -1).argmax(axis=1), 2 * _SHIFT + 1)
+    node = np.flatnonzero((i > 0) & (i < 2 * _SHIFT) & (j > 0) & (j < 2 * _SHIFT))
+    i, j, (shift, score) = i[node], j[node], (np.zeros((len(at), 2)), np.zeros(len(at)))
+    score[node] = here = found[node, i, j]
+    for axis, (di, dj) in enumerate(((0, 1), (1, 0))):
+        before, after = found[node, i - di, j - dj], found[node, i + di, j + dj]
+        bend = before - 2 * here + after
+        # the crest of the parabola through three values, of which the middle one is the largest
+        shift[node, axis] = np.divide((before - after) / 2, bend, out=np.zeros_like(bend), where=bend < 0)
+    shift[node] += np.stack([j, i], axis=1) - _SHIFT
     agrees = score >= _AGREES
     if agrees.sum() < _FITTED:
         return displacement
     shift *= _REDUCTION
     beyond = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement), shift)
     return displacement + follow(mesh.nodes[agrees], beyond[agrees], mesh, 1.0)
-
-
-def _crest(before: float, here: float, after: float) -> float:
-    """Return the place of the crest of the parabola through three values, counted from the middle one, the largest."""
-    bend = before - 2 * here + after
-    return 0.5 * (before - after) / bend if bend < 0 else 0.0
 
 
 def _reduced(residual: Residual) -> FloatImage:

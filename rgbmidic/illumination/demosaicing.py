@@ -183,7 +183,7 @@ def prediction_filters(
     cfa
         Bayer pattern.
     size
-        Side of the square of samples, odd.
+        Side of the square of samples, `SIZE` or `WIDE`.
 
     Returns
     -------

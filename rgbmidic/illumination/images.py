@@ -65,7 +65,9 @@ class IlluminationImages:
         values = np.ascontiguousarray(self.values, dtype=np.float32)
         if values.ndim != 3:
             raise InputError(f"illumination images have shape (k, H, W), not {values.shape}")
-        valid = np.asarray(self.valid, dtype=bool) & np.isfinite(values)
+        valid = np.asarray(self.valid, dtype=bool)
+        if not np.isfinite(values.sum()):  # NaN and infinity spread to it
+            valid = valid & np.isfinite(values)
         if len(self.names) != len(values):
             raise InputError(f"{len(values)} illumination images cannot carry the {len(self.names)} names {self.names}")
         if self.registration is not None and self.registration.lights != self.names:

@@ -94,21 +94,23 @@ class Registration:
         """Return the registration on frames that begin at the pixel `origin` (column, row) of the calibrated ones."""
         return replace(self, centre=(self.centre[0] - origin[0], self.centre[1] - origin[1]))
 
-    def displacement(self, points: npt.ArrayLike) -> FloatArray:
+    def displacement(self, points: npt.ArrayLike, light: int | None = None) -> FloatArray:
         """rho_j: what light 1 sees at point x is seen by light j at x + rho_j(x).
 
         Parameters
         ----------
         points : array_like, shape (M, 2)
             Points (x, y) in px of the first light's image.
+        light
+            Number of the light; None: all.
 
         Returns
         -------
-        ndarray, shape (k, M, 2)
+        ndarray, shape (k, M, 2) or (M, 2)
             In px; zero for the first light.
         """
         x, y = (_checked(points) - self.centre).T
-        along, down, turn, scale, radial = self.parameters.T[..., None]
+        along, down, turn, scale, radial = self.parameters[slice(None) if light is None else light].T[..., None]
         growth = scale + radial * ((x * x + y * y) / self.radius**2)
         return np.stack([along - turn * y + growth * x, down + turn * x + growth * y], axis=-1)
 

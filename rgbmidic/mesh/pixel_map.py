@@ -80,7 +80,7 @@ class PixelMap:
         RegionError
             No pixel of the region lies in the mesh.
         """
-        owner = np.where(region.mask, np.int32(-1), np.int32(-2))
+        owner = np.subtract(region.mask, np.int32(2), dtype=np.int32)
         claim_pixels(mesh.nodes, mesh.elements, owner)
         if (owner == -1).any():
             _claim_rim(owner)
@@ -98,17 +98,16 @@ class PixelMap:
         from_origin = column - origin[element, 0], row - origin[element, 1]
         runs = np.take(np.stack([first, length, *from_origin], axis=1).astype(np.int32), order, axis=0)
         run_offsets = np.searchsorted(element[order], np.arange(len(origin) + 1))
-        # the position along x of every pixel: that of its run's first, and one more from pixel to pixel
-        steps = np.ones(length.sum(), dtype=np.float32)
-        steps[runs[:, 0]] = np.diff(runs[:, 2], prepend=0) - np.concatenate([[0], runs[:-1, 1] - 1])
-        local_x = np.cumsum(steps, out=steps)
+        # the position along x of every pixel: its slot less that of the run's first, and that one's position
+        local_x = np.arange(length.sum(), dtype=np.int32)
+        local_x -= np.repeat(runs[:, 0] - runs[:, 2], runs[:, 1])
         # the linear shape functions of the triangles: 1 at their own corner, 0 at the others
         (x1, y1), (x2, y2) = (np.moveaxis(np.roll(corners - origin[:, None], turn, axis=1), 2, 0) for turn in (-1, 1))
         twice_areas = np.stack([x1 * y2 - x2 * y1, y1 - y2, x2 - x1], axis=2)
         return cls(
-            offsets=np.append(runs[:, 0], length.sum())[run_offsets],
+            offsets=np.append(runs[:, 0], local_x.size)[run_offsets],
             origin=origin,
-            local_x=local_x,
+            local_x=local_x.astype(np.float32),
             local_y=np.repeat(runs[:, 3].astype(np.float32), runs[:, 1]),
             barycentric=twice_areas / twice_areas[..., 0].sum(axis=1)[:, None, None],
             shape=region.mask.shape,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation import Deformed, PrecisionMethod, Reference, Solution, Start, fill, solve, track
 from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.errors import ConfigurationError, InputError
@@ -85,14 +86,15 @@ def correlate(
     solver = solver_settings(options)
     if normalise is not None:
         f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
-    first = Reference.prepare(f, region, as_weights(weights, f.shape, "weights"), mesh=mesh, prefilter=solver.prefilter)
-    second = Deformed.prepare(g, as_weights(deformed_weights, f.shape, "deformed_weights"), prefilter=solver.prefilter)
+    given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
+    second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
+    first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)
     method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
     start = initial_displacement(initial, len(mesh.nodes))
     if start is None:
-        solution = track(first, second, Start(displacement=None), solver, method)
+        solution = track(first, second.result(), Start(displacement=None), solver, method)
     else:
-        solution = solve(first, second, start, solver, method)
+        solution = solve(first, second.result(), start, solver, method)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 

@@ -98,12 +98,14 @@ def _best_fractions(covariance: FloatImage, least: np.float32) -> FloatImage:
     C is the residuals' `covariance` (k, k, h, w), with variances of `least` or more.
     """
     lights = range(len(covariance))
-    matrices = covariance.astype(np.float64)
+    if len(covariance) == 1:
+        return np.ones_like(covariance[0])
+    matrices = covariance.copy()
     matrices[lights, lights] = np.maximum(matrices[lights, lights], least)
     for a, b in combinations(lights, 2):
         most = (1 - _OWN) * np.sqrt(matrices[a, a] * matrices[b, b])
         matrices[a, b] = matrices[b, a] = np.clip((1 - _OWN) * matrices[a, b], -most, most)
-    fractions = np.ones(matrices.shape[1:])
+    fractions = np.ones_like(matrices[0])
     # elimination on whole grids: ten times as fast as a LAPACK call for each block
     for a, b in combinations(lights, 2):
         ratio = matrices[b, a] / matrices[a, a]
@@ -111,4 +113,4 @@ def _best_fractions(covariance: FloatImage, least: np.float32) -> FloatImage:
         fractions[b] -= ratio * fractions[a]
     for a in reversed(lights):
         fractions[a] = (fractions[a] - (matrices[a, a + 1 :] * fractions[a + 1 :]).sum(axis=0)) / matrices[a, a]
-    return fractions.astype(np.float32)
+    return fractions

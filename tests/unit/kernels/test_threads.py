@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
 
@@ -16,7 +17,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from rgbmidic import correlate
 from rgbmidic._kernels.interpolation import block_sums
-from rgbmidic._kernels.threads import one_blas_thread, over_ranges, set_threads, threads
+from rgbmidic._kernels.threads import aside, one_blas_thread, over_ranges, set_threads, threads
 from rgbmidic.errors import InputError
 
 
@@ -83,6 +84,16 @@ def test_a_failure_in_any_thread_is_told():
 def test_many_threads_may_call_at_once():
     with ThreadPoolExecutor(8) as callers:
         assert all(callers.map(summed, range(40)))
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_work_done_aside_may_share_kernels_and_fail(number):
+    set_threads(number)
+    assert (aside(threading.get_ident).result() == threading.get_ident()) == (number == 1)
+    assert all(one.result() for one in [aside(summed, seed) for seed in range(4)])
+    set_threads(2)
+    with pytest.raises(ZeroDivisionError):
+        aside(divmod, 1, 0).result()
 
 
 def blas_threads():
