@@ -37,8 +37,8 @@ chance, which left a strain of 6e-4 in a corner that no view reached; at .001 no
 _RIM = 32
 """Corners of the polygon that stands for a circle: its area is 0.6 % too small, and so is the offset (derived)."""
 _OUTLYING = 3.0
-"""Residual of a view, over the median, that gives a warning: in OpenCV's pictures the largest is 1.3 by `find_view`, and
-6 by the corners of OpenCV's own sample, some of which are wrong (benchmarks/camera.py)."""
+"""Residual of a view, over the median, that gives a warning: in OpenCV's pictures the largest is 1.3 by `find_view`,
+and 6 by the corners of OpenCV's own sample, some of which are wrong (benchmarks/camera.py)."""
 COVERED = 0.5
 """Fraction of the frame that the views' points must cover, or a warning says that the lens is extrapolated (chosen)."""
 
