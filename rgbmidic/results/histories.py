@@ -493,7 +493,7 @@ def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequenc
     chosen = np.flatnonzero(result.finished) if frames is None else np.asarray(frames, dtype=np.int64)
     if not len(chosen):
         raise InputError(f"no frame of {result.path} is measured yet")
-    line = ProfileLine.between(physical.covariance, physical.gauges, *physical.rectified.place(place))
+    line = ProfileLine.between(physical.covariance, physical.gauges, *physical.rectified.place(place, 2))
     times = frame_times(result, physical.scale)
     values, std = np.full((2, len(chosen), len(line.points)), np.nan)
     profile = Profile(

@@ -105,7 +105,7 @@ def _best_fractions(covariance: FloatImage, least: np.float32) -> FloatImage:
     for a, b in combinations(lights, 2):
         most = (1 - _OWN) * np.sqrt(matrices[a, a] * matrices[b, b])
         matrices[a, b] = matrices[b, a] = np.clip((1 - _OWN) * matrices[a, b], -most, most)
-    fractions = np.ones_like(matrices[0])
+    fractions: FloatImage = np.ones_like(matrices[0])
     # elimination on whole grids: ten times as fast as a LAPACK call for each block
     for a, b in combinations(lights, 2):
         ratio = matrices[b, a] / matrices[a, a]
