@@ -382,7 +382,7 @@ def compare(
         numbers = (made.fit.scale, made.fit.scale_std, *squares, made.fit.chi_square)
         rows.append([f"{made.frame}", *(f"{number:.4g}" for number in numbers)])
     _print_table(f"{len(done)} frames against {fe}", headings, rows)
-    print(scale_text(*comparison.best_scale([made.fit for made in done])))
+    print(scale_text(comparison, done))
     print(f"page: {out / PAGE}")
 
 

@@ -18,6 +18,7 @@ from rgbmidic.command import execute
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
+from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
 from rgbmidic.results.comparison import Comparison, Levelling, Simulation, measured_mesh, place
 
@@ -157,6 +158,13 @@ def test_a_rigid_motion_is_stated_and_taken_off(tmp_path):
     assert kept[0].agreement["nodes", "displacement"].chi_square > 100
     squares = [made.agreement["levelled", "displacement"].chi_square for made in taken]
     assert np.mean(squares) == pytest.approx(1, abs=0.025)
+
+
+def test_a_simulation_of_another_shape_has_no_scale_without_a_word(tmp_path):
+    result = measured(tmp_path / "r", stretch()[None] + noise(1))
+    right, wrong = (compared(result, 0.9 * stretch(bend=bend)) for bend in (0.05, 0.5))
+    assert "the shape differs" not in scale_text(right, [right.frame(0)])
+    assert "; the shape differs (chi-square of what is left: " in scale_text(wrong, [wrong.frame(0)])
 
 
 def test_nodes_without_data_are_left_out_and_so_is_their_strain(tmp_path):
