@@ -23,7 +23,10 @@ from rgbmidic.view.canvas import Canvas, columns
 
 __all__ = ["HOLES", "OUTLINES", "Draft", "RegionDrawing", "arranged", "marks_of", "region_of", "rings"]
 
-_FILES = ("frames.path", "calibration.file", "region.mask", "weights.geometry", "weights.height_map", "weights.images")
+_FILES = (
+    *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera"),
+    *("weights.geometry", "weights.height_map", "weights.images"),
+)
 """Keys that name files."""
 
 
