@@ -371,7 +371,6 @@ def compare(
     simulation = Simulation.read(fe, mesh=numbered, unit=unit, field=field, interval=interval, offset=offset)
     comparison = Comparison(result, simulation, placement, scale=scale, frames=chosen, remove_rigid=rigid == "remove")
     check_folder(out, comparison_files(comparison), overwrite=overwrite)
-    out.mkdir(parents=True, exist_ok=True)
     with _progress("comparing") as progress:
         done = write_comparison(comparison, out, progress)
     _note(f"placed: {placement.summary()}")

@@ -17,7 +17,7 @@ from rgbmidic.report import style
 from rgbmidic.report.document import Page
 from rgbmidic.report.figures import spread
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Agreement, Comparison, FrameComparison
-from rgbmidic.results.files import write_complete
+from rgbmidic.results.files import write_complete, writing
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def write_comparison(
     comparison
         Of a result and a simulation.
     out
-        Existing folder; files of these names are replaced.
+        Folder, made where it does not exist; files of these names are replaced.
     progress
         Called with the number of frames done, that of all, and a text.
 
@@ -87,6 +87,8 @@ def write_comparison(
     shown = spread(comparison.frames, _SHOWN)
     done: list[FrameComparison] = []
     optional("meshio", "fe")
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
 
     def pass_over(file: BinaryIO) -> None:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
