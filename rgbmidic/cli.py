@@ -604,7 +604,6 @@ def compare(
     simulation = Simulation.read(fe, mesh=numbered, unit=unit, field=field, interval=interval, offset=offset)
     comparison = Comparison(result, simulation, placement, scale=scale, frames=chosen, remove_rigid=rigid == "remove")
     check_folder(out, comparison_files(comparison), overwrite=overwrite)
-    out.mkdir(parents=True, exist_ok=True)
     with _progress("comparing") as progress:
         done = write_comparison(comparison, out, progress)
     _note(f"placed: {placement.summary()}")
@@ -615,7 +614,7 @@ def compare(
         numbers = (made.fit.scale, made.fit.scale_std, *squares, made.fit.chi_square)
         rows.append([f"{made.frame}", *(f"{number:.4g}" for number in numbers)])
     _print_table(f"{len(done)} frames against {fe}", headings, rows)
-    print(scale_text(*comparison.best_scale([made.fit for made in done])))
+    print(scale_text(comparison, done))
     print(f"page: {out / PAGE}")
 
 
