@@ -209,7 +209,7 @@ class MarkLayer:
         self.colours: dict[str, str] = {}
         self._canvas, self._elements, self._shown = canvas, elements, dict[Mark, Mark]()
         self._drawn: object = None
-        self._joined = bk.ColumnDataSource(columns(_PROBE))
+        self._joined = bk.ColumnDataSource(columns(_PROBE), name="probes")
         canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
         canvas.plot.text("x", "y", "text", source=self._joined, text_color="colour", **LETTERS)
 

@@ -97,6 +97,60 @@ def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
         assert fields.read(name, 3).values.shape == (NODES,)
 
 
+def test_a_contour_lies_where_the_field_has_its_level_and_nowhere_beside_nodes_without_data():
+    nodes, elements = MESH.nodes, MESH.elements
+    values = nodes[:, 0] + 2 * nodes[:, 1]
+    values[7] = np.nan
+    lines = contour_lines(nodes, elements, values, [100.0, 130.0])
+    ends = lines.reshape(-1, 2)
+    np.testing.assert_allclose(np.unique(np.round(ends @ [1, 2], 9)), [100, 130])
+    beside = elements[(elements == 7).any(axis=1)].ravel()
+    low, high = nodes[beside].min(axis=0), nodes[beside].max(axis=0)
+    assert not ((ends > low + 1) & (ends < high - 1)).all(axis=1).any()
+    assert not len(contour_lines(nodes, elements, values, []))
+
+
+def test_arrows_point_along_the_displacement_and_the_longest_reaches_to_the_next():
+    window = Window(left=0, top=0, right=240, bottom=120, width=800, height=400)
+    moved = np.tile([0.3, -0.4], (NODES, 1))
+    lines, longer = arrow_lines(window, MESH.nodes, moved, 0.0)
+    shaft = (lines[:, 2:] - lines[:, :2])[: len(lines) // 3]
+    np.testing.assert_allclose(shaft, np.tile([0.6, -0.8], (len(shaft), 1)) * 0.9 * 10)
+    assert longer == pytest.approx(18)
+    assert arrow_lines(window, MESH.nodes, moved, 5.0)[1] == 5
+    point = lines[len(lines) // 3 :]
+    assert (np.einsum("md,d->m", point[:, 2:] - point[:, :2], [0.6, -0.8]) < 0).all(), "back from the end"
+
+
+def test_what_is_hatched_lies_below_zero():
+    window = Window(left=10, top=5, right=110, bottom=75, width=400, height=280)
+    over = {"nodes": MESH.nodes, "elements": MESH.elements, "values": np.ones(NODES), "ends": (0.0, 2.0)}
+    over |= {"colours": palette("viridis")}
+    grey = np.full((80, 120), 90, dtype=np.uint8)
+    plain, hatched = (paint(window, grey, Overlay(**over, beyond=beyond)) for beyond in (None, MESH.nodes[:, 0] - 60))
+    changed = plain != hatched
+    assert not changed[:, 202:].any()
+    assert changed[:, 2:198].mean() == pytest.approx(0.25, abs=0.02)
+    assert (hatched[changed] == 0xFF000000).all()
+
+
+def test_the_value_of_a_probe_is_its_mean_with_the_uncertainty_of_one(tmp_path):
+    result = make_result(tmp_path / "result", frames=6, record=smooth_record)
+    maps, box = Maps.of(result), (30.0, 20.0, 60.0, 60.0)
+    for name, most in (("u", ""), ("exx", " at most"), ("misfit", "")):
+        text = probe_text(maps, maps.all[name], maps.read(name, 5), "region", box)
+        assert text.endswith(most)
+        history = read_histories(result, ProbeSettings(regions=(box,)))["region_1_u"]
+        if name == "u":
+            assert text == f" mean: {maps.all[name].text(history.values[5], history.std[5])}"
+    assert probe_text(maps, maps.all["misfit"], maps.read("misfit", 5), "point", (50.0, 40.0)) == ": 1"
+    assert probe_text(maps, maps.all["node_status"], maps.read("node_status", 5), "point", (50.0, 40.0)) == ": measured"
+    assert probe_text(maps, maps.all["u"], maps.read("u", 5), "region", (200.0, 200.0, 300.0, 300.0)) == ""
+    exx = maps.read("exx", 5)
+    told = probe_text(maps, maps.all["exx"], exx, "region", box)
+    assert float(told.split("±")[1].split()[0]) <= exx.std.max() * 1.05
+
+
 def map_values(values, std):
     count = len(values)
     return MapValues(values=values, std=std, moved=np.zeros((count, 2)), status=np.zeros(count, dtype=np.uint8))
