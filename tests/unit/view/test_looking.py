@@ -14,16 +14,18 @@ from bokeh.events import MouseMove
 from bokeh.models import Div, Select
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from results import LIGHTS, NODES, make_origin, make_result, random_record, smooth_record
+from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record, smooth_record
 
+from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import FrameRecord, Maps, MapValues, Result, ResultStore
-from rgbmidic.results.histories import write_histories
+from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.view import curves
-from rgbmidic.view.address import KINDS, Mark, ViewState
+from rgbmidic.view.address import KINDS, PALETTES, UNCERTAINTY, Mark, ViewState
+from rgbmidic.view.canvas import arrow_lines, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
-from rgbmidic.view.fields import frame_text, pointer_text, range_of_test, robust_range, watched
+from rgbmidic.view.fields import frame_text, pointer_text, probe_text, range_of_test, robust_range, watched
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, palette_name
 
@@ -37,6 +39,15 @@ looks = st.builds(
     over=st.sampled_from(["reference", "deformed"]),
     symmetric=st.booleans(),
     directions=st.booleans(),
+    second=st.sampled_from(["", UNCERTAINTY, *NAMES]),
+    palette=st.sampled_from(["", *PALETTES]),
+    levels=st.integers(2, 256),
+    hatched=st.booleans(),
+    longer=numbers.map(abs),
+    gauge=numbers.map(abs),
+    measure=st.sampled_from(MEASURES),
+    since=st.integers(-1, 9),
+    rate_window=st.integers(0, 99),
     curve=st.text("abc ()/²", max_size=9),
     theme=st.sampled_from(["", "light", "dark"]),
     marks=marks,
@@ -65,6 +76,9 @@ def test_an_address_of_nonsense_opens_something_that_can_be_shown(query):
     assert view.field in NAMES
     assert view.low < view.high
     assert 0 <= view.opacity <= 1
+    assert -1 <= view.since < 10
+    assert view.levels >= 2
+    assert view.rate_window >= 0
     assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in KINDS for mark in view.marks)
 
 
