@@ -284,6 +284,9 @@ class ResultPage:
         arrows, title = None, "times their length (0: as there is room)"
         if view.vectors:
             moved = self.fields.displacement(view.frame)[:2].T
+            if self.fields.physical.rectified.camera is not None:  # that is on the plane, the arrows are on the image
+                first = self.result.nodes if view.since < 0 else self.fields.read("u", view.since).moved
+                moved = values.moved - first
             arrows, longer = arrow_lines(window, nodes, moved, view.longer)
             title = f"{title}: {longer:.3g}"
         self.arrows.show(arrows)

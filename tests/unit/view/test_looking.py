@@ -440,6 +440,32 @@ def test_a_range_by_hand_that_makes_no_sense_is_told(tmp_path):
     assert (page.canvas.colours.low, page.canvas.colours.high) == (5, 9)
 
 
+def test_a_choice_that_cannot_be_is_told_and_the_next_one_counts(tmp_path):
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
+    page.parts.of["gauge"].value = 5.0
+    assert "at least 56.12 px long" in page.parts.description.text
+    assert page.values is None
+    page.parts.of["gauge"].value = 70.0
+    page.parts.of["field"].value = "exx"
+    assert "virtual strain gauge of 70 px" in page.parts.description.text
+    page.parts.of["field"].value = "velocity"
+    assert "rates need 4 measured frames or more; there are 2" in page.parts.description.text
+
+
+def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
+    reason = "the solve stopped because " + "of this and that " * 20
+    store = ResultStore.create(tmp_path / "result", make_origin(1))
+    store.write_frame(0, FrameRecord.failed(reason, nodes=NODES, lights=3))
+    store.finish()
+    maps = Maps.of(Result.open(tmp_path / "result"))
+    text = frame_text(maps, 0, maps.all["u"], maps.read("u", 0), "")
+    summary, _, rest = text.partition("</summary>")
+    assert "failed: the solve stopped because" in summary
+    assert summary.endswith("… more")
+    assert summary.rpartition("<b")[2].count("this and that") < 5
+    assert rest.count("this and that") > 15
+
+
 def test_a_page_whose_browser_has_gone_is_not_watched():
     def document(connections):
         session = None if connections is None else SimpleNamespace(connection_count=connections)
