@@ -16,7 +16,7 @@ __all__ = ["BESIDE", "KINDS", "OVER", "PALETTES", "UNCERTAINTY", "Mark", "ViewSt
 KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "circle": 2}
 """Probes that can be set with the pointer, and how many places each takes."""
 OVER = ("reference", "deformed")
-_LEAST, _LARGEST = {"levels": 2}, 10**9
+_LEAST, _LARGEST = {"levels": 2, "rate_window": 0}, 10**9
 _MOST_MARKS = 200
 """Marks that an address may set: it has 8 kB at most, of some 25 a mark."""
 BESIDE = ("second", "third", "fourth")
@@ -168,7 +168,7 @@ class ViewState:
         asked = {entry.name: _value(entry.name, texts.get(entry.name, ""), names) for entry in fields(cls)}
         stated: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         view = cls(**{"frame": frame, **stated})
-        view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1)), cls()
+        view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1), since=min(view.since, frames - 1)), cls()
         return view if view.low < view.high else replace(view, low=plain.low, high=plain.high, range="frame")
 
     def query(self) -> str:
