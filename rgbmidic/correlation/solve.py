@@ -58,10 +58,10 @@ _REFINED = {"none": 1, "global": 1, "local": 4}
 _STARTED = 0.25
 """Correlation coefficient at the initial guess under which an element waits until its neighbours have brought it
 nearer. Chosen; with half or twice of it results do not change (benchmarks/constants.py)."""
-_RETURNS = 1
-"""Passes after which elements may take part again: the precision of the lights judges them from the first one on.
-With 2 frames of a fragment's rim took a tenth more iterations, plates under glare as many, and erred as much
-(benchmarks/fast_event.py)."""
+_RETURNS = 2
+"""Passes after which elements may take part again. At a fragment's edge some come and go with every pass: with 4 plates
+under glare took up to 22 iterations instead of 16; with 1 the frames of a turning fragment take a twentieth less, but
+what a crack or another body pulls at first is left out for good (benchmarks/fast_event.py)."""
 _WANDERING = 0.1
 """Motion (px) in the last iteration of a pass, and more than half of that in the one before, from which the elements
 around a node are left out after `_RETURNS` passes: its own pixels match nothing. Chosen: ten times what ends the first
