@@ -178,7 +178,7 @@ def next_weighting(
     returned = last.returned
     if (matched & ~last.matched).any():
         returned = number + 1
-    elif number == 1 and (motion > _ELSEWHERE).mean() > _SWINGING:
+    elif number == 1 < len(residual.values) and (motion > _ELSEWHERE).mean() > _SWINGING:
         returned = max(returned, number)
     weighting = replace(last, residual=residual, matched=matched, returned=returned)
     if not refining(problem, weighting, number + 1):
