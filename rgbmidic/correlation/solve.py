@@ -67,8 +67,8 @@ _WANDERING = 0.1
 around a node are left out after `_RETURNS` passes: its own pixels match nothing. Chosen: ten times what ends the first
 pass."""
 _ELSEWHERE = 0.05
-"""Motion (px) of more than `_SWINGING` of the nodes from where weights and grey levels were learnt, after which those of
-several lights are learnt once more: what all lights alike show of the motion hides which of them is the precise one.
+"""Motion (px) of more than `_SWINGING` of the nodes from where weights and grey levels were learnt, after which those
+of several lights are learnt once more: what all lights alike show of the motion hides which of them is the precise one.
 Under glare rms errors are up to 3 % less for it, for two iterations; at .02 as much (benchmarks/fast_event.py)."""
 _SETTLED = 1e-3
 """Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
