@@ -184,6 +184,29 @@ def test_a_derived_field_and_its_uncertainty_are_those_of_the_library(driver, ad
     assert (held["gauge"], held["since"], held["measure"], held["rigid"]) == (["80"], ["2"], ["hencky"], ["1"])
 
 
+def test_a_second_field_is_moved_with_the_first_and_painted_anew(driver, address):
+    from selenium.webdriver.common.action_chains import ActionBuilder
+
+    page = Page(driver, f"{address}?frame=5&field=u&second=v")
+    shown(page, 5)
+    page.until("model('plot_2') !== null && model('plot_2').inner_width > 100")
+    time.sleep(1)  # the plots take their new sizes
+    before = page.run("model('plot').x_range.start")
+    box = page.run(
+        "(() => { const b = Bokeh.index.get_one(model('plot_2')).el.getBoundingClientRect(); "
+        "return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+    )
+    actions = ActionBuilder(driver, duration=50)
+    actions.pointer_action.move_to_location(*map(round, box))
+    actions.pointer_action.pointer_down()
+    actions.pointer_action.move_to_location(round(box[0]) + 60, round(box[1]))
+    actions.pointer_action.pointer_up()
+    actions.perform()
+    page.until(f"model('plot').x_range.start < {before} - 5")
+    for plot in ("plot", "plot_2"):
+        page.until(f"Math.abs(model('{plot}').renderers[0].data_source.data.x[0] - model('plot').x_range.start) < 0.5")
+
+
 def test_extremes_arrows_contours_and_colours(driver, address, result):
     page = Page(driver, f"{address}?frame=5&field=u")
     shown(page, 5)
