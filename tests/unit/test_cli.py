@@ -519,7 +519,7 @@ def test_movie_and_profile_write_what_is_asked_for_or_nothing(command: Run, tmp_
 def test_batch_goes_on_after_a_failure_and_ends_with_status_1(command: Run, tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / f"{name}.toml").write_text(TEST)
-    status, out, err = command("batch", tmp_path / "a.toml", tmp_path / "b.toml", "--out", tmp_path / "out")
+    status, _, err = command("batch", tmp_path / "a.toml", tmp_path / "b.toml", "--out", tmp_path / "out")
     assert status == 1
     assert "2 of 2 tests failed: a, b" in err
     assert (tmp_path / "out" / "summary.csv").read_text().count("no frame") == 2
