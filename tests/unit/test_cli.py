@@ -32,8 +32,9 @@ Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the command in this process: exit status, standard output, standard error."""
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run the command in this process, as where kernels are compiled: exit status, standard output, standard error."""
+    monkeypatch.setattr("rgbmidic._kernels.are_compiled", lambda: True)
 
     def run(*arguments: object, debug: bool = False) -> tuple[int, str, str]:
         status = execute(cli.app, [str(argument) for argument in arguments], debug=debug)
