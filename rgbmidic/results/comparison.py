@@ -307,30 +307,30 @@ class Agreement:
 
     Attributes
     ----------
-    nodes
-        Number n of values: nodes with data, of the displacement those of u and v.
+    values
+        Their number n: nodes with data, of the displacement those of u and v.
     mean, rms
         Of the differences, measured minus simulated.
     std
         Median standard uncertainty.
-    beyond
+    beyond_2
         Fraction of the differences above two standard uncertainties; .046 is ordinary.
     chi_square
         Per degree of freedom: 1 is expected where the simulation is right.
-    freedom
-        Degrees of freedom.
+    degrees_of_freedom
+        Of chi-square.
     probability
         Of a larger chi-square where the simulation is right.
     """
 
-    nodes: int
-    mean: float
-    rms: float
-    std: float
-    beyond: float
-    chi_square: float
-    freedom: float
-    probability: float
+    values: int
+    mean: float = math.nan
+    rms: float = math.nan
+    std: float = math.nan
+    beyond_2: float = math.nan
+    chi_square: float = math.nan
+    degrees_of_freedom: float = math.nan
+    probability: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -656,8 +656,7 @@ class Comparison:
         known = np.isfinite(difference) & (std > 0)
         count, scale = int(known.sum()), np.where(known, std, 1)
         if not count:
-            blank = dict.fromkeys(("mean", "rms", "std", "beyond", "chi_square", "freedom", "probability"), math.nan)
-            return Agreement(nodes=0, **blank)
+            return Agreement(values=0)
         ratio, noise, shared = (np.where(known, part / scale, 0) for part in (difference, own, common))
         square = float((shared**2).sum()) ** 2
         for row, s, b in zip(rows, noise, shared, strict=True):
@@ -665,13 +664,13 @@ class Comparison:
             square += float(s**2 @ squares @ s**2 + 2 * (b * s) @ correlation @ (b * s))
         chi_square, freedom = float((ratio**2).sum() / (count - taken)), count**2 / square
         return Agreement(
-            nodes=count,
+            values=count,
             mean=float(difference[known].mean()),
             rms=float(np.sqrt(np.mean(difference[known] ** 2))),
             std=float(np.median(std[known])),
-            beyond=float(np.mean(np.abs(ratio[known]) > 2)),
+            beyond_2=float(np.mean(np.abs(ratio[known]) > 2)),
             chi_square=chi_square,
-            freedom=freedom,
+            degrees_of_freedom=freedom,
             probability=float(fisher.sf(chi_square, freedom, len(rows) * self._blocks)),
         )
 

@@ -74,8 +74,8 @@ def test_chi_square_is_1_and_scatters_as_its_degrees_of_freedom_state(tmp_path, 
         agreements = [made.agreement["levelled", name] for made in frames]
         squares = np.array([one.chi_square for one in agreements])
         assert abs(squares.mean() - 1) < 0.1, name
-        assert 0.6 < squares.var() * agreements[0].freedom / 2 < 1.6, name
-        assert np.mean([one.beyond for one in agreements]) == pytest.approx(0.0455, abs=0.015)
+        assert 0.6 < squares.var() * agreements[0].degrees_of_freedom / 2 < 1.6, name
+        assert np.mean([one.beyond_2 for one in agreements]) == pytest.approx(0.0455, abs=0.015)
     assert np.isnan(frames[0].fit.scale)  # nothing has moved
 
 
@@ -111,7 +111,7 @@ def test_the_uncertain_scale_of_the_image_counts_as_one_factor(tmp_path):
     frames = list(comparison.each())
     agreements = [made.agreement["nodes", "displacement"] for made in frames]
     assert np.mean([one.chi_square for one in agreements]) == pytest.approx(1, abs=0.5)
-    assert agreements[0].freedom < 1.5  # all differences are the same factor
+    assert agreements[0].degrees_of_freedom < 1.5  # all differences are the same factor
     assert [made.fit.scale_std for made in frames] == pytest.approx([relative] * 60, rel=0.05)
 
 
@@ -173,11 +173,11 @@ def test_nodes_without_data_are_left_out_and_so_is_their_strain(tmp_path):
     frames = np.stack([field, np.full(field.shape, np.nan)]) + noise(2)
     made, blank = compared(measured(tmp_path / "r", frames), stretch()).each()
     assert np.isnan(blank.fit.scale)
-    assert blank.agreement["levelled", "displacement"].nodes == 0
+    assert blank.agreement["levelled", "displacement"].values == 0
     assert np.flatnonzero(np.isnan(made.ratio("levelled", "u"))).tolist() == [7]
     around = MESH.beside(np.arange(NODES) == 7)
     assert np.isnan(made.ratio("nodes", "eyy")).tolist() == around.tolist()
-    assert made.agreement["nodes", "displacement"].nodes == 2 * (NODES - 1)
+    assert made.agreement["nodes", "displacement"].values == 2 * (NODES - 1)
 
 
 def write_state(path: Path, displacement: np.ndarray, mesh: FiniteElementMesh | None = None) -> None:
@@ -252,9 +252,11 @@ def test_the_command_writes_what_it_found_with_the_simulation_s_numbers(tmp_path
     assert written.fields["displacement_ratio_levelled"][:, 1] == pytest.approx(made.ratio("levelled", "v"))
     again = Simulation.read(out / "comparison.pvd")  # the measurement, as a simulation's boundary conditions
     assert again.displacement[0][:, 1] == pytest.approx(made.measured["v"])
-    rows = (out / "nodes.csv").read_text().splitlines()
-    assert len(rows) == 1 + NODES
-    assert [float(part) for part in rows[1].split(",")[:6]] == pytest.approx([3, 3, 3e-3, 100, 0, 8])
+    head, row, *_ = (out / "comparison.csv").read_text().splitlines()
+    assert head.startswith("frame,number,time_s,way,quantity,unit,values,mean,rms,std,beyond_2,chi_square,")
+    one = made.agreement["nodes", "displacement"]
+    assert row.startswith(f"3,3,0.003,nodes,displacement,mm,{one.values},{one.mean:.9g}")
+    assert (out / "scale.csv").read_text().splitlines()[1].startswith(f"3,3,0.003,{made.fit.scale:.9g},")
     assert execute(cli.app, command) == 2
     assert "is already there" in capsys.readouterr().err
 
