@@ -159,8 +159,8 @@ class Placement:
 
         Without a camera it is a similarity: shift, rotation and scale. With one it is a rigid motion, for both have mm.
         Whether the image shows the mesh or its mirror image is what fits three or more pairs better; where they do not
-        decide, the mesh's y axis points up (and the image's down). The log states a doubt, and a pair that is farther
-        from where the others place it than their residuals explain.
+        decide, the mesh's y axis points up (and the image's down). The log states a doubt, and residuals beyond those
+        of points set by hand.
 
         Parameters
         ----------
@@ -194,15 +194,14 @@ class Placement:
         best, other = (cls._fitted(given, camera, reflected) for reflected in (True, False))
         if len(given) > 2 and max(best.rms, other.rms) < _DECIDED * max(min(best.rms, other.rms), _POINTING):
             logger.warning(
-                "%s does not decide whether the image shows the mesh or its mirror image (residuals of %.2g px with "
-                "its y axis up, %.2g px with it down): up is taken; add a pair off the line of the others",
-                where,
-                best.rms,
-                other.rms,
+                "%s does not decide whether the image shows the mesh or its mirror image: up is taken", where
             )
         elif len(given) > 2 and other.rms < best.rms:
             best = other
-        best._report(where)
+        if best.rms > _DECIDED * _POINTING:
+            off = np.hypot(*best.residuals.T)
+            text = "%s leaves residuals of %.1f px rms, the largest, %.1f px, at %s[%d]: check the pairs"
+            logger.warning(text, where, best.rms, off.max(), where, off.argmax())
         return best
 
     @classmethod
@@ -216,36 +215,6 @@ class Placement:
         b = w.mean() - a * z.mean()
         matrix = np.array([[a.real, -sign * a.imag], [a.imag, sign * a.real]])
         return cls(matrix=matrix, shift=np.array([b.real, b.imag]), camera=camera, pairs=pairs)
-
-    def _report(self, where: str) -> None:
-        """Warn of residuals beyond those of points set by hand, and of the pair that the others explain least.
-
-        The squared distance of a pair to where the others place it, over the variance of their residuals, is a quantile
-        of Fisher's distribution (Cook and Weisberg, Residuals and Influence in Regression, 1982, section 2.2.2).
-        """
-        from scipy.stats import f as fisher
-
-        if self.rms > _DECIDED * _POINTING:
-            each = ", ".join(f"{length:.1f}" for length in np.hypot(*self.residuals.T))
-            logger.warning("%s leaves residuals of %.1f px rms (its pairs: %s px)", where, self.rms, each)
-        free = 2 * (len(self.pairs) - 1) - (4 if self.camera is None else 3)
-        if len(self.pairs) < 3 or free < 1:
-            return
-        found = []
-        for number, pair in enumerate(self.pairs):
-            fit = self._fitted(np.delete(self.pairs, number, axis=0), self.camera, self.reflected)
-            middle = fit.pairs[:, :2].mean(axis=0)
-            arms = ((np.vstack([fit.pairs, pair])[:, :2] - middle) ** 2).sum(axis=1)
-            leverage = 1 + 1 / len(fit.pairs) + arms[-1] / arms[:-1].sum()
-            off = float(np.hypot(*(fit.to_px(pair[None, :2])[0] - pair[2:])))
-            variance = max((fit.residuals**2).sum() / free, _POINTING**2)
-            found.append((off**2 / (2 * variance * leverage), off, number))
-        largest, off, number = max(found)
-        if fisher.sf(largest, 2, free) < _UNLIKELY / len(self.pairs):
-            pair = self.pairs[number].tolist()
-            logger.warning(
-                "%s[%d] = %s lies %.1f px from where the other pairs place it: check it", where, number, pair, off
-            )
 
     @property
     def reflected(self) -> bool:
@@ -377,8 +346,6 @@ _DECIDED = 3.0
 _STRETCHED = 1.05
 """Ratio of lengths on the mesh and on a camera's plane beyond which they contradict each other (chosen: a wrong unit is
 25 or more, a scale that is known to 5 % is no calibration)."""
-_UNLIKELY = 0.01
-"""Probability of naming any pair as an outlier where none is one (chosen)."""
 
 
 def _cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
@@ -524,12 +491,10 @@ def _plane(points: FloatArray, faces: IntArray, path: Path) -> tuple[tuple[int, 
         centred = nodes - nodes.mean(axis=0)
         normal = np.linalg.svd(centred, full_matrices=False)[2][2]
         off, tilt = float(np.abs(centred @ normal).max()), float(np.degrees(np.arccos(np.abs(normal).max())))
-        shape = (
-            f"lies on a plane {tilt:.3g} degrees from the nearest across an axis: turn it in its program"
-            if off <= reach
-            else f"is not planar: nodes lie up to {off:.4g} (in the file's unit) off its mean plane"
+        raise InputError(
+            f"the mesh of {path} must lie on a plane across one of its axes, but most of it lies on one {tilt:.3g} "
+            f"degrees from the nearest of these, with nodes up to {off:.4g} (in the file's unit) off its mean plane"
         )
-        raise InputError(f"the mesh of {path} must lie on a plane across one of its axes, but most of it {shape}")
     alike = [plane for plane in planes if plane[0] > _SAME * largest]
     _, axis, height, chosen = max(alike, key=lambda plane: plane[1:3])
     if len(chosen) < len(faces):

@@ -281,8 +281,8 @@ def _page(comparison: Comparison, done: Sequence[FrameComparison]) -> Page:
     page.text(f"{comparison.placement.summary()}.")
     if comparison.relative_std:
         page.text(
-            f"The scale of the image is known to {comparison.relative_std:.2g} of itself, which counts in the uncertainty "
-            "of displacements and of the best-fitting scale."
+            f"The scale of the image is known to {comparison.relative_std:.2g} of itself, which counts in the "
+            "uncertainty of displacements and of the best-fitting scale."
         )
     if len(done) > 1:
         page.heading("Over the frames")
