@@ -415,12 +415,8 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     if unit not in LENGTH_UNITS:
         raise InputError(f'the unit of {path} must be one of {", ".join(LENGTH_UNITS)}, not "{unit}"')
     try:
-        present = regular(path).is_file()
-    except OSError as error:
-        raise InputError(f"mesh file {path}: {error}") from None
-    if not present:
-        raise InputError(f"mesh file not found: {path}")
-    try:
+        if not path.is_file():
+            raise InputError(f"mesh file not found: {path}")
         content = _read_abaqus(path) if path.suffix.lower() == ".inp" else _read_meshio(path)
     except RgbmidicError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None

@@ -222,6 +222,8 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
         except (ValueError, IndexError):
             raise InputError(f"row {number} of {path} is not numbers: {row}") from None
     table = np.array(rows, dtype=np.float64).reshape(-1, len(wanted))
+    if mesh.numbering.startswith("counted"):
+        logger.warning("%s: the nodes of %s are %s: those of the table must be, too", path, mesh.name, mesh.numbering)
     places = _places(mesh.node_numbers, table[:, 0])
     known = places >= 0
     if not known.any():
@@ -688,6 +690,7 @@ def measured_mesh(result: Result) -> FiniteElementMesh | None:
         node_numbers=result.node_number,
         elements=result.elements,
         element_numbers=result.element_number,
+        numbering=kept["numbering"],
     )
 
 
@@ -740,6 +743,8 @@ def _matched(
     clock = result.number.astype(np.float64) if times is None else times
     if simulation.times is None:
         return clock, tuple(frames if asked is not None else frames[-1:]), ()
+    if times is None:
+        logger.warning("the frames of %s have no times: their numbers count as the simulation's times", result.path)
     first, last = simulation.times[[0, -1]]
     slack = _SAME * max(abs(first), abs(last))
     within = [index for index in frames if first - slack <= clock[index] <= last + slack]

@@ -371,7 +371,7 @@ def test_pairs_near_each_other_are_not_refused_for_the_one_that_is_far() -> None
     homography = np.array([[0.1, 0, 30], [0, 0.1, 20], [0, 0, 1]])
     camera = CameraCalibration(shape=(480, 640), lens=[3000, 320, 240, 0, 0, 0, 0, 0], homography=homography)
     points = np.array([[0.0, 0.0], [1.0, 0.0], [30.0, 20.0]])
-    image = camera.to_px(points * [1, -1] + [40, 60]) + [[0, 0], [1, 0], [0, 0]]
+    image = camera.to_px(points * [1, -1] + [40, 60]) + np.array([[0, 0], [1, 0], [0, 0]])
     assert Placement.fit(np.hstack([points, image]), camera).rms < 1
 
 

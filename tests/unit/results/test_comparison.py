@@ -43,14 +43,14 @@ def stretch(mesh: Tri3Mesh = MESH, strain: float = 0.01, bend: float = 0.05) -> 
     return np.stack([-0.3 * strain * x, strain * (y + bend * y**2)], axis=1)
 
 
-def measured(path: Path, displacement: np.ndarray, std: float = STD, **options: object) -> Result:
+def measured(path: Path, displacement: np.ndarray, std: float = STD, timed: bool = True, **options: object) -> Result:
     """A result of displacements (T, N, 2) in mm along the mesh's axes, each frame against the one reference."""
 
     def record(index: int) -> FrameRecord:
         u, v = PLACEMENT.vectors_to_px(PLACEMENT.to_mm(MESH.nodes), displacement[index]).T
         stated = {"u_std": np.full(NODES, std), "v_std": np.full(NODES, std)}
-        time = 1_000_000 * index
-        return FrameRecord.of(nodes=NODES, lights=3, number=index, time_ns=time, status=0, u=u, v=v, **stated)
+        stated |= {"time_ns": 1_000_000 * index} if timed else {}
+        return FrameRecord.of(nodes=NODES, lights=3, number=index, status=0, u=u, v=v, **stated)
 
     mesh = {"nodes": MESH.nodes, "elements": MESH.elements, "references": []}
     return make_result(path, frames=len(displacement), record=record, **{**mesh, **options})
@@ -215,6 +215,22 @@ def test_a_simulation_is_read_with_its_times_and_interpolated(states, name):
     assert read.times == pytest.approx([0.5, 0.504])
     assert read.at(0.501) == pytest.approx(stretch(), abs=1e-9)
     assert read.mesh.node_numbers.tolist() == finite_elements().node_numbers.tolist()
+
+
+def test_what_may_be_meant_otherwise_is_stated(tmp_path, states, caplog):
+    table = states.parent / "table.csv"
+    mesh = finite_elements()
+    meshio.Mesh(np.c_[mesh.points, 0 * mesh.points[:, :1]], [("triangle", mesh.elements)]).write(tmp_path / "plain.vtu")
+    counted = tmp_path / "counted.csv"
+    counted.write_text("node,u,v\n0,1,1\n1,2,2\n")
+    Simulation.read(counted, mesh=read_mesh(tmp_path / "plain.vtu"))
+    assert "are counted from 0 in the order of the file" in caplog.text
+    table.write_text(table.read_text().replace("node,time_ms,", "node,step,"))
+    with pytest.raises(InputError, match=r"two rows or more for node 100 at one time: several states need a time_s"):
+        Simulation.read(table, mesh=mesh)
+    result = measured(tmp_path / "r", np.arange(3)[:, None, None] * stretch(), timed=False)
+    Comparison(result, Simulation.read(states.parent / "all.pvd"), PLACEMENT)
+    assert "have no times: their numbers count as the simulation's times" in caplog.text
 
 
 def test_frames_beyond_the_times_of_the_simulation_are_left_out_and_those_asked_for_refused(tmp_path, states):
