@@ -233,9 +233,9 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
         table, places = table[known], places[known]
     times = table[:, 3] * _TIMES[clock.lower()] if clock else np.zeros(len(table))
     steps, state = np.unique(times, return_inverse=True)
-    twice = np.bincount(state * len(mesh.points) + places).argmax()
-    if np.count_nonzero(state * len(mesh.points) + places == twice) > 1:
-        node = mesh.node_numbers[twice % len(mesh.points)]
+    cells, count = np.unique(state * len(mesh.points) + places, return_counts=True)
+    if (count > 1).any():
+        node = mesh.node_numbers[cells[count.argmax()] % len(mesh.points)]
         raise InputError(f"{path} has two rows or more for node {node} at one time: several states need a time_s")
     values = np.full((len(steps), len(mesh.points), 2), np.nan)
     factors = [LENGTH_UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
@@ -467,13 +467,8 @@ class Comparison:
         self.simulated_mesh = Tri3Mesh(nodes=simulation.mesh.points, elements=simulation.mesh.elements)
         self.levelling = Levelling(self.mesh, self.simulated_mesh)
         self.covariance = NodalCovariance.from_mesh(self.mesh)
-        units = rectification_of(result, scale).units
-        exact, std = (
-            (units.mm_per_pixel, units.mm_per_pixel_std)
-            if placement.camera is not None
-            else (placement.mm_per_pixel, placement.mm_per_pixel_std)
-        )
-        self.relative_std = std / exact if exact else 0.0
+        units = placement if placement.camera is None else rectification_of(result, scale).units
+        self.relative_std = units.mm_per_pixel_std / units.mm_per_pixel if units.mm_per_pixel else 0.0
         image = Tri3Mesh(nodes=result.nodes, elements=result.elements)
         self._blocks = image.areas.sum() / max(BLOCK, OF_ELEMENT * image.size) ** 2
 
