@@ -538,13 +538,13 @@ def _read_meshio(path: Path) -> _File:
     if kind is None:
         known = ", ".join([".inp", *_FORMATS])
         raise InputError(f'{path} has the ending "{path.suffix}"; meshes are read from {known}')
-    reader = optional(f"meshio.{kind}", "fe")
     if kind == "gmsh":
         with path.open("rb") as file:
             if not file.read(200).lstrip().startswith(b"$"):
                 raise InputError(f"{path} is not a gmsh file: it does not begin with a section such as $MeshFormat")
-        if (text := _read_gmsh(path, reader.gmsh_to_meshio_type)) is not None:
+        if (text := _read_gmsh(path)) is not None:
             return text
+    reader = optional(f"meshio.{kind}", "fe")
     try:
         mesh = reader.read(str(path))
     except Exception as error:  # of meshio's readers any may come, from text that is no mesh
@@ -586,7 +586,18 @@ def _labels(kind: str, mesh: Any, nodes: int, cells: int) -> tuple[IntArray, Int
     return numbers, labels, stated
 
 
-def _read_gmsh(path: Path, kinds: Mapping[int, str]) -> _File | None:
+_GMSH = {
+    **dict.fromkeys((2, 9, 20, 21), "triangle"),
+    **dict.fromkeys((3, 10, 16, 36), "quad"),
+    **dict.fromkeys((4, 11), "tetra"),
+    **dict.fromkeys((5, 12, 17), "hexahedron"),
+    **dict.fromkeys((6, 13, 18), "wedge"),
+    **dict.fromkeys((7, 14, 19), "pyramid"),
+}
+"""Shapes of gmsh's numbers of element types, of first to third order (its manual, "Node ordering")."""
+
+
+def _read_gmsh(path: Path) -> _File | None:
     """Read a gmsh file in text, versions 2 and 4.1, with its tags; None of one in binary."""
     lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
     version, names = 0.0, dict[tuple[int, int], str]()
@@ -597,8 +608,7 @@ def _read_gmsh(path: Path, kinds: Mapping[int, str]) -> _File | None:
         return [next(lines).split() for _ in range(int(count))]
 
     def add(kind: int, tag: int, corners: list[int], members: Sequence[int]) -> None:
-        shape = re.sub(r"\d+$", "", kinds.get(kind, ""))
-        if shape in _CORNERS:
+        if (shape := _GMSH.get(kind)) is not None:
             elements.setdefault(shape, {})[tag] = corners[: _CORNERS[shape]]
             for group in members:
                 sets.setdefault(names.get((2 if shape in _PLANAR else 3, group), str(group)), set()).add(tag)
