@@ -420,16 +420,7 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
         content = _read_abaqus(path) if path.suffix.lower() == ".inp" else _read_meshio(path)
     except RgbmidicError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except (
-        ValueError,
-        KeyError,
-        IndexError,
-        AssertionError,
-        OSError,
-        EOFError,
-        StopIteration,
-        RecursionError,
-    ) as error:
+    except (ValueError, LookupError, AssertionError, OSError, EOFError, StopIteration, RecursionError) as error:
         raise InputError(f"{path} is not a readable mesh: {str(error) or 'it ends early'}") from None
     faces, numbers = _faces(content, path, part)
     axes, chosen = _plane(content.points, faces, path)
