@@ -67,7 +67,6 @@ _POOR = 1.5
 """Chi-square over its degrees of freedom from which a remark says that the field is not the series'."""
 _LEAST = 1e-3
 """Least uncertainty of a node over the median one: a node that is stated without noise does not outweigh all others."""
-_K_UNIT = "MPa √m"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -144,17 +143,17 @@ class JumpAlong:
         if path[0] != ends[0] or len(path) < 2:
             raise InputError(f"{name} needs two different points of one crack of the mesh, not {_text(place)} px")
         # an element is on the right of its sides as these run: the image has y down
-        sides = np.full((len(path), 2, 2), -1, dtype=np.int64)
-        for i, step in enumerate(pairwise(path.tolist())):
-            for side, (start, end) in enumerate((step[::-1], step)):
-                face = faces[(places == (start, end)).all(axis=1)][0]
-                sides[i, side, 1], sides[i + 1, side, 0] = face if side else face[::-1]
-        known = np.where(sides >= 0, sides, sides[:, :, ::-1])
-        one = (known[:, :, 0] == known[:, :, 1]).all(axis=1)  # else another crack branches off here
-        pairs = np.flatnonzero(one & (known[:, 0, 0] != known[:, 1, 0]))
+        face = dict(zip(map(tuple, places.tolist()), faces.tolist(), strict=True))
+        steps = np.array([(face[end, start][::-1], face[start, end]) for start, end in pairwise(path.tolist())])
+        arrives, leaves = (
+            np.concatenate([steps[:1, :, 0], steps[:, :, 1]]),
+            np.concatenate([steps[:, :, 0], steps[-1:, :, 1]]),
+        )
+        one = (arrives == leaves).all(axis=1)  # else another crack branches off here
+        pairs = np.flatnonzero(one & (arrives[:, 0] != arrives[:, 1]))
         if not len(pairs):
             raise InputError(f"no pair of nodes lies on the crack between the points {_text(place)} px of {name}")
-        nodes, index = np.unique(known[:, :, 0], return_inverse=True)
+        nodes, index = np.unique(arrives, return_inverse=True)
         return cls(
             name=name,
             nodes=nodes,
@@ -166,35 +165,30 @@ class JumpAlong:
 
     def read(self, nodal: Nodal) -> Jump:
         """Compute the jump from the displacements of the `nodes`; its uncertainty is that to first order."""
-        u, std = np.stack([nodal.u, nodal.v]), np.stack([nodal.u_std, nodal.v_std])
-        middle = self.points.T[:, None] + u[:, :, self.sides].mean(axis=-1)
-        found = np.empty((4, len(nodal.u), len(self.pairs)))
-        for column, place in enumerate(self.pairs):
-            ends = (max(place - 1, 0), min(place + 1, len(self.points) - 1))
-            used, index = np.unique(self.sides[[place, *ends]], return_inverse=True)
-            across, along = np.zeros((2, len(used)))
-            np.add.at(across, index.reshape(3, 2)[0], (1, -1))
-            np.add.at(along, index.reshape(3, 2)[1:], ((-0.5, -0.5), (0.5, 0.5)))
-            arm = middle[:, :, ends[1]] - middle[:, :, ends[0]]
-            length = np.hypot(*arm)
-            tangent = arm / length
-            normal = np.stack([tangent[1], -tangent[0]])
-            jump = u[:, :, used] @ across
-            values = opening, sliding = (jump * normal).sum(axis=0), (jump * tangent).sum(axis=0)
-            # the axes turn with the crack: d(normal) = tangent d(angle), d(angle) = -normal . d(arm) / length
-            turned = (-sliding / length * normal, opening / length * normal)
-            for row, (axis, turn) in enumerate(zip((normal, tangent), turned, strict=True)):
-                parts = (axis[:, :, None] * across + turn[:, :, None] * along) * std[:, :, used]
-                variance = np.einsum("ctm,mn,ctn->t", parts, self.correlation[np.ix_(used, used)], parts)
-                found[2 * row : 2 * row + 2, :, column] = values[row], np.sqrt(np.maximum(variance, 0))
+        before, after = np.maximum(self.pairs - 1, 0), np.minimum(self.pairs + 1, len(self.points) - 1)
+        used = self.sides[np.stack([self.pairs, before, after], axis=1)].reshape(-1, 6)
+        across, along = np.array([1, -1, 0, 0, 0, 0]), np.array([0, 0, -0.5, -0.5, 0.5, 0.5])
+        u, std = np.stack([nodal.u, nodal.v])[:, :, used], np.stack([nodal.u_std, nodal.v_std])[:, :, used]
+        jump, arm = u @ across, (self.points[after] - self.points[before]).T[:, None] + u @ along
+        length = np.hypot(*arm)
+        tangent = arm / length
+        normal = np.stack([tangent[1], -tangent[0]])
+        opening, sliding = (jump * normal).sum(axis=0), (jump * tangent).sum(axis=0)
+        correlation = self.correlation[used[:, :, None], used[:, None]]
+
+        def error(axis: FloatArray, turn: FloatArray) -> FloatArray:
+            parts = (axis[..., None] * across + turn[..., None] * along) * std
+            return np.asarray(np.sqrt(np.maximum(np.einsum("ctpm,pmn,ctpn->tp", parts, correlation, parts), 0)))
+
+        # the axes turn with the crack: d(normal) = tangent d(angle), d(angle) = -normal . d(arm) / length
         steps = np.hypot(*np.diff(self.points, axis=0, prepend=self.points[:1]).T)
         return Jump(
             distance=np.cumsum(steps)[self.pairs],
             points=self.points[self.pairs],
-            opening=found[0],
-            opening_std=found[1],
-            sliding=found[2],
-            sliding_std=found[3],
+            opening=opening,
+            opening_std=error(normal, -sliding / length * normal),
+            sliding=sliding,
+            sliding_std=error(tangent, opening / length * normal),
         )
 
     def histories(self, nodal: Nodal) -> list[History]:
@@ -205,14 +199,12 @@ class JumpAlong:
             f"{self.name}: jump of the left side against the right one, across and along the deformed crack, at its "
             f"pairs of nodes 1 to {len(self.pairs)}, which are {where} px from its first point"
         )
+        parts = {"opening": (jump.opening, jump.opening_std), "sliding": (jump.sliding, jump.sliding_std)}
         return [
             History(
                 name=f"{self.name}_{pair + 1}_{kind}", unit="px", values=values[:, pair], std=std[:, pair], note=note
             )
-            for kind, values, std in (
-                ("opening", jump.opening, jump.opening_std),
-                ("sliding", jump.sliding, jump.sliding_std),
-            )
+            for kind, (values, std) in parts.items()
             for pair in range(len(self.pairs))
         ]
 
@@ -498,15 +490,12 @@ class CrackTip:
         known: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
         frames = np.flatnonzero([self._enough(row) for row in known])
         data = {frame: _Weighted.of(self, fields[frame], known[frame]) for frame in frames.tolist()}
-        fit_tip, terms = (
-            self.williams.fit_tip,
-            self.williams.terms or self._terms([one for one in data.values() if not one.certain]),
-        )
+        fit_tip = self.williams.fit_tip
+        terms = self.williams.terms or self._terms([one for one in data.values() if not one.certain])
         found = np.full((len(fields), 4, 2), np.nan)
         chi_square = np.full(len(fields), np.nan)
         for frame, weighted in data.items():
-            fit = weighted.with_tip(terms) if fit_tip else weighted.fit(range(terms + 1))
-            if fit is not None:
+            if (fit := weighted.fit(terms, fit_tip=fit_tip)) is not None:
                 values, covariance, chi_square[frame] = fit
                 std = np.sqrt(np.diag(covariance) * max(1.0, chi_square[frame]))
                 if weighted.certain:
@@ -558,17 +547,17 @@ class CrackTip:
                 f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: the "
                 "field is not the series' within the noise, and what this makes of the factors is not known"
             )
-        parts: list[tuple[str, str, FloatArray, FloatArray | None]] = [
-            ("K1", _K_UNIT, s.factors[:, 0], s.factors_std[:, 0]),
-            ("K2", _K_UNIT, s.factors[:, 1], s.factors_std[:, 1]),
+        parts: list[tuple[str, str, FloatArray | None, FloatArray | None]] = [
+            ("K1", "MPa √m", s.factors[:, 0], s.factors_std[:, 0]),
+            ("K2", "MPa √m", s.factors[:, 1], s.factors_std[:, 1]),
             ("T", "MPa", s.t_stress, s.t_stress_std),
+            ("extension", "px", s.extension, s.extension_std),
             ("chi_square", "", s.chi_square, None),
         ]
-        if s.extension is not None:
-            parts.insert(3, ("extension", "px", s.extension, s.extension_std))
         return [
             History(name=f"{self.name}_{name}", unit=unit, values=values, std=std, note=note)
             for name, unit, values, std in parts
+            if values is not None
         ]
 
 
@@ -640,36 +629,33 @@ class _Weighted:
         taken = np.linalg.qr(self.whiten(self.series(orders)))[0].T @ self.data
         return np.asarray((self.data**2).sum() - np.cumsum((taken**2).reshape(-1, 2).sum(axis=1)))
 
-    def fit(self, orders: range) -> tuple[FloatArray, FloatArray, float]:
-        """Fit some terms: coefficients, their covariance, chi-square over its degrees of freedom."""
-        return self._solved(self.whiten(self.series(orders)))
+    def fit(self, terms: int, *, fit_tip: bool) -> tuple[FloatArray, FloatArray, float] | None:
+        """Fit the terms: coefficients, their covariance, and chi-square over its degrees of freedom.
 
-    def _solved(self, design: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        data = self.data
-        q, triangle = np.linalg.qr(design)
-        inverse = solve_triangular(triangle, np.eye(len(triangle)))
-        values = inverse @ (q.T @ data)
-        chi_square = ((data - design @ values) ** 2).sum() / (len(data) - len(values))
-        return values, inverse @ inverse.T, float(chi_square)
-
-    def with_tip(self, terms: int) -> tuple[FloatArray, FloatArray, float] | None:
-        """Fit the terms and, as the last value, the way (px) by which the tip is ahead; None where it is not found.
-
-        The way must be less than half the inner radius: beyond it the annulus is another one.
+        With `fit_tip` the last value is the way (px) by which the tip is ahead, less than half the inner radius, beyond
+        which the annulus is another one; None where it is not found.
         """
         orders, tip, step = range(terms + 1), 0.0, 1e-3 * self.probe.radii[1]
-        values = self.fit(orders)[0]
-        for _ in range(_STEPS):
+        solved = self._solved(self.series(orders))
+        for _ in range(_STEPS if fit_tip else 0):
+            values = solved[0][: 2 * len(orders)]
             slope = (self.series(orders, tip + step) - self.series(orders, tip - step)) @ values / (2 * step)
-            design = np.concatenate([self.series(orders, tip), slope[..., None]], axis=2)
-            solved, covariance, chi_square = self._solved(self.whiten(design))
-            values, change = solved[:-1], float(solved[-1])
+            solved = self._solved(np.concatenate([self.series(orders, tip), slope[..., None]], axis=2))
+            change = float(solved[0][-1])
             tip += change
             if not abs(tip) < self.probe.radii[0] / 2:
                 return None
             if abs(change) < _EXACT:
-                return np.r_[values, tip], covariance, chi_square
-        return None
+                return np.r_[solved[0][:-1], tip], *solved[1:]
+        return None if fit_tip else solved
+
+    def _solved(self, parts: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        design = self.whiten(parts)
+        q, triangle = np.linalg.qr(design)
+        inverse = solve_triangular(triangle, np.eye(len(triangle)))
+        values = inverse @ (q.T @ self.data)
+        chi_square = ((self.data - design @ values) ** 2).sum() / (len(self.data) - len(values))
+        return values, inverse @ inverse.T, float(chi_square)
 
 
 def crack_jump(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -35,6 +35,8 @@ _FLAT = 1e-4
 the eight columns of Nastran leave 1e-6 to 1e-5 (derived)."""
 
 IntArray = npt.NDArray[np.int64]
+_Nodes = dict[int, list[float]]
+_Elements = dict[str, dict[int, list[int]]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -157,8 +159,8 @@ class Placement:
 
         Without a camera it is a similarity: shift, rotation and scale. With one it is a rigid motion, for both have mm.
         Whether the image shows the mesh or its mirror image is what fits three or more pairs better; where they do not
-        decide, the mesh's y axis points up (and the image's down). The log states a doubt, and a pair that is farther
-        from where the others place it than their residuals explain.
+        decide, the mesh's y axis points up (and the image's down). The log states a doubt, and residuals beyond those
+        of points set by hand.
 
         Parameters
         ----------
@@ -178,27 +180,28 @@ class Placement:
         if given.ndim != 2 or given.shape[1] != 4 or len(given) < 2 or not np.isfinite(given).all():
             raise InputError(f"{where} is two or more pairs [x_mm, y_mm, x_px, y_px] of finite numbers, not {pairs!r}")
         for part, what in ((given[:, :2], "on the mesh"), (given[:, 2:], "on the image")):
-            distance = np.hypot(*(part[:, None] - part[None]).transpose(2, 0, 1)) + np.diag(np.full(len(part), np.inf))
-            if not distance.min() > 0:
-                raise InputError(f"{where}: pairs {np.argwhere(distance == 0)[0].tolist()} are one point {what}")
-        up, down = (cls._fitted(given, camera, reflected) for reflected in (True, False))
-        rms_up, rms_down = up.rms, down.rms
-        if len(given) == 2:
-            up._report_residuals(where)
-            return up
-        if max(rms_up, rms_down) < _DECIDED * max(min(rms_up, rms_down), _POINTING):
+            same = np.argwhere(np.triu((part[:, None] == part).all(axis=2), 1))
+            if len(same):
+                raise InputError(f"{where}: pairs {same[0].tolist()} are one point {what}")
+        if camera is not None:
+            on_plane, on_mesh = (part - part.mean(axis=0) for part in (camera.to_mm(given[:, 2:]), given[:, :2]))
+            stretch = np.linalg.norm(on_plane) / np.linalg.norm(on_mesh)
+            if not 1 / _STRETCHED < stretch < _STRETCHED:
+                raise InputError(
+                    f"the pairs of {where} lie {stretch:.4g} times as far apart on the camera's plane as on the mesh, "
+                    "where both are in mm: look at mesh.unit, the points and the calibration"
+                )
+        best, other = (cls._fitted(given, camera, reflected) for reflected in (True, False))
+        if len(given) > 2 and max(best.rms, other.rms) < _DECIDED * max(min(best.rms, other.rms), _POINTING):
             logger.warning(
-                "%s does not decide whether the image shows the mesh or its mirror image (residuals of %.2g px with "
-                "its y axis up, %.2g px with it down): up is taken; add a pair off the line of the others",
-                where,
-                rms_up,
-                rms_down,
+                "%s does not decide whether the image shows the mesh or its mirror image: up is taken", where
             )
-            best = up
-        else:
-            best = min(up, down, key=lambda one: one.rms)
-        best._report_residuals(where)
-        best._report_outlier(where)
+        elif len(given) > 2 and other.rms < best.rms:
+            best = other
+        if best.rms > _DECIDED * _POINTING:
+            off = np.hypot(*best.residuals.T)
+            text = "%s leaves residuals of %.1f px rms, the largest, %.1f px, at %s[%d]: check the pairs"
+            logger.warning(text, where, best.rms, off.max(), where, off.argmax())
         return best
 
     @classmethod
@@ -208,57 +211,10 @@ class Placement:
         sign = -1.0 if reflected else 1.0
         z, w = pairs[:, 0] + sign * 1j * pairs[:, 1], image[:, 0] + 1j * image[:, 1]
         a = np.vdot(z - z.mean(), w - w.mean()) / np.vdot(z - z.mean(), z - z.mean())
-        if camera is not None:
-            stretch = float(np.std(w) / np.std(z))
-            if not 1 / _STRETCHED < stretch < _STRETCHED:
-                raise InputError(
-                    f"the pairs of mesh.points lie {stretch:.4g} times as far apart on the camera's plane as on the "
-                    "mesh, where both are in mm: look at mesh.unit, the points and the calibration"
-                )
-            a /= abs(a)
+        a /= 1 if camera is None else abs(a)
         b = w.mean() - a * z.mean()
         matrix = np.array([[a.real, -sign * a.imag], [a.imag, sign * a.real]])
         return cls(matrix=matrix, shift=np.array([b.real, b.imag]), camera=camera, pairs=pairs)
-
-    def _report_residuals(self, where: str) -> None:
-        """Warn of residuals that are more than those of points set by hand."""
-        if self.rms > _DECIDED * _POINTING:
-            each = ", ".join(f"{length:.1f}" for length in np.hypot(*self.residuals.T))
-            logger.warning("%s leaves residuals of %.1f px rms (its pairs: %s px)", where, self.rms, each)
-
-    def _report_outlier(self, where: str) -> None:
-        """Warn of the pair that lies farthest from where the others place it, if they do not explain it.
-
-        The squared distance over the variance of the others' residuals is a quantile of Fisher's distribution (Cook and
-        Weisberg, Residuals and Influence in Regression, 1982, section 2.2.2).
-        """
-        from scipy.stats import f as fisher
-
-        free = 2 * (len(self.pairs) - 1) - (3 if self.camera is not None else 4)
-        if free < 1:
-            return
-        reflected = self.reflected
-        worst, largest = 0, 0.0
-        for number in range(len(self.pairs)):
-            others = np.delete(self.pairs, number, axis=0)
-            fit = self._fitted(others, self.camera, reflected)
-            centre = others[:, :2].mean(axis=0)
-            spread = ((others[:, :2] - centre) ** 2).sum()
-            leverage = 1 + 1 / len(others) + ((self.pairs[number, :2] - centre) ** 2).sum() / spread
-            off = fit.to_px(self.pairs[number : number + 1, :2])[0] - self.pairs[number, 2:]
-            variance = max(float((fit.residuals**2).sum()) / free, _POINTING**2)
-            excess = float((off**2).sum() / (2 * variance * leverage))
-            if excess > largest:
-                worst, largest, distance = number, excess, float(np.hypot(*off))
-        if fisher.sf(largest, 2, free) < _UNLIKELY / len(self.pairs):
-            logger.warning(
-                "%s[%d] = %s lies %.1f px from where the other pairs place it, which their residuals do not explain: "
-                "check it",
-                where,
-                worst,
-                self.pairs[worst].tolist(),
-                distance,
-            )
 
     @property
     def reflected(self) -> bool:
@@ -313,15 +269,6 @@ class Placement:
     def vectors_to_px(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
         """Displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes."""
         return self.to_px(points + vectors) - self.to_px(points)
-
-    @property
-    def axes(self) -> FloatArray:
-        """The mesh's axes (2, 2), row by row, in those of the image, or of the camera's plane: an orthogonal matrix Q.
-
-        A tensor T, such as a strain, of those axes is ``Q @ T @ Q.T`` in the mesh's.
-        """
-        back = np.linalg.inv(self.matrix)
-        return np.asarray(back / np.sqrt(abs(np.linalg.det(back))))
 
     def to_document(self) -> dict[str, Any]:
         """Return all but the camera in plain values, as the provenance of a result holds it."""
@@ -399,44 +346,46 @@ _DECIDED = 3.0
 _STRETCHED = 1.05
 """Ratio of lengths on the mesh and on a camera's plane beyond which they contradict each other (chosen: a wrong unit is
 25 or more, a scale that is known to 5 % is no calibration)."""
-_UNLIKELY = 0.01
-"""Probability of naming any pair as an outlier where none is one (chosen)."""
 
 
 def _cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
-    """Twice the signed area (E,) of triangles."""
-    first, second = (points[elements[:, corner]] - points[elements[:, 0]] for corner in (1, 2))
-    return np.asarray(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Block:
-    """Cells of one shape: their nodes (m, k) as indices of points, and their numbers (m,)."""
-
-    kind: str
-    nodes: IntArray
-    numbers: IntArray
-    sets: Mapping[str, BoolArray] = field(default_factory=dict)
+    """Twice the signed area (...) of triangles (..., 3)."""
+    first, second = (points[elements[..., corner]] - points[elements[..., 0]] for corner in (1, 2))
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _File:
-    """What a file holds."""
+    """What a file holds: nodes, blocks of cells (shape, indices of their corners, numbers), and sets of the numbers."""
 
     points: FloatArray
     numbers: IntArray
-    blocks: Sequence[_Block]
+    blocks: Sequence[tuple[str, IntArray, IntArray]]
+    sets: Mapping[str, Collection[int]]
     fields: Mapping[str, FloatArray] = field(default_factory=dict)
     numbering: str = "labels of the file"
 
+    @classmethod
+    def of(cls, nodes: _Nodes, elements: _Elements, sets: Mapping[str, Collection[int]]) -> Self:
+        """Take nodes and elements by their labels."""
+        index, blocks = {label: i for i, label in enumerate(nodes)}, []
+        for shape, cells in elements.items():
+            if lost := [(cell, node) for cell, corners in cells.items() for node in corners if node not in index]:
+                raise InputError(f"element {lost[0][0]} has node {lost[0][1]}, which the file does not state")
+            corners = np.array([[index[node] for node in corners] for corners in cells.values()])
+            blocks.append((shape, corners, np.array(list(cells))))
+        points = np.array(list(nodes.values()), dtype=np.float64)
+        return cls(points=points, numbers=np.array(list(nodes)), blocks=blocks, sets=sets)
 
-_SIDES: dict[str, tuple[tuple[int, ...], ...]] = {
+
+_PLANAR = {"triangle": ((0, 1, 2),), "quad": ((0, 1, 2, 3),)}
+_SOLID = {
     "tetra": ((0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)),
     "hexahedron": ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)),
     "wedge": ((0, 1, 2), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
     "pyramid": ((0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
 }
-"""Corners of the sides of solids, in VTK's order, which meshio has for all formats and Abaqus' own is."""
+"""Corners of the sides of cells, in VTK's order, which meshio has for all formats and Abaqus' own is."""
 _CORNERS = {"triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
 
 
@@ -466,17 +415,13 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     if unit not in LENGTH_UNITS:
         raise InputError(f'the unit of {path} must be one of {", ".join(LENGTH_UNITS)}, not "{unit}"')
     try:
-        present = regular(path).is_file()
-    except OSError as error:
-        raise InputError(f"mesh file {path}: {error}") from None
-    if not present:
-        raise InputError(f"mesh file not found: {path}")
-    try:
+        if not path.is_file():
+            raise InputError(f"mesh file not found: {path}")
         content = _read_abaqus(path) if path.suffix.lower() == ".inp" else _read_meshio(path)
     except RgbmidicError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except (ValueError, KeyError, IndexError, AssertionError, OSError, EOFError) as error:
-        raise InputError(f"{path} is not a readable mesh: {error}") from None
+    except (ValueError, LookupError, AssertionError, OSError, EOFError, StopIteration, RecursionError) as error:
+        raise InputError(f"{path} is not a readable mesh: {str(error) or 'it ends early'}") from None
     faces, numbers = _faces(content, path, part)
     axes, chosen = _plane(content.points, faces, path)
     corners, numbers = _triangles(content.points[:, axes], faces[chosen], numbers[chosen])
@@ -496,29 +441,28 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
 
 def _faces(content: _File, path: Path, part: str | None) -> tuple[IntArray, IntArray]:
     """Return the corners (m, 4) of the faces, a triangle's last one twice, and their elements' numbers (m,)."""
-    names = sorted({name for block in content.blocks for name in block.sets})
-    blocks = list(content.blocks)
+    blocks = content.blocks
     if part is not None:
-        known = {name.lower(): name for name in names}
+        known = {name.lower(): list(numbers) for name, numbers in content.sets.items()}
         if part.lower() not in known:
-            raise InputError(f'{path} has no set "{part}" of elements; it has {", ".join(names) or "none"}')
-        inside = [block.sets.get(known[part.lower()], np.zeros(len(block.nodes), dtype=bool)) for block in blocks]
-        blocks = [
-            _Block(kind=block.kind, nodes=block.nodes[mask], numbers=block.numbers[mask])
-            for block, mask in zip(blocks, inside, strict=True)
+            there = ", ".join(sorted(content.sets)) or "none"
+            raise InputError(f'{path} has no set "{part}" of elements; it has {there}')
+        inside = [np.isin(numbers, known[part.lower()]) for *_, numbers in blocks]
+        blocks = [(shape, nodes[m], numbers[m]) for (shape, nodes, numbers), m in zip(blocks, inside, strict=True)]
+    for table in (_PLANAR, _SOLID):
+        sides = [
+            (nodes[:, (*side, side[-1])[:4]], numbers)
+            for shape, nodes, numbers in blocks
+            for side in table.get(shape, ())
+            if len(nodes)
         ]
-    flat = [block for block in blocks if block.kind in ("triangle", "quad") and len(block.nodes)]
-    solid = [block for block in blocks if block.kind in _SIDES and len(block.nodes)]
-    if flat:
-        sides = [(block.nodes[:, (0, 1, 2, 2) if block.kind == "triangle" else (0, 1, 2, 3)], block) for block in flat]
-    elif solid:
-        sides = [(block.nodes[:, (*side, side[-1])[:4]], block) for block in solid for side in _SIDES[block.kind]]
+        if sides:
+            faces, numbers = (np.concatenate(parts) for parts in zip(*sides, strict=True))
+            break
     else:
         of_part = "" if part is None else f' in the set "{part}"'
         raise InputError(f"{path} has no triangles, quadrilaterals or solids{of_part}")
-    faces = np.concatenate([corners for corners, _ in sides])
-    numbers = np.concatenate([block.numbers for _, block in sides])
-    if flat:
+    if table is _PLANAR:
         return faces, numbers
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     free = np.sort(first[count == 1])
@@ -527,39 +471,33 @@ def _faces(content: _File, path: Path, part: str | None) -> tuple[IntArray, IntA
 
 def _plane(points: FloatArray, faces: IntArray, path: Path) -> tuple[tuple[int, int], IntArray]:
     """Return the axes of the plane that is measured, and its faces; the log states which, if there are others."""
-    corners = points[faces]
+    corners, nodes = points[faces], points[np.unique(faces)]
     area = np.linalg.norm(np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]), axis=1) / 2
-    reach = _FLAT * float(np.ptp(points[np.unique(faces)], axis=0).max())
+    reach, curved = _FLAT * float(np.ptp(nodes, axis=0).max()), np.ones(len(faces), dtype=bool)
     planes: list[tuple[float, int, float, IntArray]] = []
     for axis in range(3):
         across = np.flatnonzero(np.ptp(corners[..., axis], axis=1) <= reach)
+        curved[across] = False
         height = corners[across, :, axis].mean(axis=1)
         order = np.argsort(height)
         groups = np.split(order, np.flatnonzero(np.diff(height[order]) > reach) + 1)
         planes += [(float(area[across[g]].sum()), axis, float(height[g].mean()), across[g]) for g in groups if len(g)]
     largest = max((plane[0] for plane in planes), default=0.0)
-    curved = np.setdiff1d(np.arange(len(faces)), np.concatenate([np.empty(0, dtype=int), *(p[3] for p in planes)]))
-    if float(area[curved].sum()) > largest or largest <= 0:
-        nodes = points[np.unique(faces[curved])] if len(curved) else points
+    if area[curved].sum() >= largest:
         centred = nodes - nodes.mean(axis=0)
         normal = np.linalg.svd(centred, full_matrices=False)[2][2]
         off, tilt = float(np.abs(centred @ normal).max()), float(np.degrees(np.arccos(np.abs(normal).max())))
-        shape = (
-            f"lies on a plane {tilt:.3g} degrees from the nearest across an axis: turn it in its program"
-            if off <= reach
-            else f"is not planar: nodes lie up to {off:.4g} (in the file's unit) off its mean plane"
+        raise InputError(
+            f"the mesh of {path} must lie on a plane across one of its axes, but most of it lies on one {tilt:.3g} "
+            f"degrees from the nearest of these, with nodes up to {off:.4g} (in the file's unit) off its mean plane"
         )
-        raise InputError(f"the mesh of {path} must lie on a plane across one of its axes, but most of it {shape}")
-    _, axis, height, chosen = max((p for p in planes if p[0] > _SAME * largest), key=lambda plane: plane[1:3])
+    alike = [plane for plane in planes if plane[0] > _SAME * largest]
+    _, axis, height, chosen = max(alike, key=lambda plane: plane[1:3])
     if len(chosen) < len(faces):
+        which = "the largest" if len(alike) == 1 else "the largest and, of several as large, the farthest along"
+        where = f"{'xyz'[axis]} = {height:.6g}"
         logger.warning(
-            "%s: measured is its plane %s = %.6g with %d of %d faces, the largest%s",
-            path,
-            "xyz"[axis],
-            height,
-            len(chosen),
-            len(faces),
-            "" if sum(p[0] > _SAME * largest for p in planes) == 1 else " and, of several as large, the farthest along",
+            "%s: measured is its plane %s with %d of %d faces, %s", path, where, len(chosen), len(faces), which
         )
     return ((1, 2), (0, 2), (0, 1))[axis], np.sort(chosen)
 
@@ -573,35 +511,21 @@ def _triangles(places: FloatArray, faces: IntArray, numbers: IntArray) -> tuple[
 
     A corner that is there twice makes a face a triangle.
     """
-
-    def split(first: int) -> tuple[IntArray, FloatArray]:
-        both = np.stack([np.roll(faces, -first, axis=1)[:, k] for k in ([0, 1, 2], [0, 2, 3])], axis=1)
-        return both, np.stack([_cross(places, both[:, k]) for k in (0, 1)], axis=1)
-
-    (one, area), (other, other_area) = split(0), split(1)
-    turn = np.sign(area.sum(axis=1))[:, None]
-    worst, other_worst = ((turn * part).min(axis=1) for part in (area, other_area))
-    length, other_length = (np.hypot(*(places[faces[:, k]] - places[faces[:, k + 2]]).T) for k in (0, 1))
-    near = np.abs(length - other_length) < _FLAT * length
-    shorter = np.where(near, np.arange(len(faces)) % 2 == 1, other_length < length)
-    swap = (faces[:, 2] != faces[:, 3]) & np.where(np.minimum(worst, other_worst) <= 0, other_worst > worst, shorter)
-    corners = np.where(swap[:, None, None], other, one).reshape(-1, 3)
-    labels = np.repeat(numbers, 2)
+    both = faces[:, [[[0, 1, 2], [0, 2, 3]], [[1, 2, 3], [1, 3, 0]]]]
+    area = _cross(places, both)
+    worst = (np.sign(area[:, :1].sum(axis=2, keepdims=True)) * area).min(axis=2)
+    length, other = np.linalg.norm(places[faces[:, :2]] - places[faces[:, 2:]], axis=2).T
+    row = np.arange(len(faces))
+    shorter = np.where(np.abs(length - other) < _FLAT * length, row % 2 == 1, other < length)
+    swap = (faces[:, 2] != faces[:, 3]) & np.where(worst.min(axis=1) <= 0, worst[:, 1] > worst[:, 0], shorter)
+    corners = both[row, swap.astype(int)].reshape(-1, 3)
     proper = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-    return corners[proper], labels[proper]
+    return corners[proper], np.repeat(numbers, 2)[proper]
 
 
 _FORMATS = {
-    ".msh": "gmsh",
-    ".vtu": "vtu",
-    ".vtk": "vtk",
-    ".bdf": "nastran",
-    ".nas": "nastran",
-    ".fem": "nastran",
-    ".xdmf": "xdmf",
-    ".mesh": "medit",
-    ".avs": "avsucd",
-    ".vol": "netgen",
+    **{".msh": "gmsh", ".vtu": "vtu", ".vtk": "vtk", ".xdmf": "xdmf", ".mesh": "medit", ".avs": "avsucd"},
+    **{".bdf": "nastran", ".nas": "nastran", ".fem": "nastran", ".vol": "netgen"},
 }
 """Formats by the files' endings: those of meshio's that were tried with numpy 2 (med and cgns fail, some never end)."""
 _NUMBERS = ("GlobalNodeId", "node_number", "node_id", "NodeId", "GlobalElementId", "element_number", "element_id")
@@ -627,31 +551,24 @@ def _read_meshio(path: Path) -> _File:
         raise InputError(f"{path} is not a readable mesh ({kind}: {first_line(error)})") from None
     points = np.zeros((len(mesh.points), 3))
     points[:, : np.shape(mesh.points)[1]] = mesh.points
-    sizes = [len(block.data) for block in mesh.cells]
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    numbers, labels, numbering = _labels(kind, mesh, len(points), int(starts[-1]))
-    sets: dict[str, list[BoolArray]] = {}
+    ends = np.cumsum([len(block.data) for block in mesh.cells])
+    numbers, labels, numbering = _labels(kind, mesh, len(points), int(ends[-1]) if len(ends) else 0)
+    by_block = np.split(labels, ends[:-1])
+    sets: dict[str, Collection[int]] = {}
     for name, members in mesh.cell_sets.items():
-        sets[name] = [np.isin(np.arange(size), np.asarray(m)) for size, m in zip(sizes, members, strict=False)]
+        given = [part[np.isin(np.arange(len(part)), m)] for part, m in zip(by_block, members, strict=False)]
+        sets[name] = np.concatenate(given)
     tags = {int(tag): name for name, (tag, dimension) in mesh.field_data.items() if int(dimension) == 2}
-    for key in ("gmsh:physical", "nastran:ref", "medit:ref", "cell_tags"):
-        for tag in np.unique(np.concatenate(mesh.cell_data[key])) if key in mesh.cell_data else ():
-            name = tags.get(int(tag), str(int(tag)))
-            sets.setdefault(name, [np.asarray(block) == tag for block in mesh.cell_data[key]])
+    for key in {"gmsh:physical", "nastran:ref", "medit:ref", "cell_tags"} & set(mesh.cell_data):
+        values = np.concatenate(mesh.cell_data[key])
+        for tag in np.unique(values):
+            sets.setdefault(tags.get(int(tag), str(int(tag))), labels[values == tag])
     blocks = [
-        _Block(
-            kind=re.sub(r"\d+$", "", block.type),
-            nodes=np.asarray(block.data, dtype=np.int64),
-            numbers=labels[starts[i] : starts[i + 1]],
-            sets={name: masks[i] for name, masks in sets.items() if len(masks) == len(sizes)},
-        )
-        for i, block in enumerate(mesh.cells)
-        if len(block.data)
+        (re.sub(r"\d+$", "", block.type), np.asarray(block.data, dtype=np.int64), part)
+        for block, part in zip(mesh.cells, by_block, strict=False)
     ]
-    fields = {
-        key: np.asarray(values, dtype=np.float64) for key, values in mesh.point_data.items() if key not in _NUMBERS
-    }
-    return _File(points=points, numbers=numbers, blocks=blocks, fields=fields, numbering=numbering)
+    fields = {key: np.asarray(x, dtype=np.float64) for key, x in mesh.point_data.items() if key not in _NUMBERS}
+    return _File(points=points, numbers=numbers, blocks=blocks, sets=sets, fields=fields, numbering=numbering)
 
 
 def _labels(kind: str, mesh: Any, nodes: int, cells: int) -> tuple[IntArray, IntArray, str]:
@@ -669,70 +586,6 @@ def _labels(kind: str, mesh: Any, nodes: int, cells: int) -> tuple[IntArray, Int
     return numbers, labels, stated
 
 
-def _read_gmsh(path: Path) -> _File | None:
-    """Read a gmsh file in text, versions 2 and 4, which numpy 2 keeps meshio from; None of one in binary."""
-    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
-    version, names = 0.0, dict[tuple[int, int], str]()
-    groups = dict[tuple[int, int], list[int]]()  # physical groups of the entities of version 4
-    nodes = dict[int, list[float]]()
-    cells = dict[str, list[tuple[int, list[int], list[tuple[int, int]]]]]()
-
-    def add(kind: int, tag: int, corners: Sequence[int], member: list[tuple[int, int]]) -> None:
-        if kind in _GMSH:
-            shape = _GMSH[kind]
-            cells.setdefault(shape, []).append((tag, list(corners[: _CORNERS[shape]]), member))
-
-    for line in lines:
-        section = line.strip()
-        if section == "$MeshFormat":
-            number, is_binary, *_ = next(lines).split()
-            version = float(number)
-            if int(is_binary):
-                return None
-        elif section == "$PhysicalNames":
-            for _ in range(int(next(lines))):
-                axis, number, title = next(lines).split(maxsplit=2)
-                names[int(axis), int(number)] = title.strip().strip('"')
-        elif section == "$Entities":
-            for dimension, count in enumerate(map(int, next(lines).split())):
-                for _ in range(count):
-                    entity, *about = next(lines).split()
-                    at = 3 if dimension == 0 else 6
-                    groups[dimension, int(entity)] = [abs(int(n)) for n in about[at + 1 : at + 1 + int(about[at])]]
-        elif section == "$Nodes" and version < 4:
-            for _ in range(int(next(lines))):
-                label, *place = next(lines).split()
-                nodes[int(label)] = [float(x) for x in place]
-        elif section == "$Nodes":
-            for _ in range(int(next(lines).split()[0])):
-                count = int(next(lines).split()[3])
-                labels = [int(next(lines)) for _ in range(count)]
-                nodes.update((label, [float(x) for x in next(lines).split()[:3]]) for label in labels)
-        elif section == "$Elements" and version < 4:
-            for _ in range(int(next(lines))):
-                tag, kind, width, *rest = map(int, next(lines).split())
-                add(kind, tag, rest[width:], [(-1, rest[0])] if width else [])
-        elif section == "$Elements":
-            for _ in range(int(next(lines).split()[0])):
-                level, entity_tag, kind, count = map(int, next(lines).split())
-                member = [(level, group) for group in groups.get((level, entity_tag), ())]
-                for _ in range(count):
-                    tag, *corners = map(int, next(lines).split())
-                    add(kind, tag, corners, member)
-    index = {label: i for i, label in enumerate(nodes)}
-    blocks = []
-    for shape, every in cells.items():
-        sets: dict[str, BoolArray] = {}
-        for row, (_, _, member) in enumerate(every):
-            for dimension, group in member:
-                flat = 2 if shape in ("triangle", "quad") else 3
-                name = names.get((flat if dimension < 0 else dimension, group), str(group))
-                sets.setdefault(name, np.zeros(len(every), dtype=bool))[row] = True
-        connected = np.array([[index[node] for node in corners] for _, corners, _ in every])
-        blocks.append(_Block(kind=shape, nodes=connected, numbers=np.array([tag for tag, _, _ in every]), sets=sets))
-    return _File(points=np.array(list(nodes.values())), numbers=np.array(list(nodes)), blocks=blocks)
-
-
 _GMSH = {
     **dict.fromkeys((2, 9, 20, 21), "triangle"),
     **dict.fromkeys((3, 10, 16, 36), "quad"),
@@ -742,33 +595,69 @@ _GMSH = {
     **dict.fromkeys((7, 14, 19), "pyramid"),
 }
 """Shapes of gmsh's numbers of element types, of first to third order (its manual, "Node ordering")."""
-_PLANES = {
-    "CPS",
-    "CPE",
-    "CPEG",
-    "CAX",
-    "CGAX",
-    "S",
-    "STRI",
-    "M3D",
-    "R3D",
-    "SFM3D",
-    "DC2D",
-    "DCAX",
-    "DS",
-    "AC2D",
-    "ACAX",
-}
-_SOLIDS = {"C3D", "DC3D", "AC3D", "SC"}
-"""Families of Abaqus' elements that have faces; the others (beams, springs, cohesive ones) are not read."""
-_ABAQUS = {
-    **dict.fromkeys(("3", "6", "65"), "triangle"),
-    **dict.fromkeys(("4", "8", "9"), "quad"),
-}
+
+
+def _read_gmsh(path: Path) -> _File | None:
+    """Read a gmsh file in text, versions 2 and 4.1, with its tags; None of one in binary."""
+    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
+    version, names = 0.0, dict[tuple[int, int], str]()
+    groups = dict[tuple[int, int], list[int]]()  # physical groups of the entities of version 4
+    nodes, elements, sets = _Nodes(), _Elements(), dict[str, set[int]]()
+
+    def rows(count: str | int) -> list[list[str]]:
+        return [next(lines).split() for _ in range(int(count))]
+
+    def add(kind: int, tag: int, corners: list[int], members: Sequence[int]) -> None:
+        if (shape := _GMSH.get(kind)) is not None:
+            elements.setdefault(shape, {})[tag] = corners[: _CORNERS[shape]]
+            for group in members:
+                sets.setdefault(names.get((2 if shape in _PLANAR else 3, group), str(group)), set()).add(tag)
+
+    for line in lines:
+        section = line.strip()
+        if section == "$MeshFormat":
+            number, is_binary, *_ = next(lines).split()
+            version = float(number)
+            if int(is_binary):
+                return None
+        elif section == "$PhysicalNames":
+            for axis, number, *title in rows(next(lines)):
+                names[int(axis), int(number)] = " ".join(title).strip('"')
+        elif section == "$Entities":
+            for dimension, count in enumerate(next(lines).split()):
+                for entity, *about in rows(count):
+                    at = 3 if dimension == 0 else 6
+                    groups[dimension, int(entity)] = [abs(int(n)) for n in about[at + 1 : at + 1 + int(about[at])]]
+        elif section == "$Nodes" and version < 4:
+            nodes.update((int(label), [float(x) for x in place]) for label, *place in rows(next(lines)))
+        elif section == "$Nodes":
+            for _ in range(int(next(lines).split()[0])):
+                count = next(lines).split()[3]
+                labels = [int(label) for (label,) in rows(count)]
+                nodes.update(
+                    (label, [float(x) for x in place[:3]]) for label, place in zip(labels, rows(count), strict=True)
+                )
+        elif section == "$Elements" and version < 4:
+            for row in rows(next(lines)):
+                tag, kind, width, *rest = map(int, row)
+                add(kind, tag, rest[width:], rest[: min(width, 1)])
+        elif section == "$Elements":
+            for _ in range(int(next(lines).split()[0])):
+                level, tag, kind, many = map(int, next(lines).split())
+                members = groups.get((level, tag), ())
+                for row in rows(many):
+                    tag, *corners = map(int, row)
+                    add(kind, tag, corners, members)
+    return _File.of(nodes, elements, sets)
+
+
+_ELEMENT = re.compile(
+    r"(?:(CPS|CPE|CPEG|CAX|CGAX|S|STRI|M3D|R3D|SFM3D|DC2D|DCAX|DS|AC2D|ACAX)|C3D|DC3D|AC3D|SC)(\d+)", re.IGNORECASE
+)
+"""Abaqus' elements that have faces: planar ones or solids; others (beams, springs, cohesive ones) are not read."""
+_ABAQUS = {"3": "triangle", "6": "triangle", "65": "triangle", "4": "quad", "8": "quad", "9": "quad"}
 _ABAQUS_SOLIDS = {
-    **dict.fromkeys(("4", "10"), "tetra"),
-    **dict.fromkeys(("5", "13"), "pyramid"),
-    **dict.fromkeys(("6", "15"), "wedge"),
+    **{"4": "tetra", "10": "tetra", "5": "pyramid", "13": "pyramid", "6": "wedge", "15": "wedge"},
     **dict.fromkeys(("8", "20", "27"), "hexahedron"),
 }
 """Shapes by the number in an element's name, which is that of its nodes (STRI65: six, with five unknowns)."""
@@ -777,108 +666,65 @@ _GENERATED = {"NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"}
 
 def _read_abaqus(path: Path) -> _File:
     """Read nodes, elements and element sets of an input file, of its one part that has elements, or without parts."""
-    scopes: dict[str, _Scope] = {}
+    parts, sets = dict[str, tuple[_Nodes, _Elements]](), dict[str, set[int]]()
     part = ""
     for keyword, options, rows in _abaqus_cards(path):
+        nodes, elements = parts.setdefault(part, ({}, {}))
         if keyword in _GENERATED or (keyword == "NODE" and options.get("SYSTEM", "R").upper() != "R"):
             raise InputError(
                 f"{path}: *{keyword} is not read: write nodes and elements out, in rectangular coordinates"
             )
-        if keyword == "PART":
-            part = options["NAME"]
-        elif keyword == "END PART":
-            part = ""
-        elif keyword in ("NODE", "ELEMENT", "ELSET"):
-            scopes.setdefault(part, _Scope()).take(keyword, options, rows)
-    meshed = {name: scope for name, scope in scopes.items() if scope.elements}
+        if keyword in ("PART", "END PART"):
+            part = options.get("NAME", "")
+        elif keyword == "INSTANCE" and any(float(x or 0) for row in rows for x in row):
+            logger.warning("%s: the translation of an *INSTANCE is not applied: nodes lie as in their part", path)
+        elif keyword == "NODE":
+            for label, *place in rows:
+                nodes[int(label)] = [float(x) if x else 0.0 for x in (*place[:3], "", "")[:3]]
+        elif keyword == "ELEMENT":
+            shape, cells = _abaqus_elements(options["TYPE"], rows)
+            if shape is not None:
+                elements.setdefault(shape, {}).update(cells)
+                sets.setdefault(options.get("ELSET", ""), set()).update(cells)
+        elif keyword == "ELSET":
+            members = sets.setdefault(options["ELSET"], set())
+            for row in rows:
+                if "GENERATE" in options:
+                    first, last, *step = map(int, filter(None, row))
+                    members.update(range(first, last + 1, *step[:1]))
+                else:
+                    for name in filter(None, row):
+                        members.update([int(name)] if name.isdigit() else sets.get(name, ()))
+    meshed = {name: found for name, found in parts.items() if found[1]}
     if len(meshed) > 1:
         raise InputError(f"{path} has parts that number their nodes alike ({', '.join(meshed)}): write one of them")
     if not meshed:
         raise InputError(f"{path} has no elements that are read: plane ones, shells, membranes or solids")
-    return next(iter(meshed.values())).content()
+    sets.pop("", None)
+    return _File.of(*next(iter(meshed.values())), sets)
 
 
-class _Scope:
-    """Nodes, elements and sets of a part of an Abaqus file while it is read."""
-
-    def __init__(self) -> None:
-        self.nodes: dict[int, list[float]] = {}
-        self.elements: dict[str, dict[int, list[int]]] = {}
-        self.sets: dict[str, set[int]] = {}
-
-    def take(self, keyword: str, options: Mapping[str, str], rows: Sequence[list[str]]) -> None:
-        """Add what one keyword's rows state."""
-        if keyword == "NODE":
-            for label, *place in rows:
-                self.nodes[int(label)] = [float(x) if x else 0.0 for x in (*place[:3], "", "")[:3]]
-        elif keyword == "ELSET":
-            given = self.sets.setdefault(options["ELSET"], set())
-            for row in rows:
-                if "GENERATE" in options:
-                    first, last, *step = map(int, filter(None, row))
-                    given.update(range(first, last + 1, *step[:1]))
-                else:
-                    for name in filter(None, row):
-                        given.update([int(name)] if name.isdigit() else self.sets.get(name, ()))
-        else:
-            found = re.match(r"([A-Z]+?(?:[23]D)?)(\d+)", options["TYPE"].upper())
-            family, size = found.groups() if found else ("", "")
-            shapes = _ABAQUS if family in _PLANES else _ABAQUS_SOLIDS if family in _SOLIDS else {}
-            if size not in shapes:
-                return
-            width = 1 + (6 if size == "65" else int(size))
-            every = [int(number) for row in rows for number in filter(None, row)]
-            if len(every) % width:
-                raise InputError(f"elements of type {options['TYPE']} have {width - 1} nodes")
-            labels = every[::width]
-            kept = self.elements.setdefault(shapes[size], {})
-            kept.update((every[i], every[i + 1 : i + width]) for i in range(0, len(every), width))
-            if "ELSET" in options:
-                self.sets.setdefault(options["ELSET"], set()).update(labels)
-
-    def content(self) -> _File:
-        """Return all of it with nodes as indices."""
-        index = {label: i for i, label in enumerate(self.nodes)}
-        blocks = []
-        for kind, elements in self.elements.items():
-            corners = _CORNERS[kind]
-            for label, nodes in elements.items():
-                if lost := [node for node in nodes[:corners] if node not in index]:
-                    raise InputError(f"element {label} has node {lost[0]}, which the file does not state")
-            numbers = np.array(list(elements), dtype=np.int64)
-            blocks.append(
-                _Block(
-                    kind=kind,
-                    nodes=np.array([[index[node] for node in nodes[:corners]] for nodes in elements.values()]),
-                    numbers=numbers,
-                    sets={name: np.isin(numbers, list(labels)) for name, labels in self.sets.items()},
-                )
-            )
-        return _File(
-            points=np.array(list(self.nodes.values()), dtype=np.float64),
-            numbers=np.array(list(self.nodes), dtype=np.int64),
-            blocks=blocks,
-        )
+def _abaqus_elements(name: str, rows: Sequence[list[str]]) -> tuple[str | None, dict[int, list[int]]]:
+    """Shape of a type of elements, None of one that is not read, and the corners of each by its label."""
+    planar, size = found.groups() if (found := _ELEMENT.match(name)) else (None, "")
+    if (shape := (_ABAQUS if planar else _ABAQUS_SOLIDS).get(size)) is None:
+        return None, {}
+    width = 1 + (6 if size == "65" else int(size))
+    every = [int(number) for row in rows for number in filter(None, row)]
+    if len(every) % width:
+        raise InputError(f"elements of type {name} have {width - 1} nodes")
+    return shape, {every[i]: every[i + 1 : i + 1 + _CORNERS[shape]] for i in range(0, len(every), width)}
 
 
 def _abaqus_cards(path: Path) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
     """Keyword, options and rows of data of every card of an Abaqus file, in its order, with included files."""
-    card: tuple[str, dict[str, str], list[list[str]]] | None = None
-    for line in regular(path).read_text(encoding="utf-8", errors="replace").splitlines():
-        text = line.strip()
-        if not text or text.startswith("**"):
-            continue
-        if not text.startswith("*"):
-            if card is not None:
-                card[2].append([entry.strip() for entry in text.split(",")])
-            continue
-        if card is not None:
-            yield card
-        keyword, *given = (entry.strip() for entry in text[1:].split(","))
+    text = re.sub(r"^\s*\*\*.*", "", regular(path).read_text(encoding="utf-8", errors="replace"), flags=re.MULTILINE)
+    for card in re.split(r"^\s*\*", text, flags=re.MULTILINE)[1:]:
+        (keyword, *given), *rows = (
+            [entry.strip() for entry in line.split(",")] for line in card.splitlines() if line.strip()
+        )
         options = {key.strip().upper(): value.strip() for key, _, value in (entry.partition("=") for entry in given)}
-        card = keyword.upper(), options, []
         if keyword.upper() == "INCLUDE":
             yield from _abaqus_cards(path.parent / options["INPUT"])
-            card = None
-    if card is not None:
-        yield card
+        else:
+            yield keyword.upper(), options, rows

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from operator import methodcaller
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -16,7 +17,7 @@ from rgbmidic.command import optional
 from rgbmidic.report import style
 from rgbmidic.report.document import Page
 from rgbmidic.report.figures import spread
-from rgbmidic.results.comparison import QUANTITIES, WAYS, Agreement, Comparison, FrameComparison
+from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
 from rgbmidic.results.files import write_complete, writing
 from rgbmidic.typing import FloatArray
 
@@ -24,10 +25,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["comparison_files", "difference_figure", "histogram_figure", "ratio_figure", "scale_figure"]
-__all__ += ["scale_text", "write_comparison"]
+__all__ = ["comparison_files", "difference_figure", "histogram_figure", "scale_figure", "scale_text"]
+__all__ += ["write_comparison"]
 
-PAGE, TABLE, SCALE, NODES, INDEX = "comparison.html", "comparison.csv", "scale.csv", "nodes.csv", "comparison.pvd"
+PAGE, TABLE, SCALE, INDEX = "comparison.html", "comparison.csv", "scale.csv", "comparison.pvd"
 _SHOWN = 2
 """Frames of which maps are shown at most."""
 _REACH = 4.0
@@ -37,17 +38,15 @@ _UNLIKELY = 0.01
 _SHAPE = 1.5
 """Chi-square of what the best scale leaves above which the shape differs: 1.2 times the stated uncertainty, more than
 that is wrong by in any scene of docs/uncertainty.md."""
-_ROUNDING = 1e-6
-"""Relative uncertainty of a scale under which it is not worth a word."""
 _BINS = np.linspace(-6, 6, 49)
 """Of a histogram of ratios; those beyond are counted in the outermost ones."""
-_RIGID = ("rigid_u_mm", "rigid_v_mm", "rigid_rotation_deg")
+_GROUPS = {"displacement": QUANTITIES[:2], "strain": QUANTITIES[2:]}
 _TITLES = {"nodes": "at the nodes", "levelled": "levelled"}
 
 
 def comparison_files(comparison: Comparison) -> list[str]:
     """Names of the files that `write_comparison` writes."""
-    return [PAGE, TABLE, SCALE, NODES, INDEX, *(_state(frame) for frame in comparison.frames)]
+    return [PAGE, TABLE, SCALE, INDEX, *(_state(frame) for frame in comparison.frames)]
 
 
 def _state(frame: int) -> str:
@@ -59,9 +58,9 @@ def write_comparison(
 ) -> list[FrameComparison]:
     """Compare all frames, and write page, tables and the fields at the simulation's nodes into a folder.
 
-    ``comparison.csv`` has a row per frame, way and quantity, ``scale.csv`` one per frame; ``nodes.csv`` and the
-    ``.vtu`` files, which ``comparison.pvd`` names with their times, have the measurement at the simulation's nodes with
-    their numbers, in mm along the simulation's axes.
+    ``comparison.csv`` has a row per frame, way and quantity, ``scale.csv`` one per frame; the ``.vtu`` files, which
+    ``comparison.pvd`` names with their times, have the measurement at the simulation's nodes with their numbers, in mm
+    along the simulation's axes.
 
     Parameters
     ----------
@@ -89,102 +88,55 @@ def write_comparison(
     optional("meshio", "fe")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-
-    def pass_over(file: BinaryIO) -> None:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        writer = csv.writer(text)
-        for number, made in enumerate(comparison.each()):
-            rows = _node_rows(comparison, made)
-            if not number:
-                writer.writerow(rows)
-            _write_rows(writer, zip(*rows.values(), strict=True))
-            _write_state(comparison, made, out / _state(made.frame))
-            done.append(made if made.frame in shown else replace(made, measured={}, std={}, simulated={}))
-            if progress is not None:
-                progress(number + 1, len(comparison.frames), "frames")
-        text.detach()  # leaves the file open for `write_complete`
-
-    write_complete(out / NODES, pass_over)
-    for name, table in ((TABLE, _agreement_rows(comparison, done)), (SCALE, _scale_rows(comparison, done))):
-        _write_table(out / name, table)
+    for made in comparison.each():
+        _write_state(comparison, made, out / _state(made.frame))
+        done.append(made if made.frame in shown else replace(made, measured={}, std={}, simulated={}))
+        if progress is not None:
+            progress(len(done), len(comparison.frames), "frames")
     sets = "".join(f'<DataSet timestep="{one.time:.12g}" file={quoteattr(_state(one.frame))}/>' for one in done)
-    index = (
-        f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>{sets}</Collection></VTKFile>\n'
-    )
-    write_complete(out / INDEX, lambda file: file.write(index.encode()))
-    page = _page(comparison, done).html
-    write_complete(out / PAGE, lambda file: file.write(page.encode()))
+    index = f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>{sets}</Collection></VTKFile>'
+    texts = {
+        TABLE: _table([row for made in done for row in _agreement_rows(comparison, made)]),
+        SCALE: _table([_scale_row(comparison, made) for made in done]),
+        INDEX: index,
+        PAGE: _page(comparison, done).html,
+    }
+    for name, text in texts.items():
+        write_complete(out / name, methodcaller("write", text.encode()))
     return done
 
 
-def _write_table(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    def write(file: BinaryIO) -> None:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        writer = csv.writer(text)
-        for number, row in enumerate(rows):
-            if not number:
-                writer.writerow(row)
-            _write_rows(writer, [row.values()])
-        text.detach()
-
-    write_complete(path, write)
-
-
-def _write_rows(writer: Any, rows: Iterable[Iterable[Any]]) -> None:
-    """Write rows of texts, whole numbers and numbers; NaN as an empty field."""
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows of texts, whole numbers and numbers as CSV; NaN is an empty field."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(rows[0])
     for row in rows:
-        writer.writerow(
-            "" if value != value else f"{value:.9g}" if isinstance(value, float) else value for value in row
+        cells = (
+            "" if value != value else f"{value:.9g}" if isinstance(value, float) else value for value in row.values()
         )
+        writer.writerow(cells)
+    return text.getvalue()
 
 
 def _of_frame(comparison: Comparison, made: FrameComparison) -> dict[str, Any]:
     clock = "time_s" if comparison.timed else "time_frame"
-    number = int(comparison.result.number[made.frame])
-    return {"frame": made.frame, "number": number, clock: made.time}
+    return {"frame": made.frame, "number": int(comparison.result.number[made.frame]), clock: made.time}
 
 
-def _agreement_rows(comparison: Comparison, done: Iterable[FrameComparison]) -> Iterator[dict[str, Any]]:
-    for made in done:
-        for (way, name), one in made.agreement.items():
-            yield {
-                **_of_frame(comparison, made),
-                "way": way,
-                "quantity": name,
-                "unit": "1" if name[0] == "e" else "mm",
-                "values": one.nodes,
-                "mean": one.mean,
-                "rms": one.rms,
-                "std": one.std,
-                "beyond_2": one.beyond,
-                "chi_square": one.chi_square,
-                "degrees_of_freedom": one.freedom,
-                "probability": one.probability,
-            }
+def _agreement_rows(comparison: Comparison, made: FrameComparison) -> Iterator[dict[str, Any]]:
+    for (way, name), one in made.agreement.items():
+        what = {"way": way, "quantity": name, "unit": "1" if name[0] == "e" else "mm"}
+        yield _of_frame(comparison, made) | what | asdict(one)
 
 
-def _scale_rows(comparison: Comparison, done: Iterable[FrameComparison]) -> Iterator[dict[str, Any]]:
-    for made in done:
-        row = _of_frame(comparison, made) | {"scale": made.fit.scale, "scale_std": made.fit.scale_std}
-        for name, value, std in zip(_RIGID, made.fit.rigid.tolist(), made.fit.rigid_std.tolist(), strict=True):
-            row |= {name: value, f"{name}_std": std}
-        yield row | {"chi_square_of_the_rest": made.fit.chi_square}
-
-
-def _node_rows(comparison: Comparison, made: FrameComparison) -> dict[str, list[Any]]:
-    """Columns of ``nodes.csv`` for one frame."""
-    mesh = comparison.simulation.mesh
-    count = len(mesh.points)
-    columns: dict[str, list[Any]] = {name: [value] * count for name, value in _of_frame(comparison, made).items()}
-    columns |= {"node": mesh.node_numbers.tolist(), "x_mm": mesh.points[:, 0].tolist()}
-    columns["y_mm"] = mesh.points[:, 1].tolist()
-    for name in QUANTITIES:
-        unit = "" if name[0] == "e" else "_mm"
-        columns[f"{name}{unit}"] = made.measured[name].tolist()
-        columns[f"{name}{unit}_std"] = made.std[name].tolist()
-        for way in WAYS:
-            columns[f"{name}{unit}_simulated_{way}"] = made.simulated[way][name].tolist()
-    return columns
+def _scale_row(comparison: Comparison, made: FrameComparison) -> dict[str, Any]:
+    fit = made.fit
+    row = _of_frame(comparison, made) | {"scale": fit.scale, "scale_std": fit.scale_std}
+    names = ("rigid_u_mm", "rigid_v_mm", "rigid_rotation_deg")
+    for name, value, std in zip(names, fit.rigid.tolist(), fit.rigid_std.tolist(), strict=True):
+        row |= {name: value, f"{name}_std": std}
+    return row | {"chi_square_of_the_rest": fit.chi_square}
 
 
 def _write_state(comparison: Comparison, made: FrameComparison, path: Path) -> None:
@@ -192,28 +144,28 @@ def _write_state(comparison: Comparison, made: FrameComparison, path: Path) -> N
     import meshio
 
     mesh = comparison.simulation.mesh
-
-    def vector(values: Mapping[str, FloatArray]) -> FloatArray:
-        return np.stack([values["u"], values["v"], 0 * values["u"]], axis=1)
-
-    def tensor(values: Mapping[str, FloatArray]) -> FloatArray:
-        return np.stack([values[name] for name in QUANTITIES[2:]], axis=1)
-
     fields: dict[str, Any] = {"node_number": mesh.node_numbers}
-    for name, join in (("displacement", vector), ("strain", tensor)):
-        fields |= {name: join(made.measured), f"{name}_std": join(made.std)}
+    for group, names in _GROUPS.items():
+
+        def stacked(values: Mapping[str, FloatArray], names: Sequence[str] = names) -> FloatArray:
+            return np.column_stack(
+                [*(values[name] for name in names), *[np.zeros(len(mesh.points))] * (3 - len(names))]
+            )
+
+        fields |= {group: stacked(made.measured), f"{group}_std": stacked(made.std)}
         for way in WAYS:
-            fields[f"{name}_simulated_{way}"] = join(made.simulated[way])
-            ratios = {quantity: made.ratio(way, quantity) for quantity in QUANTITIES}
-            fields[f"{name}_ratio_{way}"] = join(ratios)
+            fields[f"{group}_simulated_{way}"] = stacked(made.simulated[way])
+            fields[f"{group}_ratio_{way}"] = stacked({name: made.ratio(way, name) for name in names})
     points = np.column_stack([mesh.points, np.zeros(len(mesh.points))])
     cells = {"element_number": [mesh.element_numbers]}
     written = meshio.Mesh(points, [("triangle", mesh.elements)], point_data=fields, cell_data=cells)
     write_complete(path, lambda file: meshio.vtu.write(file.name, written))
 
 
-def difference_figure(comparison: Comparison, made: FrameComparison, names: Sequence[str], way: str) -> Figure:
-    """Draw measured minus simulated at the simulation's nodes, in mm or strain; blank where there are no data.
+def difference_figure(
+    comparison: Comparison, made: FrameComparison, names: Sequence[str], way: str, *, ratio: bool = False
+) -> Figure:
+    """Draw measured minus simulated at the simulation's nodes, y up; blank where there are no data.
 
     Parameters
     ----------
@@ -225,25 +177,9 @@ def difference_figure(comparison: Comparison, made: FrameComparison, names: Sequ
         Of the `QUANTITIES`, a panel each.
     way
         One of the `WAYS`.
+    ratio
+        Whether in units of the standard uncertainty, from -4 to 4; else in mm or strain.
     """
-    fields = {}
-    for name in names:
-        values = made.difference(way, name)
-        ordinary = style.ordinary_values(values, made.std[name])
-        reach = max(np.abs(style.colour_range(ordinary))) if ordinary.size else 1.0
-        fields[f"{name}, {_TITLES[way]}" + ("" if name[0] == "e" else " (mm)")] = values, reach
-    return _maps(comparison, fields)
-
-
-def ratio_figure(comparison: Comparison, made: FrameComparison, names: Sequence[str], way: str) -> Figure:
-    """Draw measured minus simulated over the standard uncertainty, from -4 to 4; parameters as `difference_figure`."""
-    return _maps(
-        comparison, {f"{name} in uncertainties, {_TITLES[way]}": (made.ratio(way, name), _REACH) for name in names}
-    )
-
-
-def _maps(comparison: Comparison, fields: Mapping[str, tuple[FloatArray, float]]) -> Figure:
-    """Draw nodal fields (M,) of the simulation's mesh, y up, with colours from minus to plus a reach."""
     from matplotlib.colors import Normalize
     from matplotlib.tri import Triangulation
 
@@ -251,29 +187,32 @@ def _maps(comparison: Comparison, fields: Mapping[str, tuple[FloatArray, float]]
     low, high = style.view_limits(mesh.points)
 
     def draw(axes: list[Axes]) -> None:
-        for axis, (title, (values, reach)) in zip(axes, fields.items(), strict=True):
-            norm = Normalize(-reach, reach)
-            known = np.isfinite(values)
+        for axis, name in zip(axes, names, strict=True):
+            values, unit, reach = made.ratio(way, name), " in uncertainties", _REACH
+            if not ratio:
+                values, unit = made.difference(way, name), "" if name[0] == "e" else " (mm)"
+                ordinary = style.ordinary_values(values, made.std[name])
+                reach = max(np.abs(style.colour_range(ordinary))) if ordinary.size else 1.0
+            norm, known = Normalize(-reach, reach), np.isfinite(values)
             whole = known[mesh.elements].all(axis=1)
-            drawn = Triangulation(mesh.points[:, 0], mesh.points[:, 1], mesh.elements, ~whole)
             if whole.any():
+                drawn = Triangulation(mesh.points[:, 0], mesh.points[:, 1], mesh.elements, ~whole)
                 axis.tripcolor(drawn, np.where(known, values, 0), cmap="RdBu_r", norm=norm, shading="gouraud")
             beyond = bool((values[known] < -reach).any()), bool((values[known] > reach).any())
             style.add_colour_bar(axis, norm, "RdBu_r", beyond=beyond)
             style.finish_picture(axis, (low[0], high[0]), (high[1], low[1]), first=axis is axes[0], unit="mm")
-            axis.set_title(title)
+            axis.set_title(f"{name}{unit}, {_TITLES[way]}")
 
     aspect = float(np.ptp([low[1], high[1]]) / np.ptp([low[0], high[0]]))
-    return style.draw_figure(draw, count=len(fields), aspect=aspect, beside=style.BAR)
+    return style.draw_figure(draw, count=len(names), aspect=aspect, beside=style.BAR)
 
 
 def histogram_figure(made: FrameComparison) -> Figure:
     """Draw how often each ratio of difference to standard uncertainty occurs, both ways, and what a Gaussian has."""
-    groups = {"displacement": QUANTITIES[:2], "strain": QUANTITIES[2:]}
 
     def draw(axes: list[Axes]) -> None:
         middles, width = (_BINS[1:] + _BINS[:-1]) / 2, _BINS[1] - _BINS[0]
-        for axis, (title, names) in zip(axes, groups.items(), strict=True):
+        for axis, (title, names) in zip(axes, _GROUPS.items(), strict=True):
             for way, colour in zip(WAYS, ("vermillion", "blue"), strict=True):
                 ratios = np.concatenate([made.ratio(way, name) for name in names])
                 ratios = ratios[np.isfinite(ratios)]
@@ -300,9 +239,8 @@ def scale_figure(comparison: Comparison, done: Sequence[FrameComparison]) -> Fig
         for way, colour in zip(WAYS, ("vermillion", "blue"), strict=True):
             for name, line in (("displacement", "-"), ("eyy", ":")):
                 values = [made.agreement[way, name].chi_square for made in done]
-                text = f"{name}, {_TITLES[way]}"
                 look: dict[str, Any] = {"linestyle": line, "color": style.OKABE_ITO[colour], "linewidth": 1}
-                axes[1].plot(times, values, marker="o", markersize=2.5, label=text, **look)
+                axes[1].plot(times, values, marker="o", markersize=2.5, label=f"{name}, {_TITLES[way]}", **look)
         axes[1].axhline(1, color="0.4", linewidth=0.8, linestyle="--")
         axes[1].set_ylim(bottom=0)
         style.finish_plot(axes[1], label, "chi-square per degree of freedom", whole=not comparison.timed)
@@ -328,73 +266,57 @@ def scale_text(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
 
 
 def _page(comparison: Comparison, done: Sequence[FrameComparison]) -> Page:
-    result = comparison.result
-    page = Page(f"Comparison: {result.path.resolve().name} with {Path(comparison.simulation.name).name}")
+    page = Page(f"Comparison: {comparison.result.path.resolve().name} with {Path(comparison.simulation.name).name}")
     page.text(f"Best-fitting scale: {scale_text(comparison, done)}.")
     page.text(
         "Differences are measured minus simulated, at the simulation's nodes and along its axes: displacement, mm, and "
         f"Green-Lagrange strain over the shortest virtual strain gauge ({comparison.gauge:.3g} mm). At the nodes the "
-        "simulation stands as it is. Levelled, it has gone through the measurement's mesh, recovery and strain gauges, "
-        "so that a lack of resolution does not count as difference. Chi-square is per degree of freedom: 1 is expected "
-        "where the simulation is right and the stated uncertainty is all there is."
+        "simulation stands as it is; levelled, it has gone through the measurement's mesh, recovery and strain gauges, "
+        "so that a lack of resolution does not count as difference. Chi-square, per degree of freedom, is 1 where the "
+        "simulation is right and the stated uncertainty is all there is."
     )
     page.heading("Warnings")
     page.bullets(list(_warnings(comparison, done)) or ["none"])
     page.heading("Where the mesh lies")
     page.text(f"{comparison.placement.summary()}.")
-    if comparison.relative_std > _ROUNDING:
+    if comparison.relative_std:
         page.text(
-            f"The scale of the image is known to {comparison.relative_std:.2g} of itself: one factor in all "
-            "displacements, which counts in their uncertainty and in that of the best-fitting scale."
+            f"The scale of the image is known to {comparison.relative_std:.2g} of itself, which counts in the "
+            "uncertainty of displacements and of the best-fitting scale."
         )
     if len(done) > 1:
         page.heading("Over the frames")
         caption = "best-fitting scale with two standard uncertainties, and chi-square"
         page.picture(style.embedded(scale_figure(comparison, done)), caption)
-    for made in (one for one in done if one.measured):
-        page.heading(f"Frame {made.frame} ({result.names[made.frame]})")
-        fit = made.fit
-        texts = [f"{value:.2g} ± {std:.1g}" for value, std in zip(fit.rigid, fit.rigid_std, strict=True)]
-        left = " (taken off)" if comparison.remove_rigid else ""
-        page.text(
-            f"Scale {fit.scale:.4f} ± {fit.scale_std:.2g}; what it leaves has a chi-square of {fit.chi_square:.3g}. "
-            f"Rigid motion, measured minus simulated{left}: {texts[0]} mm along x, {texts[1]} mm along y, {texts[2]} "
-            "degrees."
-        )
-        header = (
-            "way",
-            "quantity",
-            "values",
-            "mean",
-            "rms",
-            "uncertainty",
-            "beyond 2",
-            "chi-square",
-            "degrees of freedom",
-            "probability",
-        )
-        page.table(header, [(*key, *_cells(one)) for key, one in made.agreement.items()])
-        page.picture(style.embedded(histogram_figure(made)), "ratios of difference to standard uncertainty")
-        for names in (QUANTITIES[:2], QUANTITIES[2:]):
-            page.picture(
-                style.embedded(difference_figure(comparison, made, names, "levelled")),
-                "measured minus simulated, levelled",
-            )
-            for way in reversed(WAYS):
-                caption = f"measured minus simulated, {_TITLES[way]}, in standard uncertainties"
-                page.picture(style.embedded(ratio_figure(comparison, made, names, way)), caption)
+    for made in done:
+        if made.measured:
+            _frame_part(page, comparison, made)
     return page
 
 
-def _cells(one: Agreement) -> tuple[str, ...]:
-    numbers = (f"{one.mean:.2g}", f"{one.rms:.2g}", f"{one.std:.2g}", f"{one.beyond:.1%}", f"{one.chi_square:.3g}")
-    return (str(one.nodes), *numbers, f"{one.freedom:.0f}", f"{one.probability:.2g}")
+def _frame_part(page: Page, comparison: Comparison, made: FrameComparison) -> None:
+    """Add what is shown of one frame."""
+    page.heading(f"Frame {made.frame} ({comparison.result.names[made.frame]})")
+    fit = made.fit
+    u, v, rotation = (f"{value:.2g} ± {std:.1g}" for value, std in zip(fit.rigid, fit.rigid_std, strict=True))
+    page.text(
+        f"Scale {fit.scale:.4f} ± {fit.scale_std:.2g}; what it leaves has a chi-square of {fit.chi_square:.3g}. Rigid "
+        f"motion, measured minus simulated{' (taken off)' if comparison.remove_rigid else ''}: {u} mm along x, {v} mm "
+        f"along y, {rotation} degrees."
+    )
+    rows = [(*key, *(f"{value:.3g}" for value in asdict(one).values())) for key, one in made.agreement.items()]
+    names = asdict(next(iter(made.agreement.values())))
+    page.table(["way", "quantity", *(name.replace("_", " ") for name in names)], rows)
+    page.picture(style.embedded(histogram_figure(made)), "ratios of difference to standard uncertainty")
+    for group in _GROUPS.values():
+        for way, ratio in (("levelled", False), ("levelled", True), ("nodes", True)):
+            caption = f"measured minus simulated, {_TITLES[way]}{', in standard uncertainties' if ratio else ''}"
+            page.picture(style.embedded(difference_figure(comparison, made, group, way, ratio=ratio)), caption)
 
 
 def _warnings(comparison: Comparison, done: Sequence[FrameComparison]) -> Iterator[str]:
-    if comparison.left_out:
-        beyond = f"{len(comparison.left_out)} frames from {comparison.left_out[0]}"
-        yield f"{beyond} on lie beyond the times of the simulation and are left out"
+    if beyond := comparison.left_out:
+        yield f"{len(beyond)} frames from {beyond[0]} on lie beyond the times of the simulation and are left out"
     for name in ("displacement", *QUANTITIES[2:]):
         odd = [made.frame for made in done if made.agreement["levelled", name].probability < _UNLIKELY]
         if odd:

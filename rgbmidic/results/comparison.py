@@ -19,10 +19,10 @@ import logging
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 from xml.etree import ElementTree
 
 import numpy as np
@@ -136,14 +136,13 @@ class Simulation:
                 raise InputError(f"{path} has numbers of nodes only: state the mesh that they belong to (--mesh FILE)")
             values, times = _read_table(path, mesh, unit)
         else:
-            states = list(_listed(path, interval))
-            meshes = [read_mesh(file, unit=unit) for _, file in states]
-            mesh = meshes[0]
-            for other in meshes[1:]:
+            clock, files = zip(*_listed(path, interval), strict=True)
+            mesh, *others = meshes = [read_mesh(file, unit=unit) for file in files]
+            for other in others:
                 if not np.array_equal(mesh.node_numbers, other.node_numbers):
                     raise InputError(f"{other.name} has other nodes than {mesh.name}: the states must have one mesh")
             values = np.stack([_displacement(one, field) for one in meshes])
-            times = None if states[0][0] is None else np.array([time for time, _ in states], dtype=np.float64)
+            times = None if None in clock else np.array(clock, dtype=np.float64)
         if times is not None and not (np.diff(times) > 0).all():
             raise InputError(f"the times of the simulation {path} must rise, not {times[:5].tolist()} ...")
         return cls(mesh=mesh, displacement=values, times=None if times is None else times + offset, name=str(path))
@@ -157,31 +156,31 @@ class Simulation:
         return np.asarray((1 - part) * self.displacement[after - 1] + part * self.displacement[after])
 
 
-def _listed(path: Path, interval: float | None) -> Iterator[tuple[float | None, Path]]:
-    """Yield time and file of every state; None for the time of a single file."""
+def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
+    """Return time and file of every state; None for the time of a single file."""
     if path.is_dir():
         indices = sorted(path.glob("*.pvd"))
         if len(indices) > 1:
             raise InputError(f"{path} holds {len(indices)} .pvd files: name one of them")
         if not indices:
-            yield from _numbered(path, interval)
-            return
+            return _numbered(path, interval)
         path = indices[0]
     if path.suffix.lower() != ".pvd":
-        yield None, path
-        return
+        return [(None, path)]
     try:
         sets = list(ElementTree.fromstring(regular(path).read_bytes()).iter("DataSet"))
-        states = [(float(one.attrib["timestep"]), path.parent / one.attrib["file"]) for one in sets]
+        states: list[tuple[float | None, Path]] = [
+            (float(one.attrib["timestep"]), path.parent / one.attrib["file"]) for one in sets
+        ]
     except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
         raise InputError(f"{path} is not a readable .pvd file: {error}") from None
     if not states:
         raise InputError(f"{path} names no file: a .pvd has a DataSet with timestep and file for each state")
-    yield from states
+    return states
 
 
-def _numbered(path: Path, interval: float | None) -> Iterator[tuple[float, Path]]:
-    """Yield the files of a folder by the last number in their names, times the `interval`."""
+def _numbered(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
+    """Return the files of a folder by the last number in their names, times the `interval`."""
     files = {file: re.findall(r"\d+", file.stem) for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")}
     if not files or not all(files.values()):
         raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
@@ -189,7 +188,7 @@ def _numbered(path: Path, interval: float | None) -> Iterator[tuple[float, Path]
         raise InputError(
             f"the times of the files in {path} are not known: state --interval, the time between two numbers (above 0)"
         )
-    yield from sorted((interval * int(numbers[-1]), file) for file, numbers in files.items())
+    return sorted((interval * int(numbers[-1]), file) for file, numbers in files.items())
 
 
 def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
@@ -223,20 +222,31 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
         except (ValueError, IndexError):
             raise InputError(f"row {number} of {path} is not numbers: {row}") from None
     table = np.array(rows, dtype=np.float64).reshape(-1, len(wanted))
-    index = {number: place for place, number in enumerate(mesh.node_numbers.tolist())}
-    places = [index.get(number, -1) for number in table[:, 0].tolist()]
-    known = np.array(places, dtype=np.int64) >= 0
+    if mesh.numbering.startswith("counted"):
+        logger.warning("%s: the nodes of %s are %s: those of the table must be, too", path, mesh.name, mesh.numbering)
+    places = _places(mesh.node_numbers, table[:, 0])
+    known = places >= 0
     if not known.any():
         raise InputError(f"{path} has no row for a node of {mesh.name}")
     if not known.all():
         logger.warning("%s: %d rows name nodes that %s does not have", path, int((~known).sum()), mesh.name)
-        table, places = table[known], np.array(places)[known].tolist()
+        table, places = table[known], places[known]
     times = table[:, 3] * _TIMES[clock.lower()] if clock else np.zeros(len(table))
     steps, state = np.unique(times, return_inverse=True)
+    cells, count = np.unique(state * len(mesh.points) + places, return_counts=True)
+    if (count > 1).any():
+        node = mesh.node_numbers[cells[count.argmax()] % len(mesh.points)]
+        raise InputError(f"{path} has two rows or more for node {node} at one time: several states need a time_s")
     values = np.full((len(steps), len(mesh.points), 2), np.nan)
     factors = [LENGTH_UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
     values[state, places] = table[:, 1:3] * factors
     return values, steps if clock else None
+
+
+def _places(numbers: npt.NDArray[np.int64], wanted: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Place of each wanted label among some numbers; -1 where it is none of them."""
+    index = {number: place for place, number in enumerate(numbers.tolist())}
+    return np.array([index.get(number, -1) for number in wanted.tolist()], dtype=np.int64)
 
 
 class Levelling:
@@ -307,30 +317,30 @@ class Agreement:
 
     Attributes
     ----------
-    nodes
-        Number n of values: nodes with data, of the displacement those of u and v.
+    values
+        Their number n: nodes with data, of the displacement those of u and v.
     mean, rms
         Of the differences, measured minus simulated.
     std
         Median standard uncertainty.
-    beyond
+    beyond_2
         Fraction of the differences above two standard uncertainties; .046 is ordinary.
     chi_square
         Per degree of freedom: 1 is expected where the simulation is right.
-    freedom
-        Degrees of freedom.
+    degrees_of_freedom
+        Of chi-square.
     probability
         Of a larger chi-square where the simulation is right.
     """
 
-    nodes: int
-    mean: float
-    rms: float
-    std: float
-    beyond: float
-    chi_square: float
-    freedom: float
-    probability: float
+    values: int
+    mean: float = math.nan
+    rms: float = math.nan
+    std: float = math.nan
+    beyond_2: float = math.nan
+    chi_square: float = math.nan
+    degrees_of_freedom: float = math.nan
+    probability: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -355,14 +365,14 @@ class Fit:
         the scale.
     """
 
-    scale: float
-    scale_std: float
-    rigid: FloatArray
-    rigid_std: FloatArray
-    chi_square: float
     template: FloatArray
-    projection: float
-    information: float
+    scale: float = math.nan
+    scale_std: float = math.nan
+    rigid: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
+    rigid_std: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
+    chi_square: float = math.nan
+    projection: float = 0.0
+    information: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -457,13 +467,8 @@ class Comparison:
         self.simulated_mesh = Tri3Mesh(nodes=simulation.mesh.points, elements=simulation.mesh.elements)
         self.levelling = Levelling(self.mesh, self.simulated_mesh)
         self.covariance = NodalCovariance.from_mesh(self.mesh)
-        units = rectification_of(result, scale).units
-        exact, std = (
-            (units.mm_per_pixel, units.mm_per_pixel_std)
-            if placement.camera is not None
-            else (placement.mm_per_pixel, placement.mm_per_pixel_std)
-        )
-        self.relative_std = std / exact if exact else 0.0
+        units = placement if placement.camera is None else rectification_of(result, scale).units
+        self.relative_std = units.mm_per_pixel_std / units.mm_per_pixel if units.mm_per_pixel else 0.0
         image = Tri3Mesh(nodes=result.nodes, elements=result.elements)
         self._blocks = image.areas.sum() / max(BLOCK, OF_ELEMENT * image.size) ** 2
 
@@ -539,44 +544,32 @@ class Comparison:
         known = np.isfinite(measured + noise + levelled).all(axis=0) & (noise > 0).all(axis=0)
         if known.sum() < 3:
             logger.warning("frame %d has data at %d nodes that the simulation covers: too few", index, known.sum())
-            fit = Fit(
-                scale=math.nan,
-                scale_std=math.nan,
-                rigid=np.full(3, math.nan),
-                rigid_std=np.full(3, math.nan),
-                chi_square=math.nan,
-                template=np.zeros(measured.shape),
-                projection=0.0,
-                information=0.0,
-            )
-            return fit, np.full(measured.shape, math.nan), 0.0
+            return Fit(template=np.zeros(measured.shape)), np.full(measured.shape, math.nan), 0.0
         x, y = self.mesh.nodes.T - self.mesh.nodes[known].mean(axis=0)[:, None]
         motions = np.array([[np.ones_like(x), 0 * x], [0 * x, np.ones_like(x)], [-y, x]])
-        weighted = np.where(known, motions / np.where(known, noise, 1), 0)
-        ratios, template = (np.where(known, part / np.where(known, noise, 1), 0) for part in (measured, levelled))
+        weighted, ratios, template = (
+            np.where(known, part / np.where(known, noise, 1), 0) for part in (motions, measured, levelled)
+        )
         flat = weighted.reshape(3, -1)
         inverse = np.linalg.inv(flat @ flat.T)
         found, simulated = (inverse @ flat @ part.ravel() for part in (ratios, template))
-        spread = sum(weighted[:, axis] @ self.covariance.correlation @ weighted[:, axis].T for axis in range(2))
-        left, template = (
-            part - np.tensordot(motion, weighted, 1) for part, motion in ((ratios, found), (template, simulated))
-        )
-        information, projection = float((template**2).sum()), float((template * left).sum())
+        spread = sum(part @ self.covariance.correlation @ part.T for part in weighted.transpose(1, 0, 2))
+        rest, template = ratios - np.tensordot(found, weighted, 1), template - np.tensordot(simulated, weighted, 1)
+        information, projection = float((template**2).sum()), float((template * rest).sum())
         rigid, taken = found - simulated, float(np.trace(inverse @ spread))
         std = np.sqrt(np.diag(inverse @ spread @ inverse))
-        scale = scale_std = math.nan
-        energy, rest = self._energy(template), left
+        scale, scale_std, by_scale = math.nan, math.nan, 0.0
         if information > _RIGID * 2 * known.sum():
-            scale = projection / information
+            scale, energy = projection / information, self._energy(template)
             scale_std = math.hypot(math.sqrt(energy) / information, scale * self.relative_std)
-            rest, energy = left - scale * template, energy / information
+            rest, by_scale = rest - scale * template, energy / information
         unit = np.array([1, 1, 180 / np.pi])
         fit = Fit(
             scale=scale,
             scale_std=scale_std,
             rigid=rigid * unit,
             rigid_std=std * unit,
-            chi_square=float((rest**2).sum() / (2 * known.sum() - taken - energy * np.isfinite(scale))),
+            chi_square=float((rest**2).sum() / (2 * known.sum() - taken - by_scale)),
             template=template,
             projection=projection,
             information=information,
@@ -592,8 +585,7 @@ class Comparison:
         points, numbers = self.simulation.mesh.points, self.result.node_number
         own = np.arange(len(points)) if len(points) == len(self.mesh.nodes) else np.full(len(points), -1)
         if numbers is not None:
-            index = {number: place for place, number in enumerate(numbers.tolist())}
-            own = np.array([index.get(number, -1) for number in self.simulation.mesh.node_numbers.tolist()])
+            own = _places(numbers, self.simulation.mesh.node_numbers)
         away = np.abs(self.mesh.nodes[own] - points).max(axis=1)
         own = np.where(away < _SAME * self.mesh.size, own, -1)
         return own if len(np.unique(own[own >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
@@ -656,8 +648,7 @@ class Comparison:
         known = np.isfinite(difference) & (std > 0)
         count, scale = int(known.sum()), np.where(known, std, 1)
         if not count:
-            blank = dict.fromkeys(("mean", "rms", "std", "beyond", "chi_square", "freedom", "probability"), math.nan)
-            return Agreement(nodes=0, **blank)
+            return Agreement(values=0)
         ratio, noise, shared = (np.where(known, part / scale, 0) for part in (difference, own, common))
         square = float((shared**2).sum()) ** 2
         for row, s, b in zip(rows, noise, shared, strict=True):
@@ -665,13 +656,13 @@ class Comparison:
             square += float(s**2 @ squares @ s**2 + 2 * (b * s) @ correlation @ (b * s))
         chi_square, freedom = float((ratio**2).sum() / (count - taken)), count**2 / square
         return Agreement(
-            nodes=count,
+            values=count,
             mean=float(difference[known].mean()),
             rms=float(np.sqrt(np.mean(difference[known] ** 2))),
             std=float(np.median(std[known])),
-            beyond=float(np.mean(np.abs(ratio[known]) > 2)),
+            beyond_2=float(np.mean(np.abs(ratio[known]) > 2)),
             chi_square=chi_square,
-            freedom=freedom,
+            degrees_of_freedom=freedom,
             probability=float(fisher.sf(chi_square, freedom, len(rows) * self._blocks)),
         )
 
@@ -694,6 +685,7 @@ def measured_mesh(result: Result) -> FiniteElementMesh | None:
         node_numbers=result.node_number,
         elements=result.elements,
         element_numbers=result.element_number,
+        numbering=kept["numbering"],
     )
 
 
@@ -714,25 +706,19 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
     InputError
         No points are known, or they place no mesh.
     """
-    placed = placement_of(result)
-    if not pairs and placed is None:
+    known, where = pairs, "--points"
+    if not known and (placed := placement_of(result)) is not None:
+        known, where = placed.pairs.tolist(), "mesh.points"
+    if not known:
         raise InputError(
             f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
             "--points X_MM,Y_MM:X_PX,Y_PX each"
         )
-    camera, stated = rectification_of(result, scale).camera, scale or scale_of(result)
-    if not pairs:
-        assert placed is not None
-        return Placement.fit(placed.pairs, camera)
-    found = Placement.fit(pairs, camera, where="--points")
-    if found.mm_per_pixel is not None and stated.mm_per_pixel is not None:
-        away = found.mm_per_pixel / stated.mm_per_pixel - 1
-        if abs(away) > _DIFFERENT:
-            logger.warning(
-                "--points state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken",
-                found.mm_per_pixel,
-                stated.mm_per_pixel,
-            )
+    found = Placement.fit(known, rectification_of(result, scale).camera, where=where)
+    stated = (scale or scale_of(result)).mm_per_pixel
+    if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > _DIFFERENT:
+        text = "%s state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken"
+        logger.warning(text, where, found.mm_per_pixel, stated)
     return found
 
 
@@ -752,15 +738,17 @@ def _matched(
     clock = result.number.astype(np.float64) if times is None else times
     if simulation.times is None:
         return clock, tuple(frames if asked is not None else frames[-1:]), ()
+    if times is None:
+        logger.warning("the frames of %s have no times: their numbers count as the simulation's times", result.path)
     first, last = simulation.times[[0, -1]]
     slack = _SAME * max(abs(first), abs(last))
     within = [index for index in frames if first - slack <= clock[index] <= last + slack]
     beyond = tuple(index for index in frames if index not in within)
     if not within or (asked is not None and beyond):
         unit = "s" if times is not None else "frames (their times are not known)"
-        which = f"frame {beyond[0]} is at {clock[beyond[0]]:.9g}" if within else (
-            f"the frames of {result.path} are at {min(clock[frames]):.9g} to {max(clock[frames]):.9g}"
-        )  # fmt: skip
+        which = f"the frames of {result.path} are at {min(clock[frames]):.9g} to {max(clock[frames]):.9g}"
+        if within:
+            which = f"frame {beyond[0]} is at {clock[beyond[0]]:.9g}"
         raise InputError(
             f"{which} {unit}, the simulation {simulation.name} spans {first:.9g} to {last:.9g}: state the "
             "--offset between both clocks, or other --frames"

@@ -106,7 +106,7 @@ INP = """*Heading
 """
 
 
-def test_abaqus_labels_blocks_and_continued_lines(tmp_path: Path) -> None:
+def test_abaqus_labels_blocks_and_continued_lines(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "a.inp"
     path.write_text(INP)
     mesh = read_mesh(path)
@@ -118,6 +118,13 @@ def test_abaqus_labels_blocks_and_continued_lines(tmp_path: Path) -> None:
     assert len(read_mesh(path, part="BOTH").elements) == 3
     with pytest.raises(InputError, match='no set "right" of elements; it has LEFT, both'):
         read_mesh(path, part="right")
+    assert not caplog.text
+    moved = (
+        "*Instance, name=Plate-1, part=Plate\n5., 0., 0.\n*End Instance\n*Elset, elset=right, instance=Plate-1\n77\n"
+    )
+    path.write_text(INP.replace("*End Assembly", moved + "*End Assembly"))
+    assert read_mesh(path, part="right").element_numbers.tolist() == [77]
+    assert "translation of an *INSTANCE is not applied" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -187,6 +194,9 @@ def test_gmsh_text_of_version_4_keeps_tags_and_groups(tmp_path: Path) -> None:
     assert mesh.node_numbers.tolist() == [3, 4, 9, 90, 50]
     assert mesh.element_numbers.tolist() == [8, 12, 30]
     assert read_mesh(path, part="specimen").element_numbers.tolist() == [8, 12]
+    path.write_text(GMSH4.partition("12 3 9 90")[0])
+    with pytest.raises(InputError, match="is not a readable mesh: it ends early"):
+        read_mesh(path)
 
 
 def test_nastran_labels(tmp_path: Path) -> None:
@@ -297,16 +307,6 @@ def test_a_placement_finds_shift_turn_scale_and_the_side_it_is_seen_from(number:
     assert again.to_px(MM) == pytest.approx(placement.to_px(MM))
 
 
-def test_the_axes_turn_a_strain_into_the_mesh_s() -> None:
-    placement = Placement.fit(pairs(5))
-    gradient = np.array([[0.01, 0.004], [-0.002, 0.003]])  # in the mesh's axes
-    places = imaged(MM)
-    moved = imaged(MM + MM @ gradient.T) - places
-    on_image_ = np.linalg.lstsq(np.c_[places, np.ones(5)], moved, rcond=None)[0][:2].T
-    q = placement.axes
-    assert q @ on_image_ @ q.T == pytest.approx(gradient)
-
-
 def test_points_on_a_line_leave_a_doubt_that_is_told(caplog: pytest.LogCaptureFixture) -> None:
     line = np.array([[0.0, 0.0], [10.0, 0.0], [30.0, 0.0]])
     placement = Placement.fit(np.hstack([line, imaged(line)]))
@@ -365,6 +365,14 @@ def test_a_camera_gives_lens_and_tilt_and_the_pairs_a_rigid_motion() -> None:
     inside = placement.to_px(MM * 0.3)
     steps = [(placement.to_mm(inside + step) - placement.to_mm(inside - step)) / 2e-3 for step in 1e-3 * np.eye(2)]
     assert placement.jacobian(inside) == pytest.approx(np.stack(steps, axis=2), rel=1e-5, abs=1e-9)
+
+
+def test_pairs_near_each_other_are_not_refused_for_the_one_that_is_far() -> None:
+    homography = np.array([[0.1, 0, 30], [0, 0.1, 20], [0, 0, 1]])
+    camera = CameraCalibration(shape=(480, 640), lens=[3000, 320, 240, 0, 0, 0, 0, 0], homography=homography)
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [30.0, 20.0]])
+    image = camera.to_px(points * [1, -1] + [40, 60]) + np.array([[0, 0], [1, 0], [0, 0]])
+    assert Placement.fit(np.hstack([points, image]), camera).rms < 1
 
 
 def plate() -> FiniteElementMesh:

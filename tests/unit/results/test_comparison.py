@@ -43,14 +43,14 @@ def stretch(mesh: Tri3Mesh = MESH, strain: float = 0.01, bend: float = 0.05) -> 
     return np.stack([-0.3 * strain * x, strain * (y + bend * y**2)], axis=1)
 
 
-def measured(path: Path, displacement: np.ndarray, std: float = STD, **options: object) -> Result:
+def measured(path: Path, displacement: np.ndarray, std: float = STD, timed: bool = True, **options: object) -> Result:
     """A result of displacements (T, N, 2) in mm along the mesh's axes, each frame against the one reference."""
 
     def record(index: int) -> FrameRecord:
         u, v = PLACEMENT.vectors_to_px(PLACEMENT.to_mm(MESH.nodes), displacement[index]).T
         stated = {"u_std": np.full(NODES, std), "v_std": np.full(NODES, std)}
-        time = 1_000_000 * index
-        return FrameRecord.of(nodes=NODES, lights=3, number=index, time_ns=time, status=0, u=u, v=v, **stated)
+        stated |= {"time_ns": 1_000_000 * index} if timed else {}
+        return FrameRecord.of(nodes=NODES, lights=3, number=index, status=0, u=u, v=v, **stated)
 
     mesh = {"nodes": MESH.nodes, "elements": MESH.elements, "references": []}
     return make_result(path, frames=len(displacement), record=record, **{**mesh, **options})
@@ -74,8 +74,8 @@ def test_chi_square_is_1_and_scatters_as_its_degrees_of_freedom_state(tmp_path, 
         agreements = [made.agreement["levelled", name] for made in frames]
         squares = np.array([one.chi_square for one in agreements])
         assert abs(squares.mean() - 1) < 0.1, name
-        assert 0.6 < squares.var() * agreements[0].freedom / 2 < 1.6, name
-        assert np.mean([one.beyond for one in agreements]) == pytest.approx(0.0455, abs=0.015)
+        assert 0.6 < squares.var() * agreements[0].degrees_of_freedom / 2 < 1.6, name
+        assert np.mean([one.beyond_2 for one in agreements]) == pytest.approx(0.0455, abs=0.015)
     assert np.isnan(frames[0].fit.scale)  # nothing has moved
 
 
@@ -111,7 +111,7 @@ def test_the_uncertain_scale_of_the_image_counts_as_one_factor(tmp_path):
     frames = list(comparison.each())
     agreements = [made.agreement["nodes", "displacement"] for made in frames]
     assert np.mean([one.chi_square for one in agreements]) == pytest.approx(1, abs=0.5)
-    assert agreements[0].freedom < 1.5  # all differences are the same factor
+    assert agreements[0].degrees_of_freedom < 1.5  # all differences are the same factor
     assert [made.fit.scale_std for made in frames] == pytest.approx([relative] * 60, rel=0.05)
 
 
@@ -173,11 +173,11 @@ def test_nodes_without_data_are_left_out_and_so_is_their_strain(tmp_path):
     frames = np.stack([field, np.full(field.shape, np.nan)]) + noise(2)
     made, blank = compared(measured(tmp_path / "r", frames), stretch()).each()
     assert np.isnan(blank.fit.scale)
-    assert blank.agreement["levelled", "displacement"].nodes == 0
+    assert blank.agreement["levelled", "displacement"].values == 0
     assert np.flatnonzero(np.isnan(made.ratio("levelled", "u"))).tolist() == [7]
     around = MESH.beside(np.arange(NODES) == 7)
     assert np.isnan(made.ratio("nodes", "eyy")).tolist() == around.tolist()
-    assert made.agreement["nodes", "displacement"].nodes == 2 * (NODES - 1)
+    assert made.agreement["nodes", "displacement"].values == 2 * (NODES - 1)
 
 
 def write_state(path: Path, displacement: np.ndarray, mesh: FiniteElementMesh | None = None) -> None:
@@ -217,6 +217,22 @@ def test_a_simulation_is_read_with_its_times_and_interpolated(states, name):
     assert read.mesh.node_numbers.tolist() == finite_elements().node_numbers.tolist()
 
 
+def test_what_may_be_meant_otherwise_is_stated(tmp_path, states, caplog):
+    table = states.parent / "table.csv"
+    mesh = finite_elements()
+    meshio.Mesh(np.c_[mesh.points, 0 * mesh.points[:, :1]], [("triangle", mesh.elements)]).write(tmp_path / "plain.vtu")
+    counted = tmp_path / "counted.csv"
+    counted.write_text("node,u,v\n0,1,1\n1,2,2\n")
+    Simulation.read(counted, mesh=read_mesh(tmp_path / "plain.vtu"))
+    assert "are counted from 0 in the order of the file" in caplog.text
+    table.write_text(table.read_text().replace("node,time_ms,", "node,step,"))
+    with pytest.raises(InputError, match=r"two rows or more for node 100 at one time: several states need a time_s"):
+        Simulation.read(table, mesh=mesh)
+    result = measured(tmp_path / "r", np.arange(3)[:, None, None] * stretch(), timed=False)
+    Comparison(result, Simulation.read(states.parent / "all.pvd"), PLACEMENT)
+    assert "have no times: their numbers count as the simulation's times" in caplog.text
+
+
 def test_frames_beyond_the_times_of_the_simulation_are_left_out_and_those_asked_for_refused(tmp_path, states):
     result = measured(tmp_path / "r", np.arange(7)[:, None, None] * stretch() + noise(7))
     simulation = Simulation.read(states.parent / "all.pvd", offset=1e-3)
@@ -252,9 +268,11 @@ def test_the_command_writes_what_it_found_with_the_simulation_s_numbers(tmp_path
     assert written.fields["displacement_ratio_levelled"][:, 1] == pytest.approx(made.ratio("levelled", "v"))
     again = Simulation.read(out / "comparison.pvd")  # the measurement, as a simulation's boundary conditions
     assert again.displacement[0][:, 1] == pytest.approx(made.measured["v"])
-    rows = (out / "nodes.csv").read_text().splitlines()
-    assert len(rows) == 1 + NODES
-    assert [float(part) for part in rows[1].split(",")[:6]] == pytest.approx([3, 3, 3e-3, 100, 0, 8])
+    head, row, *_ = (out / "comparison.csv").read_text().splitlines()
+    assert head.startswith("frame,number,time_s,way,quantity,unit,values,mean,rms,std,beyond_2,chi_square,")
+    one = made.agreement["nodes", "displacement"]
+    assert row.startswith(f"3,3,0.003,nodes,displacement,mm,{one.values},{one.mean:.9g}")
+    assert (out / "scale.csv").read_text().splitlines()[1].startswith(f"3,3,0.003,{made.fit.scale:.9g},")
     assert execute(cli.app, command) == 2
     assert "is already there" in capsys.readouterr().err
 
