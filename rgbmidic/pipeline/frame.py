@@ -144,13 +144,13 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
-        weights, ready = plan.frame_weights(images, index), correlated(images, settings.illumination)
-        deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter, origin=window.origin)
+        weights, ready = plan.frame_weights(images, index), correlated(images, plan.illumination)
+        deformed = Deformed.prepare(ready, weights, prefilter=plan.solver.prefilter, origin=window.origin)
         step = -(-max(plan.window.shape) // _THUMBNAIL)
         thumbnail = _in_bytes(weights[:, *here][:, ::step, ::step])
         del weights, ready  # a tenth of what a frame needs
     method = precision_method(plan.weights, settings.weights.method)
-    solution = reference_update.track(deformed, start, settings.solver, method)
+    solution = reference_update.track(deformed, start, plan.solver, method)
     if solution.status is not Status.CONVERGED:
         there = state
         if not isinstance(state, IlluminationImages):
@@ -213,7 +213,7 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
     """
     window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
     images = plan.lights(read_state(plan, index, window)[0], window)
-    ready = correlated(images, plan.settings.illumination)
+    ready = correlated(images, plan.illumination)
     return before.updated(solution, ready, plan.frame_weights(images, index), window.origin)
 
 

@@ -15,6 +15,7 @@ from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.separation import beside_cracks
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import Statistics
@@ -55,7 +56,8 @@ def correlate(
     deformed_weights
         Like `weights`, on the deformed images.
     normalise
-        Standard deviation in px of the local mean by which every image is divided first; None leaves grey levels.
+        Standard deviation in px of the local mean by which every image is divided first, wider where there are cracks
+        (see `IlluminationSettings`); None leaves grey levels.
     statistics
         Weight the lights by what the residual around each pixel shows (`rgbmidic.weights.Statistics`), by a method of
         one's own, or, if False, by `weights` alone.
@@ -85,7 +87,8 @@ def correlate(
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
     solver = solver_settings(options)
     if normalise is not None:
-        f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
+        sigma, solver = beside_cracks(mesh, normalise, solver)
+        f, g = (divide_by_local_mean(stack, sigma, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
     given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
     second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
     first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)
