@@ -25,6 +25,7 @@ __all__ = [
     "BAYER_PATTERNS",
     "ELEMENT_SIZE",
     "LENGTH_UNITS",
+    "WIDER_AT_CRACKS",
     "ChannelSettings",
     "FrameKind",
     "FrameSettings",
@@ -181,6 +182,12 @@ class FrameSettings(_Checked):
         )
 
 
+WIDER_AT_CRACKS = 3.0
+"""Width of the local mean where a mesh has cracks, over `IlluminationSettings.normalise`: a gap changes so wide a mean
+nearly alike all over an element, and the gain of the means takes that out. With 5 the gap is followed no better and a
+slope of the brightness worse (rendered cracks open by up to 5 px)."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IlluminationSettings(_Checked):
     """How the frame becomes one image per light (``[illumination]``).
@@ -192,7 +199,8 @@ class IlluminationSettings(_Checked):
         Malvar's for frames too small for it.
     normalise
         Standard deviation in px of the local mean by which each light's image is divided before the solve; 0 leaves
-        the grey levels as they are.
+        the grey levels as they are. Where the mesh has cracks it is three times as wide, and ``solver.brightness``,
+        which is then ``"mean"`` unless it is ``"local"``, does the rest.
     """
 
     section = "illumination"
@@ -311,7 +319,8 @@ class SolverSettings(_Checked):
         Rigid functions per light after the first: ``"none"``, ``"translation"`` or ``"translation+rotation"``.
     brightness
         Grey-level correction: ``"global"``, a gain and offset per light; ``"local"``, both as linear shape functions on
-        the mesh.
+        the mesh; ``"mean"``, a gain as linear shape functions, from the mean grey levels around the nodes, each on its
+        side of a crack.
     fill
         Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
         flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
@@ -325,7 +334,7 @@ class SolverSettings(_Checked):
 
     prefilter: Literal["none", "binomial", "gaussian"] = "binomial"
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
-    brightness: Literal["none", "global", "local"] = "none"
+    brightness: Literal["none", "global", "local", "mean"] = "none"
     fill: float = bounded(0.0, at_least=0)
     tolerance: float = bounded(1e-3, above=0)
     max_iterations: int = bounded(50, at_least=1)

@@ -199,7 +199,7 @@ _SMOOTHNESS = 1e-3
 with half or twice of it lights differ by 4e-4 px at most (benchmarks/constants.py)."""
 
 
-def corrected_values(residual: Residual, kind: Literal["none", "global", "local"]) -> FloatImage:
+def corrected_values(residual: Residual, kind: Literal["none", "global", "local", "mean"]) -> FloatImage:
     """Bring the reference to the brightness and contrast of the deformed images (paper, section 2.2).
 
     f is taken as ``a g + b``; what is returned is ``(f - b) / a`` of the uncorrected reference.
@@ -210,7 +210,8 @@ def corrected_values(residual: Residual, kind: Literal["none", "global", "local"
         At the displacement so far.
     kind
         ``"global"``: one gain and offset per light. ``"local"``: gain and offset as linear shape functions on the mesh.
-        ``"none"``: the reference itself.
+        ``"mean"``: a gain as linear shape functions, that of the mean grey levels in the elements around each node,
+        which are all on its side of a crack. ``"none"``: the reference itself.
 
     Returns
     -------
@@ -220,6 +221,9 @@ def corrected_values(residual: Residual, kind: Literal["none", "global", "local"
     reference = residual.reference
     if kind == "none":
         return reference.values
+    if kind == "mean":
+        sums = zip(reference.values, residual.weights, residual.moments[..., 2], strict=True)
+        return np.stack([_gain_of_means(reference, *light) for light in sums])
     lights = zip(reference.values, residual.warped, residual.weights, strict=True)
     if kind == "global":
         return np.stack([_one_gain(f, g, weight.astype(np.float64)) for f, g, weight in lights])
@@ -236,6 +240,16 @@ def _one_gain(f: FloatImage, g: FloatImage, weight: FloatArray) -> FloatImage:
     spread_f, spread_g = (float((weight * (i - m) ** 2).sum()) for i, m in ((f, mean_f), (g, mean_g)))
     gain = np.sqrt(spread_f / spread_g) if spread_f > 0 and spread_g > 0 else 1.0
     return np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32)
+
+
+def _gain_of_means(reference: Reference, f: FloatImage, weight: FloatImage, sum_g: FloatArray) -> FloatImage:
+    """Correct f (P,) by the ratio of the weighted sums around each node, of which `sum_g` (E,) is that of g."""
+    mesh = reference.mesh
+    around_f, around_g = mesh.to_nodes(reference.sums(weight[None], f)[0, :, 1]), mesh.to_nodes(sum_g)
+    ratio = np.divide(around_g, around_f, out=np.ones_like(around_f), where=(around_f > 0) & (around_g > 0))
+    fields = np.empty((2, f.size), dtype=np.float32)
+    interpolate_nodal(np.stack([ratio, ratio], axis=1), mesh.elements, *reference.pixels.positions, fields)
+    return np.asarray(f * np.maximum(fields[0], np.float32(_LEAST_GAIN)))
 
 
 def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: FloatImage) -> FloatImage:

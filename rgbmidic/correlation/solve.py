@@ -53,7 +53,7 @@ __all__ = [
 FIRST_PASS = 0.01
 """Increment (px) at which the first pass hands over to the pass with weights warped anew. At .05 an iteration
 less is needed, but from another start the result differs by up to 2.3e-4 px."""
-_REFINED = {"none": 1, "global": 1, "local": 4}
+_REFINED = {"none": 1, "global": 1, "local": 4, "mean": 2}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _STARTED = 0.25
 """Correlation coefficient at the initial guess under which an element waits until its neighbours have brought it
@@ -143,10 +143,10 @@ class Weighting:
 @stage("weights")
 def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
     """Return the weighting of the first pass, at the initial guess."""
-    residual = compare(problem, problem.reference.values, estimate)
+    residual, kind = compare(problem, problem.reference.values, estimate), problem.options.brightness
     return Weighting(
         residual=residual,
-        values=corrected_values(residual, "none" if problem.options.brightness == "none" else "global"),
+        values=corrected_values(residual, "global" if kind == "local" else kind),
         matched=_matched(problem, residual, estimate, least=_STARTED),
         learnt_at=estimate.displacement,
     )

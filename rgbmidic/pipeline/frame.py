@@ -28,7 +28,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import Plan, exposure_fault, too_small
-from rgbmidic.pipeline.source import RawState, correlated
+from rgbmidic.pipeline.source import RawState, beside_cracks, correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names
 from rgbmidic.timing import stage, timed
@@ -159,13 +159,13 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
-        weights, ready = plan.frame_weights(images, index), correlated(images, settings.illumination)
-        deformed = Deformed.prepare(ready, weights, prefilter=settings.solver.prefilter, origin=window.origin)
+        weights, ready = plan.frame_weights(images, index), correlated(images, plan.illumination)
+        deformed = Deformed.prepare(ready, weights, prefilter=plan.solver.prefilter, origin=window.origin)
         step = -(-max(plan.window.shape) // _THUMBNAIL)
         thumbnail = _in_bytes(weights[:, *here][:, ::step, ::step])
         del weights, ready  # a tenth of what a frame needs
     method = precision_method(plan.weights, settings.weights.method)
-    solution = reference_update.track(deformed, start, settings.solver, method)
+    solution = reference_update.track(deformed, start, plan.solver, method)
     if solution.status is not Status.CONVERGED:
         there = state
         if not isinstance(state, IlluminationImages):
@@ -228,7 +228,7 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
     """
     window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
     images = plan.lights(read_state(plan, index, window)[0], window)
-    ready = correlated(images, plan.settings.illumination)
+    ready = correlated(images, plan.illumination)
     return before.updated(solution, ready, plan.frame_weights(images, index), window.origin)
 
 
@@ -302,7 +302,8 @@ def correlate(
     deformed_weights
         Like `weights`, on the deformed images.
     normalise
-        Standard deviation in px of the local mean by which every image is divided first; None leaves grey levels.
+        Standard deviation in px of the local mean by which every image is divided first, wider where there are cracks
+        (see `IlluminationSettings`); None leaves grey levels.
     statistics
         Weight the lights by what the residual around each pixel shows (`rgbmidic.weights.Statistics`), by a method of
         one's own, or, if False, by `weights` alone.
@@ -332,7 +333,8 @@ def correlate(
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
     solver = solver_settings(options)
     if normalise is not None:
-        f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
+        sigma, solver = beside_cracks(mesh, normalise, solver)
+        f, g = (divide_by_local_mean(stack, sigma, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
     given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
     second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
     first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, combinations
 from threading import Lock
 
@@ -38,12 +38,13 @@ from rgbmidic.pipeline.source import (
     Separation,
     Series,
     WindowedSeparation,
+    beside_cracks,
     correlated,
     light_images,
     open_sequence,
     reference_images,
 )
-from rgbmidic.settings import RegionSettings, TestSettings
+from rgbmidic.settings import WIDER_AT_CRACKS, IlluminationSettings, RegionSettings, SolverSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, prepare_weights
 
@@ -105,6 +106,8 @@ class Plan:
     ----------
     settings
         What TEST.toml says.
+    illumination, solver
+        Of these, what holds for the mesh (`beside_cracks`).
     series
         The frames.
     separation
@@ -132,6 +135,8 @@ class Plan:
     """
 
     settings: TestSettings
+    illumination: IlluminationSettings
+    solver: SolverSettings
     series: Series
     separation: LightSeparation
     region: Region
@@ -202,6 +207,8 @@ class Plan:
         size = settings.side if mesh is None else mesh.size
         if mesh is None:
             mesh = Tri3Mesh.from_region(region, size, [np.subtract(path, window.origin) for path in settings.cracks])
+        sigma, solver = beside_cracks(mesh, settings.illumination.normalise, settings.solver)
+        illumination = replace(settings.illumination, normalise=sigma)
         weights = weights or prepare_weights(
             settings,
             rest.images,
@@ -211,11 +218,11 @@ class Plan:
             images_of=lambda index: light_images(rest.separation, series.read(index, window), window),
         )
         reference = Reference.prepare(
-            correlated(rest.images, settings.illumination),
+            correlated(rest.images, illumination),
             region,
             as_weights(weights.reference(rest.images), rest.images.values.shape, "weights of the reference"),
             mesh=mesh,
-            prefilter=settings.solver.prefilter,
+            prefilter=solver.prefilter,
             origin=window.origin,
             registration=rest.images.registration,
         )
@@ -227,6 +234,8 @@ class Plan:
         rest.check_seen(reference, region)
         return cls(
             settings=settings,
+            illumination=illumination,
+            solver=solver,
             series=series,
             separation=rest.separation,
             region=region,
@@ -418,7 +427,8 @@ def _region_and_window(settings: TestSettings, region: Region | None, frame: tup
 
 def _window(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
     """What lies within `reach` of points (N, 2), and what its images depend on."""
-    widths = settings.illumination.normalise, settings.weights.blur
+    split = settings.cracks or settings.mesh_file is not None
+    widths = settings.illumination.normalise * (WIDER_AT_CRACKS if split else 1.0), settings.weights.blur
     return Window.around(points, reach + max(_REACH, 3 * max(widths)), frame)
 
 

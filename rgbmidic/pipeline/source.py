@@ -26,7 +26,8 @@ from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linear import LinearChannels, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.settings import FrameSettings, IlluminationSettings
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.settings import WIDER_AT_CRACKS, FrameSettings, IlluminationSettings, SolverSettings
 from rgbmidic.typing import AnyArray, FloatImage
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "Series",
     "SourceSeries",
     "WindowedSeparation",
+    "beside_cracks",
     "correlated",
     "describe",
     "light_images",
@@ -465,6 +467,17 @@ def reference_images(
             raise FrameError(f"the reference frames have different shapes: {total.shape}, {images.values.shape}")
         total, valid, count = total + images.values, valid & images.valid, count + 1
     return replace(mean, values=(total / count).astype(np.float32), valid=valid), separation
+
+
+def beside_cracks(mesh: Tri3Mesh, sigma: float, solver: SolverSettings) -> tuple[float, SolverSettings]:
+    """Width (px) of the local mean and settings of the solve that hold for a mesh: others where it has cracks.
+
+    A local mean takes in the gap of an open crack, and the other side, which may be lit otherwise. So it is made wider,
+    and means over the elements around each node, on one side and without the gap, do the rest.
+    """
+    if not sigma or not len(mesh.crack_edges):
+        return sigma, solver
+    return WIDER_AT_CRACKS * sigma, solver if solver.brightness == "local" else replace(solver, brightness="mean")
 
 
 def correlated(images: IlluminationImages, settings: IlluminationSettings) -> FloatImage:

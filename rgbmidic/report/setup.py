@@ -13,7 +13,7 @@ import numpy as np
 
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import QUANTITIES, Result, speckle_diameter
-from rgbmidic.settings import SetupSettings
+from rgbmidic.settings import WIDER_AT_CRACKS, SetupSettings
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -80,7 +80,11 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
     separation = f"demosaicing `{demosaic}`, crosstalk unmixed by calibration"
     separated = len(result.lights) > 1 and demosaic is not None
     strain = "plane fitted to the displacements of the nodes in a virtual strain gauge"
-    levels = f"divided by their local mean, σ = {normalise:g} px" if normalise else "as they are"
+    correction, levels = set_("solver", "brightness"), "as they are"
+    if normalise:
+        cracked = len(mesh.crack_edges) > 0
+        levels = f"divided by their local mean, σ = {normalise * (WIDER_AT_CRACKS if cracked else 1):g} px"
+        correction = "mean" if cracked and correction != "local" else correction
     side = physical.in_units(mesh.size if size is None else size)
     rows = (
         ("software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"),
@@ -93,7 +97,7 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         ("shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"),
         ("matching criterion", "weighted sum of squared differences over all lights at once"),
         ("interpolant", "cubic B-spline"),
-        ("grey-level correction", set_("solver", "brightness")),
+        ("grey-level correction", correction),
         ("rigid motion between lights", set_("solver", "rigid")),
         ("strain", f"{physical.measure_name}: {strain}"),
         ("virtual strain gauge", f"{physical.in_units(physical.gauges.length)}, at every node"),

@@ -218,7 +218,6 @@ def read_histories(
         units=units,
         remarks=(
             *_remarks(rectified, speed, exposure(result), there, by_probe, beside),
-            *_of_cracks(result, by_probe),
             *clocks,
         ),
     )
@@ -321,17 +320,6 @@ def _beside(
     name, newtons = channels.force(stated.force)
     stress = HistoryColumn(name="stress", unit="MPa", values=read[name] * newtons / stated.area, std=None)
     return beside, [stress], remarks
-
-
-def _of_cracks(result: Result, read: Mapping[str, list[History]]) -> Iterator[str]:
-    """Report what hurts the nodes at an open crack: the local mean reaches across it and takes the gap in."""
-    width = result.setting("illumination", "normalise", 0.0)
-    if width and (names := [name for name in read if name.startswith("crack_")]):
-        yield (
-            f"{', '.join(names)}: the images were divided by their local mean, which takes in the gap of a crack: "
-            "from half a px of opening on the jump is wrong by more than its uncertainty; measure with normalise = 0 "
-            f"in [illumination], not {width:g}"
-        )
 
 
 def _remarks(

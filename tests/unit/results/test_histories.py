@@ -33,7 +33,6 @@ from rgbmidic.results.histories import history_csv, read_histories
 from rgbmidic.settings import (
     ChannelSettings,
     FrameSettings,
-    IlluminationSettings,
     ProbeSettings,
     RegionSettings,
     ScaleSettings,
@@ -377,13 +376,12 @@ CRACKED = Tri3Mesh.from_region(Region.from_rectangle((5, 5, 194, 194), (200, 200
 MATERIAL = {"youngs_modulus": 70_000, "poissons_ratio": 0.3, "plane": "stress"}
 
 
-def cracked(path: Path, scale: ScaleSettings | None = SCALE, normalise: float = 0.0) -> Result:
+def cracked(path: Path, scale: ScaleSettings | None = SCALE) -> Result:
     """Frames 0 to 4 px of opening, of a crack whose sides move apart as they are."""
     settings = TestSettings(
         frames=FrameSettings(path=("f*.tif",), kind="monochrome"),
         region=RegionSettings(rectangle=(5, 5, 194, 194)),
         scale=scale or ScaleSettings(),
-        illumination=IlluminationSettings(normalise=normalise),
     )
     names = [f"frame {index}" for index in range(5)]
     origin = Origin(nodes=CRACKED.nodes, elements=CRACKED.elements, names=names, lights=("light",), settings=settings)
@@ -423,10 +421,6 @@ def test_cracks_are_read_as_histories_in_mm_with_their_notes(tmp_path: Path) -> 
     assert "Williams' series up to n = 3 (stated)" in remarks
     assert "its chi-square over the degrees of freedom is up to" in remarks
     assert "K (MPa √m)" in [axis.get_ylabel() for axis in history_figure(found).axes]
-    normalised = cracked(tmp_path / "c", normalise=10.0)
-    said = "crack_1: the images were divided by their local mean"
-    assert said not in remarks
-    assert said in "\n".join(read_histories(normalised, ProbeSettings(cracks=probes.cracks)).remarks)
 
 
 def history_csv_text(histories: Histories) -> str:
