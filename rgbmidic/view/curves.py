@@ -1,4 +1,4 @@
-"""Curves over time, as `rgbmidic history` reads probes at marks, a field along a line, and the time line of the frames."""
+"""Curves over time, as `rgbmidic history` reads probes at marks; a field along a line; the time line of the frames."""
 
 from __future__ import annotations
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import time
 from importlib.util import find_spec
-from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -15,7 +14,7 @@ from viewer import MISSING, Page, chromium, click, serving
 
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories, read_profile
-from rgbmidic.settings import FrameSettings, ProbeSettings, ScaleSettings, TestSettings
+from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
 from rgbmidic.view.fields import robust_range
 from rgbmidic.view.picture import element_at
 
@@ -379,9 +378,9 @@ ALONG = (25, 40, 95, 45)
 
 @pytest.fixture(scope="module")
 def wave(tmp_path_factory):
-    """Twelve frames, 1 ms apart, of which the fourth failed; nodes of one part are not measured in the sixth."""
-    scale = ScaleSettings(mm_per_pixel=0.5, frame_rate=1000.0)
-    settings = TestSettings(frames=FrameSettings(path=Path()), scale=scale)
+    """Twelve frames, 1 ms apart, of which the fourth failed."""
+    parts = {"frames": FrameSettings(path=("a",)), "region": RegionSettings(rectangle=(0, 0, 9, 9))}
+    settings = TestSettings(**parts, scale=ScaleSettings(mm_per_pixel=0.5, frame_rate=1000.0))
     store = ResultStore.create(tmp_path_factory.mktemp("wave") / "result", make_origin(12, settings=settings))
     for index in range(12):
         failed = FrameRecord.failed("no start", nodes=NODES, lights=3, number=index)
