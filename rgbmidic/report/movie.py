@@ -188,15 +188,11 @@ def write_movie(
             f"a movie has .1 to 240 frames per second, 320 to 7680 px and an opacity of 0 to 1, not {fps:g} frames "
             f"per second, {width} px and {opacity:g}"
         )
-    ends = limits if isinstance(limits, Mapping) else {} if limits is None else dict.fromkeys(fields, limits)
-    for low, high in ends.values():
-        if not low < high:
-            raise InputError(f"the colours range from a smaller to a larger value, not {low:g} to {high:g}")
     check_file(out, overwrite=overwrite)
     chosen = np.flatnonzero(maps.result.finished).tolist() if frames is None else list(frames)
     if beyond := [frame for frame in chosen if not 0 <= frame < len(maps.result)] or not chosen:
         raise InputError(f"there is no frame {beyond} in {maps.result.path}, which has {len(maps.result)} frames")
-    drawer = _Drawer.of(maps, tuple(fields), chosen, ends, images=images, curve=curve, colours=colours)
+    drawer = _Drawer.of(maps, tuple(fields), chosen, limits, images=images, curve=curve, colours=colours)
     drawer = replace(drawer, opacity=opacity, width=width)
     exe = "" if out.suffix.lower() == ".gif" else str(optional("imageio_ffmpeg", "movie").get_ffmpeg_exe())
     parts = max(1, min(processes, len(chosen) // _FEW))
@@ -251,13 +247,17 @@ class _Drawer:
         maps: Maps,
         names: tuple[str, ...],
         frames: list[int],
-        limits: Mapping[str, tuple[float, float]],
+        limits: tuple[float, float] | Mapping[str, tuple[float, float]] | None,
         **more: Any,
     ) -> _Drawer:
         """Find the colours of fields from all frames, or from evenly spaced ones."""
         from matplotlib import colormaps
 
         fields = tuple(maps.field(name) for name in names)
+        given_ends = limits if isinstance(limits, Mapping) else dict.fromkeys(names, limits) if limits else {}
+        for low, high in given_ends.values():
+            if not low < high:
+                raise InputError(f"the colours range from a smaller to a larger value, not {low:g} to {high:g}")
         if not fields or any(field.codes for field in fields):
             raise InputError(f"a movie shows fields of numbers, not {', '.join(names) or 'none'}")
         given = more.pop("colours")
@@ -280,7 +280,7 @@ class _Drawer:
             known_values = np.concatenate(ordinary)
             if not known_values.size:
                 raise InputError(f"{part.name} is measured in none of the frames of {result.path}")
-            low, high = limits.get(part.name) or part.ends or style.colour_range(known_values)
+            low, high = given_ends.get(part.name) or part.ends or style.colour_range(known_values)
             ends.append((low, high))
             beyond.append((bool(known_values.min() < low), bool(known_values.max() > high)))
         return cls(

@@ -369,6 +369,8 @@ class LinePanel:
         Document of the page.
     colours
         Colours of the field on the map.
+    look
+        Options of controls of the page.
 
     Attributes
     ----------
@@ -380,14 +382,14 @@ class LinePanel:
         The plots.
     """
 
-    def __init__(self, document: Document, colours: bk.LinearColorMapper) -> None:
+    def __init__(self, document: Document, colours: bk.LinearColorMapper, look: Mapping[str, Any]) -> None:
         self._reading: _Reading | None = None
         self._asked: tuple[Any, ...] = ()
         self._reader = Background(document)
         self._view: tuple[int, MapValues | None] = (0, None)
-        self.choice = bk.RadioButtonGroup(labels=[], name="beside_map", sizing_mode="stretch_width", visible=False)
+        self.choice = bk.RadioButtonGroup(labels=[], name="beside_map", visible=False, **look)
         self.choice.html_attributes = {"role": "group", "aria-label": "curves over time, or the field along a line"}
-        self.told = bk.Div(name="told_of_line", sizing_mode="stretch_width")
+        self.told = bk.Div(name="told_of_line", **look)
         self.told.html_attributes = {"aria-live": "polite"}
         self._image = bk.ColumnDataSource(columns(_IMAGE), name="wave")
         self._line = bk.ColumnDataSource(columns("x y"), name="profile")

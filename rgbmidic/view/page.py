@@ -87,7 +87,7 @@ class ResultPage:
         )
         self.timeline = TimeLine(len(result), view.frame)
         self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, message=p.message, hint=_HELP)
-        self.line = LinePanel(document, self.canvas.colours)
+        self.line = LinePanel(document, self.canvas.colours, p.wide)
         panels = [self.line.choice, self.curves.plot, *self.line.parts]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
         self.movie: Movie | None = None

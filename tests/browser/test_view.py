@@ -497,3 +497,20 @@ def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave):
         page.keys("m")
         page.until("model('said').text.includes('was stopped; no file is left')")
         assert sorted(file.name for file in wave.path.glob("*movie*")) == sorted([first.name, second.name])
+
+
+def test_a_line_of_a_result_that_grows_takes_the_new_frames_in(driver, tmp_path):
+    store = ResultStore.create(tmp_path / "result", make_origin(6))
+    for index in range(3):
+        store.write_frame(index, smooth_record(index))
+    with serving(store.path) as told:
+        page = Page(driver, f"{told}?frame=1&field=u&line=line_1&marks=line:25,40;line:95,45")
+        page.until("model('wave').data.image.length && model('wave').data.image[0].shape[1] === 3")
+        for index in range(3, 6):
+            store.write_frame(index, smooth_record(index))
+        store.finish()
+        page.until("model('wave').data.image[0].shape[1] === 6 && !model('told_of_line').visible")
+        expected = read_profile(Maps.of(Result.open(store.path)), "u", (25, 40, 95, 45))
+        np.testing.assert_allclose(
+            array(page, "model('wave').data.image[0]"), expected.values.T.ravel(), rtol=1e-5, atol=1e-7
+        )
