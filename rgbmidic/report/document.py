@@ -12,13 +12,13 @@ from urllib.parse import quote
 import numpy as np
 
 from rgbmidic._version import __version__
-from rgbmidic.errors import legible
+from rgbmidic.errors import InputError, legible
 from rgbmidic.report import figures
 from rgbmidic.report import setup as tables
 from rgbmidic.report.curves import field_history_figure, history_figure, status_figure, uncertainty_figure
 from rgbmidic.report.gallery import REPORT
 from rgbmidic.report.style import PAGE_DPI, embedded, time_text
-from rgbmidic.results import QUANTITIES, Result, channels_of, probes_of
+from rgbmidic.results import QUANTITIES, Maps, Result, channels_of, probes_of
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ChannelSettings, ProbeSettings, SetupSettings, TestSettings, read_section
@@ -36,6 +36,8 @@ _KEYS = 5
 """Key frames in a strip: as many as a page is wide with panels of 4 cm."""
 _LISTED = 20
 """Failed frames that are listed with their reason: half a page."""
+_FEWEST = 10
+"""Frames from which position against time is a picture: fewer are single stripes."""
 _NO_DATA, _MISFIT, _RATIO, _BLUR = 0.1, 2.0, 1.5, 1.0
 """Where warnings begin. Chosen: fraction of nodes without data; median misfit (1 is ordinary); noise of static frames
 over the stated uncertainty; px that a node moves during the exposure (the speckle's gradient is resolved to 1 px)."""
@@ -117,6 +119,7 @@ class _Report:
         page.table(("analysis", ""), list(tables.analysis_rows(self.physical, self.floor)))
         self._fields(page)
         self._probes(page)
+        self._along(page)
         self._uncertainty(page)
         self._lights(page)
         self._quality(page)
@@ -212,6 +215,39 @@ class _Report:
         _show(page, history_figure(histories), caption)
         if histories.remarks:
             page.bullets(histories.remarks)
+
+    def _along(self, page: Page) -> None:
+        """Add position against time along the lines of the probes, else through the middle of the region."""
+        physical, measured = self.physical, figures.measured_frames(self.physical.result)
+        if not physical.units.timed or len(measured) < _FEWEST:
+            return
+        from rgbmidic.report.curves import profile_figure
+        from rgbmidic.results.histories import read_profile
+
+        nodes = physical.result.nodes
+        middle, (wide, tall) = (nodes.min(axis=0) + nodes.max(axis=0)) / 2, np.ptp(nodes, axis=0) / 2
+        reach = np.array([wide, 0.0] if wide >= tall else [0.0, tall])
+        along = "the longer side of the region, through its middle"
+        lines = {"line": (*(middle - reach), *(middle + reach))}
+        if stated := [place for kind, place in self.probes.places if kind == "line"]:
+            lines, along = {f"line_{number}": place for number, place in enumerate(stated, 1)}, ""
+        page.heading("Along a line")
+        maps, frames = Maps(result=physical.result, physical=physical), figures.spread(measured, _MOST)
+        for name, place in lines.items():
+            x0, y0, x1, y1 = place
+            field = "exx" if abs(x1 - x0) >= abs(y1 - y0) else "eyy"
+            ends = f"({x0:.0f}, {y0:.0f}) to ({x1:.0f}, {y1:.0f}) px"
+            where = f"{along or f'`{name}`'}, from {ends}"
+            try:
+                figure = profile_figure(read_profile(maps, field, place, frames))
+            except InputError as error:
+                page.text(f"Nothing is shown along {where}: {error}.")
+                continue
+            caption = f"strain {field} along {where.replace('`', '')}: position, from the first end, against time in "
+            caption += (
+                f"{len(frames)} of {len(measured)} measured frames, and the strain along the line in some frames "
+            )
+            _show(page, figure, caption + "with bands of two standard uncertainties")
 
     def _uncertainty(self, page: Page) -> None:
         physical, length = self.physical, self.physical.units.length

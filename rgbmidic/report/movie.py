@@ -10,7 +10,7 @@ import csv
 import multiprocessing
 import signal
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,7 +123,7 @@ def write_movie(
     fields: Sequence[str],
     *,
     frames: Sequence[int] | None = None,
-    limits: tuple[float, float] | None = None,
+    limits: tuple[float, float] | Mapping[str, tuple[float, float]] | None = None,
     fps: float = 15.0,
     images: Callable[[int], AnyArray] | None = None,
     curve: Curve | None = None,
@@ -150,7 +150,8 @@ def write_movie(
     frames
         Indices of the frames; None: all that are measured.
     limits
-        Ends of the colour bar of all fields; None: for each those of all its frames but the extreme .5 % at each end.
+        Ends of the colour bar of all fields, or by the name of each; of others, or None: those of all its frames but
+        the extreme .5 % at each end.
     fps
         Frames per second of the movie.
     images
@@ -187,8 +188,6 @@ def write_movie(
             f"a movie has .1 to 240 frames per second, 320 to 7680 px and an opacity of 0 to 1, not {fps:g} frames "
             f"per second, {width} px and {opacity:g}"
         )
-    if limits is not None and not limits[0] < limits[1]:
-        raise InputError(f"the colours range from a smaller to a larger value, not {limits[0]:g} to {limits[1]:g}")
     check_file(out, overwrite=overwrite)
     chosen = np.flatnonzero(maps.result.finished).tolist() if frames is None else list(frames)
     if beyond := [frame for frame in chosen if not 0 <= frame < len(maps.result)] or not chosen:
@@ -248,13 +247,17 @@ class _Drawer:
         maps: Maps,
         names: tuple[str, ...],
         frames: list[int],
-        limits: tuple[float, float] | None,
+        limits: tuple[float, float] | Mapping[str, tuple[float, float]] | None,
         **more: Any,
     ) -> _Drawer:
         """Find the colours of fields from all frames, or from evenly spaced ones."""
         from matplotlib import colormaps
 
         fields = tuple(maps.field(name) for name in names)
+        given_ends = limits if isinstance(limits, Mapping) else dict.fromkeys(names, limits) if limits else {}
+        for low, high in given_ends.values():
+            if not low < high:
+                raise InputError(f"the colours range from a smaller to a larger value, not {low:g} to {high:g}")
         if not fields or any(field.codes for field in fields):
             raise InputError(f"a movie shows fields of numbers, not {', '.join(names) or 'none'}")
         given = more.pop("colours")
@@ -277,7 +280,7 @@ class _Drawer:
             known_values = np.concatenate(ordinary)
             if not known_values.size:
                 raise InputError(f"{part.name} is measured in none of the frames of {result.path}")
-            low, high = limits or part.ends or style.colour_range(known_values)
+            low, high = given_ends.get(part.name) or part.ends or style.colour_range(known_values)
             ends.append((low, high))
             beyond.append((bool(known_values.min() < low), bool(known_values.max() > high)))
         return cls(

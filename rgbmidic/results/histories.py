@@ -11,7 +11,7 @@ import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +37,7 @@ from rgbmidic.results.maps import MapField, Maps
 from rgbmidic.results.physical import Channels, exposure, frame_times, rectification_of, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import AnyArray, FloatArray
 
 __all__ = ["Histories", "HistoryColumn", "Profile", "Wave", "history_csv", "history_rows"]
 __all__ += ["read_histories", "read_profile", "write_histories", "write_profile"]
@@ -409,6 +409,43 @@ class Profile:
     common_fraction: float
     rate_window: float
 
+    @classmethod
+    def along(cls, maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | AnyArray) -> Self:
+        """Lay the points of a profile whose values are not read yet; parameters and errors as `read_profile`."""
+        found, result, physical = maps.field(field), maps.result, maps.physical
+        if f"{field}_std" not in maps.all:
+            raise InputError(
+                f'a profile is of a field with an uncertainty, not of "{field}"; these are '
+                + ", ".join(name for name in maps.all if f"{name}_std" in maps.all)
+            )
+        chosen = np.asarray(frames, dtype=np.int64)
+        if not len(chosen):
+            raise InputError(f"no frame of {result.path} is measured yet")
+        line = ProfileLine.between(physical.covariance, physical.gauges, *physical.rectified.place(place, 2))
+        times = frame_times(result, physical.scale)
+        values, std = np.full((2, len(chosen), len(line.points)), np.nan)
+        profile = cls(
+            field=found,
+            line=line,
+            frames=chosen,
+            numbers=result.number[chosen],
+            times=None if times is None else times[chosen],
+            units=replace(physical.units, timed=times is not None),
+            values=values,
+            std=std,
+            common_fraction=shared_part(result),
+            rate_window=0.0,
+        )
+        rated = "velocity" in field or "acceleration" in field or "_rate" in field
+        interval = float(np.median(np.diff(profile.clock))) if len(chosen) > 1 else 0.0
+        return replace(profile, rate_window=(maps.window - 1) * interval if rated else 0.0)
+
+    def fill(self, maps: Maps, rows: Iterable[int]) -> None:
+        """Read some rows of the values and of their uncertainties, in place."""
+        for row in rows:
+            read = maps.read(self.field.name, int(self.frames[row]))
+            self.values[row], self.std[row] = self.line.read(read.values, read.std, self.kind)
+
     @property
     def positions(self) -> FloatArray:
         """Distance (P,) of the points from the first end, in the unit of lengths."""
@@ -472,37 +509,11 @@ def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequenc
     InputError
         There is no such field or frame, it has no uncertainty, or half of the line is outside the mesh.
     """
-    found, result, physical = maps.field(field), maps.result, maps.physical
-    if f"{field}_std" not in maps.all:
-        raise InputError(
-            f'a profile is of a field with an uncertainty, not of "{field}"; these are '
-            + ", ".join(name for name in maps.all if f"{name}_std" in maps.all)
-        )
-    chosen = np.flatnonzero(result.finished) if frames is None else np.asarray(frames, dtype=np.int64)
-    if not len(chosen):
-        raise InputError(f"no frame of {result.path} is measured yet")
-    line = ProfileLine.between(physical.covariance, physical.gauges, *physical.rectified.place(place, 2))
-    times = frame_times(result, physical.scale)
-    values, std = np.full((2, len(chosen), len(line.points)), np.nan)
-    profile = Profile(
-        field=found,
-        line=line,
-        frames=chosen,
-        numbers=result.number[chosen],
-        times=None if times is None else times[chosen],
-        units=replace(physical.units, timed=times is not None),
-        values=values,
-        std=std,
-        common_fraction=shared_part(result),
-        rate_window=0.0,
-    )
-    for row, each in enumerate(maps.read(field, frame) for frame in chosen.tolist()):
-        values[row], std[row] = line.read(each.values, each.std, profile.kind)
-    if not np.isfinite(values).any():
+    profile = Profile.along(maps, field, place, np.flatnonzero(maps.result.finished) if frames is None else frames)
+    profile.fill(maps, range(len(profile.frames)))
+    if not np.isfinite(profile.values).any():
         raise InputError(f"{field} is measured in no frame along the line; place it elsewhere")
-    rated = "velocity" in field or "acceleration" in field or "_rate" in field
-    interval = float(np.median(np.diff(profile.clock))) if len(chosen) > 1 else 0.0
-    return replace(profile, rate_window=(maps.window - 1) * interval if rated else 0.0)
+    return profile
 
 
 def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *, overwrite: bool = False) -> None:

@@ -106,6 +106,8 @@ class ViewState:
         As `Maps` has them; -1: the test's reference, 0: the usual window.
     curve
         Quantity of the probes whose curve is shown; empty: the first.
+    line
+        Line along which the field is shown in place of the curves; empty: none.
     theme
         ``"light"``, ``"dark"``, or empty: as the browser likes it.
     window
@@ -140,6 +142,7 @@ class ViewState:
     rigid: bool = False
     rate_window: int = 0
     curve: str = ""
+    line: str = ""
     theme: str = ""
     window: tuple[float, ...] = ()
     marks: tuple[Mark, ...] = ()

@@ -147,6 +147,11 @@ class ResultControls(Controls):
         for group, says in ((self.over, "image"), (self.section, "controls shown"), (self.mode, "what a click sets")):
             group.html_attributes = {"role": "group", "aria-label": says}
         self.curve = bk.Select(title="Curve", name="curve", **wide)
+        self.movie = bk.Toggle(label="Movie", name="movie", width=90, **self.small)
+        folded = {"max-height": "48px", "overflow": "auto", "overflow-wrap": "anywhere"}
+        self.said = bk.Div(name="said", width=300, visible=False, styles=folded, **self.small)
+        self.said.html_attributes = {"aria-live": "polite"}
+        self.player = row(self.play, self.step, self.frame, self.movie, self.said, sizing_mode="stretch_width")
         self.lock, self.clear, self.csv, self.png = (
             bk.Button(label=name, **wide) for name in ("Lock the range", "Clear", "Save CSV", "Save PNG")
         )

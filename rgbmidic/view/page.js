@@ -73,10 +73,12 @@ document.addEventListener("keydown", (event) => {
     PageDown: slider.value + 10 * step, PageUp: slider.value - 10 * step,
     Home: slider.start, End: slider.end,
   }[event.key];
+  const movie = page.get_model_by_name("movie");
   const section = page.get_model_by_name("section"), asked = Number(event.key) - 1;
   if (section && section.labels[asked]) section.active = asked; else
   if (to !== undefined) slider.value = Math.min(Math.max(to, slider.start), slider.end);
   else if (event.key === " ") play.active = !play.active;
+  else if (event.key === "m" && movie) movie.active = !movie.active;
   else return;
   event.preventDefault();
   event.stopPropagation();

@@ -18,7 +18,7 @@ from rgbmidic.results import MapField, Maps, MapValues, Result
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import BESIDE, KINDS, OVER, UNCERTAINTY, ViewState, probe_marks, probe_place
 from rgbmidic.view.canvas import Canvas, LabelLayer, LineLayer, arrow_lines, contour_lines, direction_lines
-from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, places
+from rgbmidic.view.curves import CurvePanel, LinePanel, Progress, TimeLine, as_csv, places
 from rgbmidic.view.fields import (
     Pictures,
     every,
@@ -33,6 +33,7 @@ from rgbmidic.view.fields import (
 )
 from rgbmidic.view.models import CONTROLS, MarkLayer, ResultControls, SharedState
 from rgbmidic.view.picture import AROUND, Overlay, Picture, paint, palette, palette_name
+from rgbmidic.view.setup_panel import Movie
 
 __all__ = ["ResultPage"]
 
@@ -86,6 +87,10 @@ class ResultPage:
         )
         self.timeline = TimeLine(len(result), view.frame)
         self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, message=p.message, hint=_HELP)
+        self.line = LinePanel(document, self.canvas.colours, p.wide)
+        panels = [self.line.choice, self.curves.plot, *self.line.parts]
+        self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
+        self.movie: Movie | None = None
         self.maps = bk.Column(children=[self.canvas.plot], sizing_mode="stretch_both")
         self._begin()
         p.wire(self.state, self.canvas.tools, self.timeline.now, self.curves.plot)
@@ -95,7 +100,7 @@ class ResultPage:
     def roots(self) -> dict[str, Any]:
         """The parts of the page by the names that its template gives their places."""
         p = self.parts
-        drawn = {"maps": self.maps, "timeline": self.timeline.plot, "curves": self.curves.plot}
+        drawn = {"maps": self.maps, "timeline": self.timeline.plot, "curves": self.panel}
         return {"head": p.head, "under": p.under, "side": p.side, "player": p.player, **drawn}
 
     def _begin(self) -> None:
@@ -147,7 +152,9 @@ class ResultPage:
         p.clear.on_click(lambda: self.canvas.place([]))
         p.csv.on_click(self._save)
         self.canvas.plot.on_event(MouseMove, self._hover)
-        for plot in (self.timeline.plot, self.curves.plot):
+        self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(new))
+        p.movie.on_change("active", lambda attr, old, new: guarded(self._film, self._stop_film))
+        for plot in (self.timeline.plot, self.curves.plot, self.line.wave):
             plot.on_event(Tap, self._jump)
         self.document.on_event(DocumentReady, lambda event: self._ready())
 
@@ -157,7 +164,7 @@ class ResultPage:
         if self.view.marks:
             self._read_curves()
         every(_TICK, self.document, lambda: self.progress.advance(self.result), self.complain)
-        for act in (self._grow, self._draw_progress):
+        for act in (self._grow, self._draw_progress, self._tell_film):
             every(_IDLE, self.document, act, self.complain)
 
     def complain(self, text: str) -> None:
@@ -185,6 +192,7 @@ class ResultPage:
         self.blank.show()
         self._read_out()
         self.curves.point(self.view.frame)
+        self.line.show(self.view.frame, None)
         self.state.query = self.view.query()
         self.complain(text)
 
@@ -207,6 +215,7 @@ class ResultPage:
         self._draw_layers(field, values, nodes)
         self._read_out()
         self.curves.point(view.frame)
+        self._show_line()
         self.state.query, self.state.shown = view.query(), self.state.asked
 
     def _choose(self) -> None:
@@ -369,6 +378,59 @@ class ResultPage:
         measure = view.measure if view.measure != MEASURES[0] else None
         self.curves.read(self.result, view.marks, self._gauge, measure, lambda: self.curves.point(self.view.frame))
 
+    @property
+    def _lines(self) -> dict[str, tuple[float, ...]]:
+        """Ends of the lines that are marked, by their names."""
+        probes = probe_marks(self.view.marks).items()
+        return {name: probe_place(marks, 0) for name, marks in probes if marks[0].kind == "line"}
+
+    def _choose_line(self, active: int) -> None:
+        name = ["", *self._lines][active]
+        if name != self.view.line:
+            self.show(line=name)
+
+    def _show_line(self) -> None:
+        """Show the field along the chosen line in place of the curves."""
+        lines, name = self._lines, self.view.line
+        shown = self.line.offer(list(lines), name)
+        self.curves.plot.visible = not shown
+        if shown:
+            self.line.ask(self.fields, self.view.field, lines[name], self._chosen, self._changes)
+            self.line.show(self.view.frame, self.values)
+
+    def _film(self) -> None:
+        """Write a movie of what is in view, or stop the one that is being written."""
+        if not self.parts.movie.active:
+            if self.movie is not None and self.movie.going:
+                self._stop_film(f"{self.movie.out.name} was stopped; no file is left")
+            return
+        view, names = self.view, [self.view.field, *self._others]
+        limits: dict[str, tuple[float, float]] = {}
+        for name in names:
+            first = name == view.field
+            if view.range == "test" or (view.range == "hand" and first):
+                limits[name] = self._ends(name, self._values(name), by_hand=first)
+        self.movie = Movie.start(
+            self.fields, names, limits=limits, opacity=view.opacity, raw=view.over == "deformed",
+            colours=view.palette if len(names) == 1 else "",
+        )  # fmt: skip
+        self._tell_film()
+
+    def _tell_film(self) -> None:
+        if self.movie is None:
+            return
+        text, going = self.movie.summary(), self.movie.going
+        self.parts.said.text, self.parts.said.visible = text, True
+        self.parts.movie.label = "■ Movie" if going else "Movie"
+        if not going:
+            self.movie, self.parts.movie.active = None, False
+
+    def _stop_film(self, text: str) -> None:
+        if self.movie is not None:
+            self.movie.stop()
+        self.movie, self.parts.movie.label, self.parts.movie.active = None, "Movie", False
+        self.parts.said.text, self.parts.said.visible = warning(text), True
+
     def _save(self) -> None:
         if self.curves.reading:
             self.parts.message.text = "The curves are still being read: save them once they are drawn."
@@ -379,7 +441,8 @@ class ResultPage:
 
     def _jump(self, event: Any) -> None:
         """Go to the frame that was clicked in the time line or among the curves."""
-        frame = self.curves.frame(event.x) if event.model is self.curves.plot else event.x
+        clocks = {self.curves.plot: self.curves.frame, self.line.wave: self.line.frame}
+        frame = clocks[event.model](event.x) if event.model in clocks else event.x
         self.parts.frame.value = min(max(round(float(frame)), 0), len(self.result) - 1)
 
     def _draw_progress(self) -> None:

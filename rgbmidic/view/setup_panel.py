@@ -1,13 +1,18 @@
-"""Parts of the page that sets a test up: its frames, raw and inspected, its controls, and the run that it starts."""
+"""Parts of the page that sets a test up: frames, raw and inspected, controls, its run; and a result's movie."""
 
 from __future__ import annotations
 
 import html
+import multiprocessing
+import signal
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
+from itertools import count
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -16,18 +21,19 @@ import numpy as np
 import numpy.typing as npt
 from bokeh.layouts import column, row
 
-from rgbmidic.errors import ResultError
+from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.inspection import Inspection, inspect_frame
 from rgbmidic.mesh import Region
-from rgbmidic.results import Result
+from rgbmidic.report import write_movie
+from rgbmidic.results import Maps, Result
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.view.draft import Draft
 from rgbmidic.view.models import Controls
-from rgbmidic.view.picture import Picture, grey_picture, stretched
+from rgbmidic.view.picture import Picture, RawPictures, grey_picture, stretched
 
-__all__ = ["RAW", "DraftFrames", "Run", "SetupControls", "pictures", "side_by_side"]
+__all__ = ["RAW", "DraftFrames", "Movie", "Run", "SetupControls", "pictures", "side_by_side"]
 
 RAW = "raw frame"
 
@@ -225,3 +231,100 @@ class Run:
         lines = [line for line in self.output.read().decode("utf-8", "replace").splitlines() if line.strip()]
         errors = [line for line in lines if line.startswith("error: ")]
         return f"failed: {[*errors, *lines[-1:], 'it printed nothing'][0]}"
+
+
+class Movie:
+    """A movie that a process of its own writes into the folder of a result.
+
+    Parameters
+    ----------
+    out
+        The file.
+    process, receive
+        The process, and the end of the pipe at which it reports.
+
+    Attributes
+    ----------
+    out
+        The file.
+    """
+
+    def __init__(self, out: Path, process: Any, receive: Any) -> None:
+        self.out, self._process, self._receive, self._end = out, process, receive, ""
+        self._far = "starting"
+
+    @classmethod
+    def start(
+        cls, maps: Maps, fields: Sequence[str], *, limits: Mapping[str, Any], opacity: float, raw: bool, colours: str
+    ) -> Self:
+        """Start the process; a file that is there is never written over.
+
+        Parameters
+        ----------
+        maps, fields
+            The result, how its fields are derived, and their names.
+        limits
+            Ends of the colours by the fields' names; of others those of all frames.
+        opacity
+            Of the fields over the image.
+        raw
+            Whether they lie over the raw frames.
+        colours
+            Their name; empty: as suits each field.
+        """
+        result = replace(maps.result)  # without what was read
+        maps = replace(maps, result=result, physical=replace(maps.physical, result=result))
+        ending = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
+        name = f"movie_{'_'.join(fields)}".replace(" ", "_")
+        names = (f"{name}{f'_{number}' if number > 1 else ''}{ending}" for number in count(1))
+        out = next(file for file in (result.path / name for name in names) if not file.exists())
+        options = {"limits": limits, "opacity": opacity, "colours": colours or None}
+        options["images"] = RawPictures(result=result) if raw else None
+        context = multiprocessing.get_context("spawn")
+        receive, send = context.Pipe(duplex=False)
+        process = context.Process(target=_write, args=(send, maps, out, tuple(fields), options), daemon=True)
+        process.start()
+        send.close()
+        return cls(out, process, receive)
+
+    @property
+    def going(self) -> bool:
+        """Whether it goes on, as far as `summary` has heard."""
+        return not self._end
+
+    def stop(self) -> None:
+        """End the process; nothing is left of its file."""
+        self._process.terminate()
+        self._process.join()
+
+    def summary(self) -> str:
+        """Return, as HTML, how far it is, where the file is, or why there is none."""
+        try:
+            while not self._end and self._receive.poll():
+                kind, text = self._receive.recv()
+                self._far, self._end = (text, "") if kind == "far" else ("", text or "written")
+        except EOFError:
+            self._end = "its process was ended"
+        name = html.escape(self.out.name)
+        if self.going:
+            return f"{name}: {self._far}"
+        if self._end != "written":
+            return f'<b style="color:var(--warn)">no {name}: {html.escape(self._end)}</b>'
+        gif = "" if self.out.suffix != ".gif" else ' (a .gif; for .mp4: pip install "rgbmidic[movie]")'
+        return f"written: {html.escape(str(self.out))}{gif}"
+
+
+def _write(send: Any, maps: Maps, out: Path, fields: tuple[str, ...], options: dict[str, Any]) -> None:
+    """Write a movie in a process of its own, and report each hundredth of it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # what is begun is removed
+
+    def progress(done: int, total: int, _: str) -> None:
+        if 100 * done // total > 100 * (done - 1) // total:
+            send.send(("far", f"{done} of {total} frames"))
+
+    try:
+        write_movie(maps, out, fields, progress=progress, **options)
+        send.send(("end", ""))
+    except (RgbmidicError, OSError) as error:
+        send.send(("end", str(error)))

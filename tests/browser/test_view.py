@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from importlib.util import find_spec
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -11,9 +12,11 @@ import pytest
 from results import NODES, make_origin, make_result, smooth_record
 from viewer import MISSING, Page, chromium, click, serving
 
+from rgbmidic.report import write_movie
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
-from rgbmidic.results.histories import read_histories
-from rgbmidic.settings import ProbeSettings
+from rgbmidic.results.histories import read_histories, read_profile
+from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
+from rgbmidic.view import setup_panel
 from rgbmidic.view.fields import robust_range
 from rgbmidic.view.picture import element_at
 
@@ -370,3 +373,157 @@ def test_a_folder_s_page_opens_its_results_and_a_reload_stays(driver, result):
         while "2 of 7" not in (listed or "") and "7 of 7" not in (listed or ""):
             listed = driver.execute_script(wait)
         assert "result: 7 of 7 frames" in listed
+
+
+ALONG = (25, 40, 95, 45)
+
+
+@pytest.fixture(scope="module")
+def wave(tmp_path_factory):
+    """Twelve frames, 1 ms apart, of which the fourth failed."""
+    parts = {"frames": FrameSettings(path=("a",)), "region": RegionSettings(rectangle=(0, 0, 9, 9))}
+    settings = TestSettings(**parts, scale=ScaleSettings(mm_per_pixel=0.5, frame_rate=1000.0))
+    store = ResultStore.create(tmp_path_factory.mktemp("wave") / "result", make_origin(12, settings=settings))
+    for index in range(12):
+        failed = FrameRecord.failed("no start", nodes=NODES, lights=3, number=index)
+        store.write_frame(index, failed if index == 3 else smooth_record(index))
+    store.finish()
+    return Result.open(store.path)
+
+
+def array(page, script):
+    """Numbers of the page; what is not finite is NaN."""
+    read = page.run(f"Array.from({script}).map((v) => Number.isFinite(v) ? v : null)")
+    return np.array([np.nan if value is None else value for value in read], dtype=float)
+
+
+def test_a_line_shows_its_profile_and_position_against_time(driver, wave):
+    from selenium.webdriver.common.action_chains import ActionBuilder
+
+    with serving(wave.path) as told:
+        page = Page(driver, f"{told}?frame=5&field=exx")
+        shown(page, 5)
+        assert not page.run("model('beside_map').visible")
+        page.do("model('mode').active = 3")
+        page.pointer(("click", *ALONG[:2]), ("click", *ALONG[2:]))
+        page.until("model('beside_map').visible")
+        assert page.run("model('beside_map').labels") == ["over time", "along line 1"]
+        page.driver.execute_script(*click("along line 1"))
+        page.until("model('wave').data.image.length && !model('told_of_line').visible")
+        data = page.run("[Array.from(model('marks').data.x), Array.from(model('marks').data.y)]")
+        place = tuple(np.transpose(data).ravel())
+        expected = read_profile(Maps.of(wave), "exx", place)
+        image = array(page, "model('wave').data.image[0]").reshape(page.run("model('wave').data.image[0].shape"))
+        np.testing.assert_allclose(image, expected.values.T, rtol=1e-5)
+        assert np.isnan(image[:, 3]).all()
+        x, y, wide, tall = (page.run(f"model('wave').data.{name}[0]") for name in ("x", "y", "dw", "dh"))
+        apart = expected.positions[1]
+        assert (x, y, wide) == pytest.approx((-0.5, -apart / 2, 12))
+        assert tall == pytest.approx(expected.positions[-1] + apart)
+        page.until("model('wave_now').location === 5")
+        for frame in (5, 8):
+            page.do(f"model('frame').value = {frame}")
+            shown(page, frame)
+            page.until(f"model('wave_now').location === {frame}")
+            curve = array(page, "model('profile').data.y")
+            np.testing.assert_allclose(curve, expected.values[frame], atol=1e-12)
+            np.testing.assert_allclose(array(page, "model('profile').data.x"), expected.positions)
+            rim = array(page, "model('profile bands').data.ys[0]")
+            known = np.isfinite(curve)
+            np.testing.assert_allclose(rim[: known.sum()], (curve - 2 * expected.std[frame])[known])
+            ends = page.run("[model('colours').low, model('colours').high]")
+            assert page.run("model('wave_plot').renderers[0].glyph.color_mapper === model('colours')")
+            assert ends == pytest.approx(robust_range(Maps.of(wave).read("exx", frame)))
+        held = parse_qs(urlsplit(driver.current_url).query)
+        assert held["line"] == ["line_1"]
+        box = page.run(
+            "(() => { const v = Bokeh.index.get_one(model('wave_plot')), b = v.el.getBoundingClientRect(); "
+            "return [b.x + v.frame.x_scale.compute(2), b.y + b.height / 2]; })()"
+        )
+        actions = ActionBuilder(driver, duration=50)
+        actions.pointer_action.move_to_location(*map(round, box))
+        actions.pointer_action.click()
+        actions.perform()
+        shown(page, 2)
+        page.do("model('quantity').value = 'u'")
+        other = read_profile(Maps.of(wave), "u", place)
+        page.until("model('wave_plot').title.text.startsWith('u ') && model('wave').data.image.length")
+        page.until("!model('told_of_line').visible")
+        np.testing.assert_allclose(array(page, "model('wave').data.image[0]"), other.values.T.ravel(), rtol=1e-5)
+        page.do("model('quantity').value = 'node_status'")
+        page.until(
+            "model('told_of_line').text.includes('a field with an uncertainty') && !model('wave').data.image.length"
+        )
+        page.driver.execute_script(*click("over time"))
+        page.until("!model('wave_plot').visible && model('lines').data.ys.length")
+
+
+def test_the_line_s_panel_is_whole_on_a_small_dark_screen(driver, wave):
+    driver.set_window_size(1280, 720)
+    driver.set_window_size(1280, 2 * 720 - driver.execute_script("return innerHeight"))
+    with serving(wave.path) as told:
+        marks = "line:25,40;line:95,45;line:30,20;line:90,70"
+        page = Page(driver, f"{told}?frame=5&field=u&marks={marks}&line=line_2&theme=dark")
+        page.until("model('wave').data.image.length && model('profile_plot').inner_height > 80")
+        for name in ("beside_map", "wave_plot", "profile_plot", "movie"):
+            box = page.run(
+                f"(() => {{ const b = Bokeh.index.get_one(model('{name}')).el.getBoundingClientRect(); "
+                "return [b.left, b.top, innerWidth - b.right, innerHeight - b.bottom, b.height]; })()"
+            )
+            assert min(box[:4]) >= 0, name
+            assert box[4] > (20 if name in ("beside_map", "movie") else 150), name
+        assert page.run("Bokeh.index.get_one(model('beside_map')).el.getAttribute('aria-label')")
+    driver.set_window_size(1280, 940)
+
+
+def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, tmp_path, monkeypatch):
+    """Without the extra it is a .gif, whose bytes are those of the library."""
+    names = [f"movie_exx_u{number}{ending}" for number, ending in (("", ".gif"), ("_2", ".gif"), ("", ".mp4"))]
+    first, second, other = (wave.path / name for name in names)
+    there = find_spec("imageio_ffmpeg") is not None
+    with serving(wave.path) as told:
+        view = "frame=5&field=exx&second=u&range=hand&low=-0.01&high=0.02&opacity=0.5&gauge=60&since=1&measure=hencky"
+        page = Page(driver, f"{told}?{view}")
+        shown(page, 5)
+        monkeypatch.setattr(setup_panel, "find_spec", lambda name: None)
+        page.driver.execute_script(*click("Movie"))
+        page.until("model('said').text.startsWith('movie_exx_u') && model('movie').label === '■ Movie'")
+        page.until(f"model('said').text.startsWith('written: {first} (a .gif; for .mp4: pip install')", patience=60)
+        assert not page.run("model('movie').active")
+        maps = Maps.of(wave, gauge=60.0, since=1, measure="hencky")
+        write_movie(maps, tmp_path / "a.gif", ["exx", "u"], limits={"exx": (-0.01, 0.02)}, opacity=0.5)
+        before = first.read_bytes()
+        assert before == (tmp_path / "a.gif").read_bytes()
+        page.keys("m")
+        page.until(f"model('said').text.startsWith('written: {second}')", patience=60)
+        assert first.read_bytes() == before
+        monkeypatch.undo()
+        if there:
+            page.keys("m")
+            page.until(f"model('said').text === 'written: {other}'", patience=60)
+        page.do("model('quantity').value = 'node_status'")
+        page.keys("m")
+        page.until("model('said').text.includes('a movie shows fields of numbers, not node_status')", patience=60)
+        page.do("model('quantity').value = 'v'")
+        page.keys("m")
+        page.until("model('movie').active && model('said').text.startsWith('movie_v')")
+        page.keys("m")
+        page.until("model('said').text.includes('was stopped; no file is left')")
+        assert sorted(file.name for file in wave.path.glob("*movie*")) == sorted(names[: 2 + there])
+
+
+def test_a_line_of_a_result_that_grows_takes_the_new_frames_in(driver, tmp_path):
+    store = ResultStore.create(tmp_path / "result", make_origin(6))
+    for index in range(3):
+        store.write_frame(index, smooth_record(index))
+    with serving(store.path) as told:
+        page = Page(driver, f"{told}?frame=1&field=u&line=line_1&marks=line:25,40;line:95,45")
+        page.until("model('wave').data.image.length && model('wave').data.image[0].shape[1] === 3")
+        for index in range(3, 6):
+            store.write_frame(index, smooth_record(index))
+        store.finish()
+        page.until("model('wave').data.image[0].shape[1] === 6 && !model('told_of_line').visible")
+        expected = read_profile(Maps.of(Result.open(store.path)), "u", (25, 40, 95, 45))
+        np.testing.assert_allclose(
+            array(page, "model('wave').data.image[0]"), expected.values.T.ravel(), rtol=1e-5, atol=1e-7
+        )

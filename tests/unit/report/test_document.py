@@ -17,8 +17,8 @@ from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.report import document, remove_report, setup, style, write_report
-from rgbmidic.results import FrameRecord, Result, ResultStore
+from rgbmidic.report import curves, document, remove_report, setup, style, write_report
+from rgbmidic.results import FrameRecord, Maps, Result, ResultStore, read_profile
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import (
     ChannelSettings,
@@ -294,3 +294,38 @@ def test_speckle_size_is_the_width_of_the_autocorrelation(tmp_path: Path, sigma:
     reference = texture / texture.std() + noise * more
     size = setup.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
     assert size == pytest.approx(2 * np.sqrt(2 * np.log(2)) * np.sqrt(2) * sigma, rel=0.08)
+
+
+MIDDLE = "the longer side of the region, through its middle"
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    ("count", "lines", "missing", "expected"),
+    [
+        (11, (), False, f"strain exx along {MIDDLE}, from (10, 40) to (110, 40) px"),
+        (11, ((30, 20, 35, 60),), False, "strain eyy along line_1, from (30, 20) to (35, 60) px"),
+        (11, (), True, ""),
+        (10, (), False, ""),
+    ],
+)  # fmt: skip
+def test_position_against_time_is_along_the_stated_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int, lines: Any, missing: bool, expected: str
+) -> None:
+    """The first frame is the reference, and no part of it."""
+    seen: list[Any] = []
+    monkeypatch.setattr(curves, "profile_figure", lambda profile: seen.append(profile) or Figure())
+    part = np.where((np.abs(Y - 40) < 15) & missing, np.nan, 0.1)
+    records = [still(index, 0.01, u=part, u_std=part, time_ns=20_000 * index) for index in range(count)]
+    result = make(tmp_path / "r", records, settings=settings(probes=ProbeSettings(lines=lines)))
+    write_report(result, tmp_path / "a.html")
+    words = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert [*re.findall(r'alt="(strain e.. along [^:]*):', words)] == [expected] * bool(expected)
+    assert ("Nothing is shown along the longer side" in words) == missing
+    assert len(seen) == bool(expected)
+    for profile in seen:
+        ends = lines[0] if lines else (X.min(), np.mean([Y.min(), Y.max()]), X.max(), np.mean([Y.min(), Y.max()]))
+        read = read_profile(Maps.of(result), profile.field.name, ends, range(1, count))
+        np.testing.assert_array_equal(profile.values, read.values)
+        np.testing.assert_allclose(profile.times, 2e-5 * np.arange(1, count))
+        assert f"against time in {count - 1} of {count - 1} measured frames" in words
