@@ -233,6 +233,10 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
         table, places = table[known], np.array(places)[known].tolist()
     times = table[:, 3] * _TIMES[clock.lower()] if clock else np.zeros(len(table))
     steps, state = np.unique(times, return_inverse=True)
+    pairs, first = np.unique(np.stack([state, places]), axis=1, return_index=True)
+    if pairs.shape[1] < len(table):
+        twice = sorted(set(range(len(table))) - set(first.tolist()))[0]
+        raise InputError(f"{path} has several rows for node {table[twice, 0]:g}" + (" at one time" if clock else ""))
     values = np.full((len(steps), len(mesh.points), 2), np.nan)
     factors = [LENGTH_UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
     values[state, places] = table[:, 1:3] * factors

@@ -408,6 +408,8 @@ class Profile:
         Fraction of the variance that all frames have in common.
     rate_window
         Time that a rate is taken over; 0 for what is no rate.
+    how
+        How the field is derived (`Maps.how`).
     """
 
     field: MapField
@@ -420,6 +422,7 @@ class Profile:
     std: FloatArray
     common_fraction: float
     rate_window: float
+    how: str = ""
 
     @property
     def positions(self) -> FloatArray:
@@ -498,6 +501,7 @@ def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequenc
     values, std = np.full((2, len(chosen), len(line.points)), np.nan)
     profile = Profile(
         field=found,
+        how=maps.how.get(found.group, ""),
         line=line,
         frames=chosen,
         numbers=result.number[chosen],
