@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from results import NODES, make_result, smooth_record
 
-from rgbmidic.errors import InputError, ResultError
+from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.report import movie
 from rgbmidic.report.movie import Curve, write_movie
 from rgbmidic.results import FrameRecord, Maps
+from rgbmidic.view.picture import RawPictures
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +136,8 @@ def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path:
     ):
         with pytest.raises(InputError, match=message):
             write_movie(maps, tmp_path / name, fields, **more)
+    with pytest.raises(FrameError, match=r"result does not state where its raw frames are"):
+        write_movie(maps, tmp_path / "m.gif", ["u"], images=RawPictures(result=maps.result))
     assert not list(tmp_path.iterdir())
     (tmp_path / "there.gif").write_text("kept")
     with pytest.raises(ResultError, match="already exists"):
