@@ -197,10 +197,12 @@ def batch(
     ] = "0.0005:0.0025",
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
     reports: Annotated[bool, typer.Option("--reports/--no-reports", help="Write a report of each test.")] = True,
+    overwrite: Overwrite = False,
 ) -> None:
     """Measure a series of tests, each into DIR/NAME, with one summary table and page.
 
-    A test that fails does not stop the rest; one that is measured already with the same settings is not measured again.
+    A test that fails does not stop the rest; one that is measured already is not measured again. --overwrite replaces a
+    result of other settings.
     """
     from rgbmidic.pipeline import batch as series
     from rgbmidic.report import REPORT, write_batch_page, write_report
@@ -223,7 +225,13 @@ def batch(
     outcomes = []
     with _progress("batch") as progress:
         for outcome in series.run_batch(
-            chosen, out, workers=workers or None, elastic=limits, conclude=conclude, progress=lambda name: progress
+            chosen,
+            out,
+            workers=workers or None,
+            elastic=limits,
+            overwrite=overwrite,
+            conclude=conclude,
+            progress=lambda name: progress,
         ):
             outcomes.append(outcome)
             series.write_summary(outcomes, out / "summary.csv")
@@ -414,7 +422,7 @@ def history(
     from rgbmidic.results.files import check_file
     from rgbmidic.results.histories import read_histories
 
-    picture = out.with_suffix(".png")
+    picture = command.picture_beside(out)
     for file in (out, picture):
         check_file(file, overwrite=overwrite)
     result = Result.open(folder, partial=partial)
@@ -441,7 +449,7 @@ _DERIVED: dict[str, Any] = {
     "gauge": Annotated[float | None, typer.Option("--gauge", metavar="PX", help="Virtual strain gauge length, px.")],
     "measure": _PROBE_OPTIONS["measure"],
     "since": Annotated[int | None, typer.Option("--since", metavar="N", help="Displacement and strain since frame N.")],
-    "rigid_removed": Annotated[bool, typer.Option("--rigid-removed", help="Remove the motion as a whole.")],
+    "rigid_removed": Annotated[bool, typer.Option("--remove-rigid", help="Remove the motion as a whole.")],
     "window": Annotated[int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more.")],
 }
 """Options that state how fields are derived, by the keys of `rgbmidic.results.Maps.of`."""
@@ -495,6 +503,8 @@ def movie(
     result, settings = Result.open(folder, partial=partial), _settings(test)
     if over not in ("reference", "frame"):
         raise InputError(f"--over is reference or frame, not {over!r}")
+    if curve is None and (column is not None or offset):
+        raise InputError("--column and --offset are of a --curve FILE, which is not stated")
     with _progress("movie") as progress:
         write_movie(
             Maps.of(result, None if settings is None else settings.scale, **derived),
@@ -528,7 +538,9 @@ def profile(
     speed: Annotated[
         str, typer.Option("--speed", metavar="WHAT", help="Fit the speed of the front, or of the peak.")
     ] = "",
-    level: Annotated[float, typer.Option("--level", help="Fraction of the peak at which the front is taken.")] = 0.5,
+    level: Annotated[
+        float | None, typer.Option("--level", help="Fraction of the peak at which the front is taken; else 0.5.")
+    ] = None,
     test: Reading = None,
     overwrite: Overwrite = False,
     partial: Partial = False,
@@ -539,14 +551,19 @@ def profile(
     from rgbmidic.results.files import check_file
     from rgbmidic.results.histories import arrivals_file
 
-    picture, place = out.with_suffix(".png"), command.read_place(line, "--line", "X0,Y0:X1,Y1")
+    picture, place = command.picture_beside(out), command.read_place(line, "--line", "X0,Y0:X1,Y1")
     for file in (out, picture, *([arrivals_file(out)] if speed else [])):
         check_file(file, overwrite=overwrite)
+    if level is not None and speed != "front":
+        raise InputError("--level is of --speed front, which is not stated")
     result, settings = Result.open(folder, partial=partial), _settings(test)
     maps = Maps.of(result, None if settings is None else settings.scale, **derived)
     read = read_profile(maps, field, place, _chosen_frames(result, frames))
-    rows = [list(read.frames).index(frame) for frame in _frames(curves) or [] if frame in read.frames]
-    wave = read.wave(speed, level) if speed else None
+    shown, there = _frames(curves, "--curves") or [], list(read.frames)
+    if beyond := [frame for frame in shown if frame not in there]:
+        raise InputError(f"--curves {curves}: frames {beyond} are not among those read, {there[0]} to {there[-1]}")
+    rows = [there.index(frame) for frame in dict.fromkeys(shown)]
+    wave = read.wave(speed, 0.5 if level is None else level) if speed else None
     write_profile(read, out, wave, overwrite=overwrite)
     save_figure(profile_figure(read, wave, rows), picture)
     if wave is not None:
@@ -851,12 +868,12 @@ def _print_table(
     print()
 
 
-def _frames(text: str) -> list[int] | None:
-    """Indices that ``--frames`` states, None where it states none."""
+def _frames(text: str, option: str = "--frames") -> list[int] | None:
+    """Indices that an option states, None where it states none."""
     try:
         return [int(part) for part in text.split(",")] if text else None
     except ValueError:
-        raise InputError(f"--frames are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
+        raise InputError(f"{option} are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
 
 
 def _explain_first_run() -> None:

@@ -6,12 +6,14 @@ import errno
 import inspect
 import io
 import logging
+import math
 import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping
 from functools import wraps
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -29,6 +31,7 @@ __all__ = [
     "help_where_alone",
     "main",
     "optional",
+    "picture_beside",
     "read_pair",
     "read_place",
     "read_shape",
@@ -187,10 +190,19 @@ _EXAMPLES = {
 }
 
 
+def picture_beside(table: Path) -> Path:
+    """The picture of a table's name; an `InputError` where that is the table itself, which it would replace."""
+    if table.suffix.lower() == ".png":
+        raise InputError(f"--out is the table, such as {table.with_suffix('.csv').name}, not {table.name!r}")
+    return table.with_suffix(".png")
+
+
 def read_pair(text: str, option: str) -> tuple[float, float]:
-    """The two numbers of ``LOW:HIGH``; an `InputError` where it is something else."""
+    """The two finite numbers of ``LOW:HIGH``; an `InputError` where it is something else."""
     try:
         low, high = map(float, text.split(":"))
+        if not math.isfinite(low + high):
+            raise ValueError(text)
     except ValueError:
         raise InputError(f"{option} is LOW:HIGH, such as -0.01:0.01, not {text!r}") from None
     return low, high

@@ -225,26 +225,27 @@ def draw_camera(estimate: CameraEstimate, path: Path) -> None:
 
     camera = estimate.camera
     rows, columns = camera.shape
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    axes = figure.subplots(1, 3)
     y, x = np.mgrid[0 : rows - 1 : 24j, 0 : columns - 1 : 24j]
     grid = np.stack([x.ravel(), y.ravel()], axis=1)
     shown = list(zip(estimate.views, estimate.lens.residuals, strict=True)) if estimate.lens else []
     if estimate.plane_view and estimate.plane:
         shown.append((estimate.plane_view, estimate.plane.residual))
-    largest = max((np.abs(residual).max() for _, residual in shown), default=1.0)
-    unit = float(f"{max(largest, 1e-6):.0e}")
-    for view, residual in shown:
-        axes[0].quiver(*view.pixels.T, *residual.T, angles="xy", scale_units="width", scale=10 * unit, width=0.003)
-    axes[0].set_title(f"residuals of the points (a tenth of the width: {unit:g} px)" if shown else "no residuals")
+    count = 3 if shown else 2  # a file has no residuals
+    figure = Figure(figsize=(4.3 * count, 4.2), layout="constrained")
+    axes = figure.subplots(1, count)
+    if shown:
+        unit = float(f"{max(1e-6, *(np.abs(residual).max() for _, residual in shown)):.0e}")
+        for view, residual in shown:
+            axes[0].quiver(*view.pixels.T, *residual.T, angles="xy", scale_units="width", scale=10 * unit, width=0.003)
+        axes[0].set_title(f"residuals of the points (a tenth of the width: {unit:g} px)")
     if camera.lens is not None:
         shift = np.linalg.norm(distorted(camera.lens, grid) - grid, axis=1).reshape(x.shape)
-        axes[1].clabel(axes[1].contour(x, y, shift, cmap="viridis"), fmt="%.2f")
-    axes[1].set_title("distortion, px" if camera.lens is not None else "no lens calibrated")
+        axes[-2].clabel(axes[-2].contour(x, y, shift, cmap="viridis"), fmt="%.2f")
+    axes[-2].set_title("distortion, px" if camera.lens is not None else "no lens calibrated")
     if camera.homography is not None:
         scale = np.sqrt(np.linalg.det(camera.jacobian(grid))).reshape(x.shape)
-        axes[2].clabel(axes[2].contour(x, y, 100 * (scale / scale.mean() - 1), cmap="viridis"), fmt="%.3f")
-    axes[2].set_title("scale on the plane, % of its mean" if camera.homography is not None else "no plane calibrated")
+        axes[-1].clabel(axes[-1].contour(x, y, 100 * (scale / scale.mean() - 1), cmap="viridis"), fmt="%.3f")
+    axes[-1].set_title("scale on the plane, % of its mean" if camera.homography is not None else "no plane calibrated")
     for axis in axes:
         axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal", xlabel="x, px", ylabel="y, px")
     figure.savefig(path, dpi=120)

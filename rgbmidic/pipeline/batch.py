@@ -34,6 +34,8 @@ logger = logging.getLogger(__name__)
 
 _NAME = re.compile(r"[\w][\w .+-]{0,79}")
 """What a test may be called: it names a folder."""
+SUMMARIES = ("summary.csv", "summary.html")
+"""Table and page of a batch, beside the folders of its tests."""
 _QUANTILE = 99
 """Percentile of the nodes that stands for the largest value in a frame: single outliers do not count."""
 _FIELDS = ("magnitude", "e1", "equivalent")
@@ -96,7 +98,7 @@ def read_tests(paths: Sequence[Path]) -> list[BatchTest]:
     Raises
     ------
     InputError
-        Two tests would have one name.
+        Two tests would have one name, or a file is missing.
     """
     stems = [path.stem for path in paths]
     names = [
@@ -106,7 +108,10 @@ def read_tests(paths: Sequence[Path]) -> list[BatchTest]:
     for path, name in zip(paths, names, strict=True):
         document: dict[str, Any] = {"path": str(path)}  # read when its turn comes: a damaged one does not stop the rest
         tests.append(BatchTest(name=name, document=document, base=path.parent))
-    return _checked(tests)
+    tests = _checked(tests)
+    if missing := [str(path) for path in paths if not path.is_file()]:
+        raise InputError(f"there is no settings file {', '.join(missing)}")
+    return tests
 
 
 def read_table(template: Path, table: Path) -> list[BatchTest]:
@@ -139,6 +144,8 @@ def read_table(template: Path, table: Path) -> list[BatchTest]:
             f'the table {table} needs a first column "test" and keys such as "frames.path"; its columns are '
             f"{', '.join(head) or 'none'}"
         )
+    if twice := [name for name in dict.fromkeys(head) if head.count(name) > 1]:
+        raise InputError(f"the table {table} has several columns of one name: {', '.join(twice)}")
     tests = []
     for number, row in enumerate(rows[1:], 2):
         if len(row) != len(head):
@@ -160,13 +167,12 @@ def _value(text: str) -> Any:
 
 
 def _checked(tests: list[BatchTest]) -> list[BatchTest]:
-    names = [test.name for test in tests]
-    for name in names:
-        if not _NAME.fullmatch(name) or names.count(name) > 1:
-            why = (
-                "is the name of two tests" if _NAME.fullmatch(name) else "names no test: letters, digits, . _ + - only"
-            )
-            raise InputError(f'"{name}" {why}')
+    names = [test.name.casefold() for test in tests]  # as file systems without capitals take them
+    for name, folded in zip((test.name for test in tests), names, strict=True):
+        if not _NAME.fullmatch(name) or folded in SUMMARIES:
+            raise InputError(f'"{name}" names no test: letters, digits, . _ + - only, and not {" or ".join(SUMMARIES)}')
+        if names.count(folded) > 1:
+            raise InputError(f'"{name}" is the name of two tests')
     if not tests:
         raise InputError("a batch needs one test or more")
     return tests
@@ -178,6 +184,7 @@ def run_batch(
     *,
     workers: int | None = 1,
     elastic: tuple[float, float] = ELASTIC,
+    overwrite: bool = False,
     conclude: Callable[[Result, TestSettings, bool], None] | None = None,
     progress: Callable[[str], Callable[[int, int, str], None]] | None = None,
 ) -> Iterator[Outcome]:
@@ -193,6 +200,8 @@ def run_batch(
         As of `measure`.
     elastic
         Strains between which moduli are fitted.
+    overwrite
+        Whether a result of other settings, calibration or frames may be replaced; else the test fails.
     conclude
         Called with each result, its settings, and whether it was measured now.
     progress
@@ -206,7 +215,7 @@ def run_batch(
     for test in tests:
         folder = out / test.name
         try:
-            yield _outcome(test, folder, workers, elastic, conclude, progress and progress(test.name))
+            yield _outcome(test, folder, workers, elastic, overwrite, conclude, progress and progress(test.name))
         except (RgbmidicError, OSError) as error:
             yield Outcome(name=test.name, folder=folder, reason=str(error))
 
@@ -216,6 +225,7 @@ def _outcome(
     folder: Path,
     workers: int | None,
     elastic: tuple[float, float],
+    overwrite: bool,
     conclude: Callable[[Result, TestSettings, bool], None] | None,
     progress: Callable[[int, int, str], None] | None,
 ) -> Outcome:
@@ -236,7 +246,10 @@ def _outcome(
     try:
         result = measure(settings, folder, resume=there, workers=workers, progress=count)
     except AnotherTestError as error:
-        logger.warning("%s is measured again: %s", test.name, str(error).rpartition("; ")[0])
+        reason = str(error).rpartition("; ")[0]
+        if not overwrite:
+            raise ResultError(f"{reason}; --overwrite measures it again") from None
+        logger.warning("%s is measured again: %s", test.name, reason)
         result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
     if conclude is not None:
         conclude(result, settings, moved)

@@ -253,7 +253,7 @@ def scale_text(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
     """Say what the best-fitting scale of all frames is, and what it means for a modulus."""
     scale, std = comparison.best_scale([made.fit for made in done])
     if not np.isfinite(scale):
-        return "the simulation is a rigid motion in all frames: it has no scale to be found"
+        return "no scale is found: the simulation is a rigid motion in all frames, or too few of its nodes have data"
     text = f"{scale:.4f} ± {std:.2g} times the simulation fits the measurement best, with any shift and rotation: "
     away, rest = abs(scale - 1) / std if std else np.inf, float(np.median([made.fit.chi_square for made in done]))
     if away <= 2:

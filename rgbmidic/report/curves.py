@@ -207,6 +207,7 @@ def profile_figure(profile: Profile, wave: Wave | None = None, shown: Sequence[i
             above.set_title(literal(profile.field.label))
         finish_plot(above, label_of_times, position, whole=profile.times is None)
         above.grid(visible=False)
+        below.set_title(profile.how, pad=15, fontsize=8)  # above the power of ten of the numbers
         for row, shade in zip(rows, np.linspace(0, 0.85, len(rows)), strict=True):
             look: dict[str, Any] = {"color": colormaps["plasma"](shade), "linewidth": 1.1}
             name = (

@@ -90,7 +90,7 @@ class Curve:
         Raises
         ------
         InputError
-            The file is no such table, or has no such column.
+            The file is no such table or has no such column, or an offset is stated for a history.
         """
         path = Path(path)
         with suppress(OSError, UnicodeDecodeError), path.open(encoding="utf-8-sig", newline="") as file:
@@ -105,6 +105,8 @@ class Curve:
                     table = np.array([[float(row[at] or "nan") for at in wanted] for row in rows]).reshape(-1, 2)
                 except (ValueError, IndexError):
                     raise InputError(f"the table {path} is damaged: a row is not numbers") from None
+                if offset:
+                    raise InputError(f"an offset is of channels; {path} is a history, by the frames' own clock")
                 return cls(name=name, times=table[:, 0], values=table[:, 1], timed=timed)
         channels = Channels.read(path, offset)
         name = _chosen(path, column, list(channels.values))
@@ -323,10 +325,13 @@ class _Canvas:
         aspect = (bottom - top) / (right - left)
         self.figure = style.draw_figure(draw, count=count, aspect=aspect, beside=style.BAR, title=" ")
         self.figure.set_dpi(drawer.width / self.figure.get_figwidth())
+        groups = [drawer.maps.field(part.name.removesuffix("_std")).group for part in drawer.fields]
+        texts = {drawer.maps.how.get(group, "") for group in groups}
+        self._how = "; ".join(sorted(text for text in texts if sum(text in other for other in texts) == 1))
         canvas: Any = FigureCanvasAgg(self.figure)
         self._canvas = canvas
         self._title = self.figure.texts[0]
-        self._title.set_visible(False)
+        self._title.set(visible=False, fontsize=8)  # two lines have room
         canvas.draw()
         self._title.set_visible(True)
         self._bare = canvas.copy_from_bbox(self.figure.bbox)
@@ -353,7 +358,7 @@ class _Canvas:
     def _draw_curve(self, axis: Axes, curve: Curve) -> None:
         times, label = style.time_axis(curve.times if curve.timed else None, curve.times)
         axis.plot(times, curve.values, linewidth=1, color=style.OKABE_ITO["blue"])
-        axis.set_title(style.literal(curve.name))
+        axis.set_title(style.literal(curve.name), pad=15)  # above the power of ten of the numbers
         style.finish_plot(axis, label, "", whole=not curve.timed)
         self._factor = style.time_unit(curve.times)[0] if curve.timed else 1.0
         (self._cursor,) = axis.plot([], [], color="k", linewidth=1.0, animated=True)
@@ -404,7 +409,7 @@ class _Canvas:
             else f"{self._clock[0] * drawer.times[frame]:.{self._clock[2]}f} {self._clock[1]}   "
         )
         remark = "" if status == "converged" else f" ({status})"
-        self._title.set_text(f"{time}frame {frame}{remark}")
+        self._title.set_text("\n".join(filter(None, (f"{time}frame {frame}{remark}", self._how))))
         self.figure.draw_artist(self._title)
         if self._curve is not None:
             now = frame if not self._curve.timed or drawer.times is None else self._factor * drawer.times[frame]
@@ -440,14 +445,18 @@ def _pages(drawer: _Drawer, frames: list[int], processes: int) -> Iterator[Page]
     )  # without what was read, which each reads for itself
     drawer = replace(drawer, maps=maps)
     context, started, ends = multiprocessing.get_context("spawn"), [], []
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which they inherit: Ctrl-C reaches all processes
     try:
-        for part in range(processes):
-            receive, send = context.Pipe(duplex=False)
-            process = context.Process(target=_draw, args=(drawer, frames[part::processes], send), daemon=True)
-            process.start()
-            send.close()
-            started.append(process)
-            ends.append(receive)
+        try:
+            for part in range(processes):
+                receive, send = context.Pipe(duplex=False)
+                process = context.Process(target=_draw, args=(drawer, frames[part::processes], send), daemon=True)
+                process.start()
+                send.close()
+                started.append(process)
+                ends.append(receive)
+        finally:
+            signal.signal(signal.SIGINT, before)
         for number in range(len(frames)):
             try:
                 page = ends[number % processes].recv()

@@ -396,6 +396,8 @@ class Profile:
         Fraction of the variance that all frames have in common.
     rate_window
         Time that a rate is taken over; 0 for what is no rate.
+    how
+        How the field is derived (`Maps.how`).
     """
 
     field: MapField
@@ -408,6 +410,7 @@ class Profile:
     std: FloatArray
     common_fraction: float
     rate_window: float
+    how: str = ""
 
     @classmethod
     def along(cls, maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | AnyArray) -> Self:
@@ -426,6 +429,7 @@ class Profile:
         values, std = np.full((2, len(chosen), len(line.points)), np.nan)
         profile = cls(
             field=found,
+            how=maps.how.get(found.group, ""),
             line=line,
             frames=chosen,
             numbers=result.number[chosen],

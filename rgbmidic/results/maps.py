@@ -251,6 +251,9 @@ class Maps:
         frames = len(self.result)
         if since is not None and not 0 <= since < frames:
             raise InputError(f"there is no frame {since} in a result of {frames} frames (0 to {frames - 1})")
+        if since is not None and self.result.finished[since] and np.isnan(self.result.frame(since).u).all():
+            reason = self.result.frame(since).reason or "no node"
+            raise InputError(f"nothing is known since frame {since}, in which nothing is measured: {reason}")
         window = window or int(self.result.setting("probes", "window", 0)) or WINDOW
         if window < _FEWEST:
             raise InputError(f"rates are taken over a window of {_FEWEST} frames or more, not {window}")

@@ -231,8 +231,8 @@ class Channels:
         Raises
         ------
         InputError
-            The file is missing, has no such header, a field is no number, the times do not rise, or the trigger is not
-            one of the channels or constant.
+            The file is missing, has no such header, a field is no number, two columns have one name, the times do not
+            rise, or the trigger is not one of the channels or constant.
         """
         path = Path(path)
         try:
@@ -249,6 +249,8 @@ class Channels:
             raise InputError(
                 f'the channels {path} need a header line: "time_s" (or time_ms, time_us) and the name of each channel'
             )
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"the channels {path} have several columns of one name: {', '.join(twice)}")
         table = _numbers(path, lines[1:], separator, len(names))
         times = table[:, 0] * _SECONDS[(unit[1] or "s").lower()]
         if len(times) < 2 or not (np.diff(times) > 0).all():

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.interpolation import paint_field
+from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.results import Result
@@ -230,6 +231,10 @@ class RawPictures:
     @cached_property
     def _series(self) -> FrameSeries:
         provenance = self.result.provenance
+        if "settings" not in provenance:
+            raise FrameError(
+                f"{self.result.path} does not state where its raw frames are: it was not measured from files"
+            )
         settings = TestSettings.from_mapping(provenance["settings"], provenance["base"])
         return open_series(settings.frames, settings.base)
 

@@ -509,7 +509,10 @@ def test_movie_and_profile_write_what_is_asked_for_or_nothing(command: Run, tmp_
     line = ("--line", "20,40:100,45")
     for arguments, message in (
         (("movie", result, "--out", movie, "--range", "1"), "--range is LOW:HIGH"),
+        (("movie", result, "--out", movie, "--range", "0:inf"), "--range is LOW:HIGH"),
         (("movie", result, "--out", movie, "--over", "mask"), "--over is reference or frame"),
+        (("movie", result, "--out", movie, "--column", "a"), "--column and --offset are of a --curve FILE"),
+        (("movie", result, "--out", movie, "--offset", "1"), "--column and --offset are of a --curve FILE"),
         (("movie", result, "--out", movie, "--frames", "7:9"), "none of them is measured"),
         (("movie", result, "--out", movie, "--field", "w"), 'there is no field "w"'),
         (("profile", result, "--out", table, "--line", "1,2"), "--line is X0,Y0:X1,Y1"),
@@ -517,6 +520,11 @@ def test_movie_and_profile_write_what_is_asked_for_or_nothing(command: Run, tmp_
         (("profile", result, "--out", table, *line, "--speed", "wave"), "front or peak"),
         (("profile", result, "--out", table, *line, "--field", "exx", "--speed", "front"), "no front"),
         (("profile", result, "--out", table, "--line", "20,40:900,40"), "half or more of the line"),
+        (("profile", result, "--out", table, *line, "--level", ".3"), "--level is of --speed front"),
+        (("profile", result, "--out", table, *line, "--curves", "2,9"), "--curves 2,9: frames [9] are not among"),
+        (("profile", result, "--out", table, *line, "--curves", "a"), "--curves are whole numbers"),
+        (("profile", result, "--out", tmp_path / "p.png", *line), "--out is the table, such as p.csv, not 'p.png'"),
+        (("history", result, "--out", tmp_path / "h.PNG", "--point", "30,40"), "--out is the table, such as h.csv"),
     ):
         status, out, err = command(*arguments)
         assert (status, out) == (2, "")

@@ -37,7 +37,9 @@ def test_a_failed_test_does_not_stop_the_rest_and_a_measured_one_is_kept(small: 
     assert outcomes[0].values["peak_magnitude_px"] == pytest.approx(0.6, abs=0.3)
     kept = (out / "first" / "provenance.json").read_bytes()
     table.write_text("test,mesh.element_size\nfirst,30\nlast,40\n")
-    again = list(run_batch(read_table(template, table), out))
+    other = list(run_batch(read_table(template, table), out))
+    assert [outcome.reason.split(";")[-1] for outcome in other] == ["", " --overwrite measures it again"]
+    again = list(run_batch(read_table(template, table), out, overwrite=True))
     assert [outcome.measured for outcome in again] == [False, True]
     assert again[0].values == outcomes[0].values
     assert (out / "first" / "provenance.json").read_bytes() == kept
@@ -77,11 +79,16 @@ def test_tests_of_one_name_and_tables_without_keys_are_refused(tmp_path: Path) -
     with pytest.raises(InputError, match="is the name of two tests"):
         read_tests([tmp_path / "a.toml", tmp_path / "a.toml"])
     (tmp_path / "a.toml").write_text("")
+    with pytest.raises(InputError, match=r"no settings file .*b\.toml$"):
+        read_tests([tmp_path / "a.toml", tmp_path / "b.toml"])
     for text, message in (
         ("name,x\n", 'a first column "test"'),
         ("test,speed\n", 'a first column "test"'),
         ("test,channels.area\na\n", "row 2 .* has 1 fields"),
         ("test,channels.area\n../a,1\n", "names no test"),
+        ("test,channels.area\nSummary.csv,1\n", "names no test"),
+        ("test,channels.area\nA,1\na,1\n", "is the name of two tests"),
+        ("test,channels.area,channels.area\na,1,2\n", "several columns of one name: channels.area"),
         ("test,channels.area\n", "one test or more"),
     ):
         (tmp_path / "t.csv").write_text(text)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import replace
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -10,10 +12,11 @@ import numpy as np
 import pytest
 from results import NODES, make_result, smooth_record
 
-from rgbmidic.errors import InputError, ResultError
+from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.report import movie
 from rgbmidic.report.movie import Curve, write_movie
 from rgbmidic.results import FrameRecord, Maps
+from rgbmidic.view.picture import RawPictures
 
 
 @pytest.fixture(scope="module")
@@ -55,12 +58,35 @@ def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
         np.testing.assert_allclose(at, colormaps["viridis"](value + 0.5)[:3], atol=0.03)
 
 
-def test_pages_are_the_same_for_any_number_of_processes(maps: Maps) -> None:
+def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
+    since = replace(maps, since=2)
+    drawer = movie._Drawer.of(since, ("u", "exx_std"), [4], None, images=None, curve=None, colours=None)
+    canvas = drawer.opened()
+    canvas.page(4)
+    first, how = canvas._title.get_text().splitlines()
+    assert first.endswith("frame 4")
+    assert how == since.how["Strain"]
+    assert how.endswith(", since frame 2")
+    page, box = canvas.figure.bbox, canvas._title.get_window_extent()
+    assert page.y0 <= box.y0 < box.y1 <= page.y1
+
+
+def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
+    start, handlers = SpawnProcess.start, []
+
+    def starting(process: SpawnProcess) -> None:
+        handlers.append(signal.getsignal(signal.SIGINT))
+        start(process)
+
+    monkeypatch.setattr(SpawnProcess, "start", starting)
+    before = signal.getsignal(signal.SIGINT)
     curve = Curve(name="force_N", times=np.linspace(0, 5e-5, 9), values=np.arange(9.0), timed=True)
     drawer = movie._Drawer.of(maps, ("exx", "velocity"), [0, 2, 4], None, images=None, curve=curve, colours=None)
     alone, shared = (list(movie._pages(drawer, [0, 2, 4], count)) for count in (1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(alone, shared, strict=True))
     assert not np.array_equal(alone[0], alone[1])
+    assert handlers == [signal.SIG_IGN] * 2  # inherited: a Ctrl-C while they import is no traceback of theirs
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) -> None:
@@ -110,6 +136,8 @@ def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path:
     ):
         with pytest.raises(InputError, match=message):
             write_movie(maps, tmp_path / name, fields, **more)
+    with pytest.raises(FrameError, match=r"result does not state where its raw frames are"):
+        write_movie(maps, tmp_path / "m.gif", ["u"], images=RawPictures(result=maps.result))
     assert not list(tmp_path.iterdir())
     (tmp_path / "there.gif").write_text("kept")
     with pytest.raises(ResultError, match="already exists"):
@@ -128,3 +156,5 @@ def test_a_curve_is_a_column_of_a_history_or_a_channel(tmp_path: Path) -> None:
     assert Curve.read(channels, offset=1.0).times[0] == 1.0
     with pytest.raises(InputError, match="it has a_px, b"):
         Curve.read(history, "c")
+    with pytest.raises(InputError, match="an offset is of channels"):
+        Curve.read(history, "b", offset=1.0)

@@ -289,6 +289,9 @@ def test_a_result_of_mesh_file_is_compared_by_number_where_the_simulation_has_an
     made = Comparison(result, simulation, place(result)).frame(1)
     assert np.abs(made.difference("nodes", "u")).max() < 1e-9
     assert np.abs(made.ratio("nodes", "v")).max() < 1e-6
+    (tmp_path / "t.csv").write_text("\n".join(["node,u_mm,v_mm", *rows, rows[3]]))
+    with pytest.raises(InputError, match=f"two rows or more for node {mesh.node_numbers[order[3]]} at one time"):
+        Simulation.read(tmp_path / "t.csv", mesh=measured_mesh(result))
 
 
 def test_nodes_on_two_sides_of_a_crack_are_told_apart_by_their_numbers(tmp_path):

@@ -237,6 +237,7 @@ def test_channels_are_brought_to_the_frames_and_make_a_stress(result: Result, tm
         ("0,1\n1,2\n", r"need a header line: \"time_s\""),
         ("time_s,a\n0,1\n", "must rise from row to row, over two rows or more"),
         ("time_s,a\n0,1\n0,2\n", "must rise"),
+        ("time_s,a,b,a\n0,1,2,3\n1,1,2,3\n", "several columns of one name: a"),
         ("time_s,a\n0,x\n1,2\n", r"row 2 of the channels .* is not numbers"),
         ("time_s,a\n0,1\n1,2,3\n", r"row 3 of the channels .* has 3 fields, the header 2"),
         ("", "need a header line"),

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nodal_tests import MESH, NodalTest
-from results import make_result
+from results import NODES as SMALL
+from results import make_result, smooth_record
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import strain_of_gradient
@@ -182,3 +183,13 @@ def test_a_value_within_two_standard_uncertainties_of_zero_is_doubtful(noisy: li
 def test_bad_choices_are_refused(exact: Result, act: Callable[[Result], object], says: str) -> None:
     with pytest.raises(InputError, match=says):
         act(exact)
+
+
+def test_nothing_is_known_since_a_frame_that_failed(tmp_path: Path) -> None:
+    def record(index: int) -> FrameRecord:
+        bad = {"number": 1, "status": 2, "reason": "no texture", "node_status": np.ones(SMALL)}
+        return FrameRecord.of(nodes=SMALL, lights=3, **bad) if index == 1 else smooth_record(index)
+
+    result = make_result(tmp_path / "r", frames=3, record=record)
+    with pytest.raises(InputError, match="nothing is known since frame 1, in which nothing is measured: no texture"):
+        Maps.of(result, since=1)
