@@ -137,7 +137,7 @@ def write_cases(folder: Path, size: int, cases: list[str]) -> None:
 
 def registered_states(size: int, plain: FloatArray) -> tuple[FloatArray, Any]:
     """The star pair (2, 3, H, W) as three lights through a lens see it, and their registration, as a lens has it."""
-    from rgbmidic.illumination.registration import Registration, frame_geometry
+    from rgbmidic.illumination.images import Registration, frame_geometry
 
     centre, radius = frame_geometry((size, size))
     parameters = [[0.0] * 5, [0.6, -0.3, 3e-4, 8e-4, 3e-4], [-0.4, 0.5, -2e-4, -6e-4, -4e-4]]

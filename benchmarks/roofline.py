@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rgbmidic._kernels.illumination import unmix
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients
-from rgbmidic._kernels.lights import unmix
 from rgbmidic._kernels.threads import set_threads
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.mesh import Region, Tri3Mesh

@@ -19,8 +19,8 @@ import numpy as np
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities
+from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
-from rgbmidic.illumination.registration import Registration
 from rgbmidic.report.style import literal
 from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray

@@ -14,8 +14,8 @@ from rich.table import Table
 from rgbmidic.fields.plane import LENS_PARAMETERS, CameraCalibration, distorted
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
-from rgbmidic.illumination.registration import Registration
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design
 from rgbmidic_calibration.jobs import CameraEstimate

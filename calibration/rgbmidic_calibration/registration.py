@@ -3,7 +3,7 @@
 With one light on, every colour plane of the camera shows the same picture, each with its own strength. Each plane
 divided by its local mean gives that picture at every pixel, with no demosaicing and no crosstalk matrix. The
 displacement between the pictures of two lights (`rgbmidic.correlate`) is then fitted by shift, rotation,
-scale and a radial term (`rgbmidic.illumination.registration`).
+scale and a radial term (`rgbmidic.illumination.images`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from rgbmidic.correlation.solution import NodeStatus, Solution
 from rgbmidic.errors import CalibrationError, RgbmidicError
-from rgbmidic.illumination.registration import PARAMETERS, Registration, frame_geometry, registration_basis
+from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry, registration_basis
 from rgbmidic.pipeline import correlate
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.captures import TemporalStack, same_camera

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
-from rgbmidic.illumination.registration import Registration
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import TILE, Captures, TemporalStack, same_camera, stack_frames, tile_means
 from rgbmidic_calibration.ratio import BlockMeans, block_centres, block_means

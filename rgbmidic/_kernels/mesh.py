@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-from rgbmidic._kernels.interpolation import _FAST
-from rgbmidic._kernels.texture import between
+from rgbmidic._kernels.interpolation import _FAST, between
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
 __all__ = [

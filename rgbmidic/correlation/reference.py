@@ -18,8 +18,8 @@ from rgbmidic._kernels.correlation import (
     interpolate_nodal,
     warp,
 )
+from rgbmidic._kernels.illumination import gradient_of_others
 from rgbmidic._kernels.interpolation import pixel_gradient, sample_with_gradient
-from rgbmidic._kernels.lights import gradient_of_others
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
 from rgbmidic.correlation.images import (
@@ -32,7 +32,7 @@ from rgbmidic.correlation.images import (
 )
 from rgbmidic.correlation.recovery import NodeColouring, linear_fit_offset
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.registration import Registration
+from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 

@@ -1,6 +1,6 @@
 """Raw mosaic to illumination images: linearise, demosaic, unmix, reflection index, weights.
 
-The names below are imported on first use: spectra and calibration files are read without the kernels.
+The names below are imported on first use.
 """
 
 from importlib import import_module
@@ -20,7 +20,7 @@ _HOMES = {
     "demosaic": "separation",
     "linearise": "linear",
     "separate": "separation",
-    "unmix": "unmixing",
+    "unmix": "crosstalk",
 }
 
 

@@ -16,8 +16,8 @@ from typing import Any, TypeVar, cast
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
-from rgbmidic.illumination.registration import Registration
 from rgbmidic.settings import FrameKind, plain, read_section, read_table, regular
 
 __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk", "read_document", "write_document"]

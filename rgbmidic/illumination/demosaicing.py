@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.lights import PAD, malvar, pad_mosaic
+from rgbmidic._kernels.illumination import PAD, malvar, pad_mosaic
 from rgbmidic._kernels.mesh import TILE, fill_unknown, predict
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels

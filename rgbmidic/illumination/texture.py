@@ -47,7 +47,7 @@ WHITE_ENERGY = float((_BINOMIAL[::2] ** 2).sum() ** 2)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BandEnergy:
-    """Second moments of the planes' low-passed contrast (`rgbmidic._kernels.texture.cell_moments`) for unit texture.
+    """Second moments of the planes' low-passed contrast, `cell_moments` of the kernels, for unit texture.
 
     Attributes
     ----------
@@ -155,8 +155,8 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     Parameters
     ----------
     sums, counts : ndarray, shape (L, 6)
-        As `rgbmidic._kernels.texture.lag_products` gives them, of contrast divided by the square root of the low-passed
-        planes' own moments.
+        As `lag_products` of the kernels gives them, of contrast divided by the square root of the low-passed planes'
+        own moments.
     correlations : ndarray, shape (3,)
         Mean over the field of the low-passed planes' correlation, red-green, red-blue, green-blue.
     agreement

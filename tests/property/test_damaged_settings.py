@@ -14,8 +14,8 @@ import pytest
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
+from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.linear import CameraNoise, Quantity
-from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic.scene.scene import read_scene
 from rgbmidic.settings import TestSettings, read_test
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.registration import Registration, frame_geometry
+from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
 from rgbmidic.lab.virtual.dataset import dark_frames, target_scene
 from rgbmidic.pipeline import measure

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from calibration_scene import MATRICES, expose, registered_pictures
 
-from rgbmidic.illumination.registration import Registration, frame_geometry
+from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.registration import estimate_registration
 

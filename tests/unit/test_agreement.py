@@ -22,7 +22,7 @@ from rgbmidic.frames.data import Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.frames.stored import StoredFrame, raw_frame
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.registration import Registration
+from rgbmidic.illumination.images import Registration
 from rgbmidic.lab.inspection import inspect_files, state_frames
 from rgbmidic.pipeline import Plan
 from rgbmidic.settings import FrameSettings

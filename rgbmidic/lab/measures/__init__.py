@@ -1,6 +1,5 @@
 """How the paper judges a set-up and a specimen, for any data: perturbation P, goniometry, topography."""
 
-from rgbmidic.lab.measures.goniometry import Goniometry, Lobe, fit_lobe, goniometry, pixel_levels
 from rgbmidic.lab.measures.perturbation import (
     Area,
     area_means,
@@ -9,10 +8,15 @@ from rgbmidic.lab.measures.perturbation import (
     perturbation,
     residual_percent,
 )
-from rgbmidic.lab.measures.topography import (
+from rgbmidic.lab.measures.surface import (
+    Goniometry,
+    Lobe,
     detrend,
+    fit_lobe,
+    goniometry,
     local_slope,
     paint_classes,
+    pixel_levels,
     rms_slope,
     slope_uncertainty,
     wrinkle_spacing,

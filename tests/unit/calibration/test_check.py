@@ -10,8 +10,8 @@ from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.ratio import block_means
 from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, read_limits, registration_left

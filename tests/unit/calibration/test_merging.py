@@ -10,8 +10,8 @@ import pytest
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
+from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise, Quantity
-from rgbmidic.illumination.registration import Registration
 from rgbmidic_calibration.design import draw_calibration
 from rgbmidic_calibration.jobs import merge_files
 

@@ -9,7 +9,7 @@ from calibration_scene import BLACK, MATRICES, WHITE, expose, registered_picture
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.registration import Registration, frame_geometry, registration_basis
+from rgbmidic.illumination.images import Registration, frame_geometry, registration_basis
 from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.registration import estimate_registration, jitter, light_picture
 

@@ -13,7 +13,7 @@ from rgbmidic.correlation import Deformed, Reference, Start
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import find_start
-from rgbmidic.illumination.registration import Registration
+from rgbmidic.illumination.images import Registration
 from rgbmidic.settings import SolverSettings
 
 SHAPE = (240, 300)

@@ -11,7 +11,7 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
-from rgbmidic.illumination.registration import Registration
+from rgbmidic.illumination.images import Registration
 
 WHOLE, CROP, ORIGIN = (300, 401), (90, 121), (273, 35)
 LIGHTS = ("red", "green", "blue")

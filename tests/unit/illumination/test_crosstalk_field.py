@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from naive_calibration import unmix_field as naive_unmix_field
 
-from rgbmidic._kernels.lights import unmix as unmix_kernel
+from rgbmidic._kernels.illumination import unmix as unmix_kernel
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products, unmix
 from rgbmidic.illumination.linear import LinearChannels

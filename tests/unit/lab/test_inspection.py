@@ -21,8 +21,8 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import CrosstalkField
+from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel, linearise
-from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame

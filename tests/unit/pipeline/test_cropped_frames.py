@@ -14,7 +14,7 @@ from rgbmidic.errors import CalibrationError, FrameError
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.registration import Registration
+from rgbmidic.illumination.images import Registration
 from rgbmidic.lab.inspection import inspect_files
 from rgbmidic.pipeline import Plan
 

@@ -18,8 +18,8 @@ from rgbmidic import Calibration, Status, measure, read_test
 from rgbmidic.frames import Mosaic, Window, write_tiff
 from rgbmidic.frames.data import ChannelFrame, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
+from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.illumination.registration import Registration
 from rgbmidic.pipeline import Plan, plan
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings
