@@ -261,7 +261,7 @@ def make_probe(
     place: Sequence[float],
     settings: ProbeSettings,
 ) -> Probe:
-    """Make a probe, named by its kind and number.
+    """Make a probe, named by its kind and number, or as the settings do.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def make_probe(
     place
         The numbers of `PROBES`, px of the image.
     settings
-        Strain measure of a strain gauge; material and fit of a crack's tip.
+        Strain measure of a strain gauge; material and fit of a crack's tip; names.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def make_probe(
         The place is outside the region, or no place for it.
     """
     points, lengths, make = PROBES[kind]
-    name = f"{kind}_{number}"
+    name = dict(settings.names).get(f"{kind}_{number}", f"{kind}_{number}")
     if len(place) != 2 * points + lengths:
         raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(place)}")
     more: dict[str, Any] = {"measure": settings.measure} if kind == "strain_gauge" else {}

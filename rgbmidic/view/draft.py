@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+import cv2
 import numpy as np
 import tomlkit
 from bokeh.document import Document
@@ -16,14 +17,19 @@ from bokeh.models import ColumnDataSource
 from tomlkit.exceptions import TOMLKitError
 
 from rgbmidic.errors import ConfigurationError
+from rgbmidic.mesh import Region
+from rgbmidic.report.style import OKABE_ITO
+from rgbmidic.results import Result
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_section, read_toml
-from rgbmidic.view.address import Mark
+from rgbmidic.view.address import Mark, Steps
 from rgbmidic.view.canvas import Canvas, columns
 
-__all__ = ["HOLES", "OUTLINES", "Draft", "RegionDrawing", "arranged", "marks_of", "region_of", "rings"]
+__all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "RegionDrawing", "arranged", "marks_of"]
+__all__ += ["mask_images", "masks_of", "region_of", "rings"]
 
 _FILES = ("frames.path", "calibration.file", "region.mask", "weights.geometry", "weights.height_map", "weights.images")
+_FILES += ("mesh.file", "scale.camera", "channels.file")
 """Keys that name files."""
 
 
@@ -71,6 +77,38 @@ class Draft:
             return draft
         file = Path.cwd() / "TEST.toml"
         return cls(file=file, text="").changed({"frames": {"path": str(path.resolve())}})
+
+    @classmethod
+    def of_result(cls, result: Result, file: Path) -> Self:
+        """Read a TEST.toml beside a result, or begin one with the settings that the result was measured with.
+
+        Parameters
+        ----------
+        result
+            The result.
+        file
+            The TEST.toml, relative to the folder of that of the result.
+
+        Returns
+        -------
+        Draft
+            The draft.
+
+        Raises
+        ------
+        ConfigurationError
+            As `of`; or the file lies neither beside the result nor in the folder of its test.
+        """
+        base = Path(result.provenance.get("base", result.path.parent))
+        folders, file = {base.resolve(), result.path.resolve().parent}, (base / file).resolve()
+        if file.suffix.lower() != ".toml" or file.parent not in folders:
+            raise ConfigurationError(f"{file} must end in .toml and be in {' or '.join(sorted(map(str, folders)))}")
+        if file.exists():
+            return cls.of(file)
+        settings = {name: dict(section) for name, section in result.provenance.get("settings", {}).items()}
+        frames = settings.setdefault("frames", {})
+        frames["path"] = [str(base / path) for path in frames.get("path", ())]
+        return cls(file=file, text="").changed(settings)
 
     @property
     def document(self) -> dict[str, Any]:
@@ -158,6 +196,10 @@ class Draft:
             )
         return replace(self, file=file)
 
+    def check(self) -> None:
+        """Check that the draft is a complete test; errors as `write`."""
+        TestSettings.from_mapping(self.document, self.file.parent)
+
     def write(self) -> None:
         """Write the TEST.toml.
 
@@ -168,14 +210,30 @@ class Draft:
         ResultError
             The file cannot be written.
         """
-        TestSettings.from_mapping(self.document, self.file.parent)
+        self.check()
         write_complete(self.file, lambda file: file.write(self.text.encode("utf-8")))
+
+
+class Confirmation:
+    """Second press of a button, which lets files that exist be replaced."""
+
+    def __init__(self) -> None:
+        self._asked: object = None
+
+    def missing(self, files: Sequence[Path], what: str) -> str:
+        """Return what to confirm; empty where no file exists, or where the same was asked just before."""
+        there = [str(file) for file in files if file.exists()]
+        asked = (there, what) if there and self._asked != (there, what) else None
+        self._asked = asked
+        return f"{', '.join(there)} exists: press again to replace {what}." if asked else ""
 
 
 OUTLINES = {"rectangle": 2, "polygon": 3, "circle": 2}
 """Kinds of an outline and the marks that it takes at least: opposite corners; corners; the centre and a place on it."""
 HOLES = {"hole": 3, "round hole": 2}
 """Kinds of a hole and the marks that it takes at least."""
+MASK = "mask"
+"""Kind of a polygon in which a light does not count."""
 _ROUND = 48
 """Corners of the polygon that stands for a circle: within 1 - cos(pi / 48) = 0.2 % of its radius."""
 
@@ -229,9 +287,33 @@ def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
 
 def _holes(marks: Sequence[Mark]) -> list[Ring]:
     """Return the corners of the complete holes."""
-    names = [mark.kind for mark in marks if mark.kind not in OUTLINES]
+    names = [mark.kind for mark in marks if mark.kind not in OUTLINES and not mark.kind.startswith(MASK)]
     complete = [name for name in dict.fromkeys(names) if names.count(name) >= HOLES[name.rpartition(" ")[0]]]
     return [_corners(name, marks) for name in complete]
+
+
+def masks_of(marks: Sequence[Mark]) -> dict[str, list[Ring]]:
+    """Return the corners of the complete masks of each light that has some."""
+    names, found = [mark.kind for mark in marks if mark.kind.startswith(MASK)], dict[str, list[Ring]]()
+    for name in dict.fromkeys(names):
+        if names.count(name) >= HOLES["hole"]:
+            found.setdefault(name.split(" ", 2)[2], []).append(_corners(name, marks))
+    return found
+
+
+def mask_images(masks: Mapping[str, Sequence[Ring]], lights: Sequence[str], shape: tuple[int, int]) -> list[bytes]:
+    """Return a picture (PNG) for each light: 0 within its masks, 255 elsewhere.
+
+    Raises
+    ------
+    ConfigurationError
+        A mask is of none of the lights.
+    """
+    if other := [light for light in masks if light not in lights]:
+        raise ConfigurationError(f"there is a mask of {', '.join(other)}, but the lights are {', '.join(lights)}")
+    whole = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape)
+    kept = [whole.without(masks.get(light, ())).mask for light in lights]
+    return [cv2.imencode(".png", np.uint8(255) * mask.astype(np.uint8))[1].tobytes() for mask in kept]
 
 
 def _corners(name: str, marks: Sequence[Mark]) -> Ring:
@@ -246,8 +328,7 @@ def _corners(name: str, marks: Sequence[Mark]) -> Ring:
 
 _SOON = 60
 """Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
-_KEPT = 100
-"""Steps that can be undone: more than a hand takes back one by one, at some hundred bytes each."""
+_COLOURS = list(OKABE_ITO.values())
 
 
 class RegionDrawing:
@@ -263,26 +344,31 @@ class RegionDrawing:
         Marks at first.
     changed
         Called when they have changed.
+
+    Attributes
+    ----------
+    light
+        Name of the light of which masks are drawn from now on.
     """
 
     def __init__(
         self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], changed: Callable[[], None]
     ) -> None:
         self._document, self._canvas, self._changed = document, canvas, changed
-        self._history, self._hole, self._moved, self._coming = [marks], 1, False, False
+        self.light = ""
+        self._steps, self._hole, self._coming = Steps(marks), 1, False
         self._rings = ColumnDataSource(columns("xs ys colour"), name="rings")
         canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
         canvas.marks.on_change("data", lambda attr, old, new: self._marked())
 
     @property
-    def region(self) -> dict[str, Any] | None:
-        """Keys of ``[region]``; None where no outline is complete."""
-        return region_of(self._history[-1])
+    def marks(self) -> tuple[Mark, ...]:
+        """The marks."""
+        return self._steps.now
 
-    def undo(self) -> None:
-        """Return to the marks before the last step."""
-        if len(self._history) > 1:
-            self._history.pop()
+    def go(self, *, back: bool) -> None:
+        """Return to the marks before the last step, or do it again."""
+        self._steps.go(back=back)
         self.draw()
 
     def clear(self) -> None:
@@ -290,20 +376,21 @@ class RegionDrawing:
         self._keep(())
 
     def next_hole(self) -> None:
-        """Let the marks of a hole that are set from now on belong to another one."""
-        holes = [mark.kind for mark in self._history[-1] if mark.kind.startswith("hole ")]
-        self._hole = max((int(kind.rpartition(" ")[2]) for kind in holes), default=0) + 1
+        """Let the marks of a hole or a mask that are set from now on belong to another one."""
+        numbers = [mark.kind.split(" ")[1] for mark in self.marks if mark.kind.startswith(("hole ", MASK))]
+        self._hole = max(map(int, numbers), default=0) + 1
 
     def draw(self) -> None:
         """Draw the marks and the lines."""
         self._coming = False
-        self._canvas.place(self._history[-1])
-        outline, holes = rings(self._history[-1])
-        closed = [[*ring, *ring[:1]] for ring in (outline, *holes)]
+        self._canvas.place(self.marks)
+        outline, holes = rings(self.marks)
+        masks = [(ring, _COLOURS[at % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
+        closed = [[*ring, *ring[:1]] for ring in (outline, *holes, *(ring for ring, _ in masks))]
         self._rings.data = {
             "xs": [[x for x, _ in ring] for ring in closed],
             "ys": [[y for _, y in ring] for ring in closed],
-            "colour": ["#56b4e9", *["#e69f00"] * len(holes)],
+            "colour": ["#56b4e9", *["#e69f00"] * len(holes), *(colour for _, colour in masks)],
         }
         self._changed()
 
@@ -312,20 +399,19 @@ class RegionDrawing:
 
         A polygon's number is that of the present hole; a round hole is complete with two marks.
         """
-        before, now = self._history[-1], list[Mark]()
+        before, now = self.marks, list[Mark]()
         for mark in self._canvas.set:
-            number = self._hole
-            if mark.kind == "round hole":
+            kind, number = mark.kind, self._hole
+            if kind == "round hole":
                 number = 1 + sum(other.kind.startswith("round hole ") for other in now) // HOLES["round hole"]
-            now.append(Mark(f"{mark.kind} {number}", mark.x, mark.y) if mark.kind in HOLES else mark)
+            kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
+            now.append(Mark(kind, mark.x, mark.y))
         if tuple(self._canvas.set) != before:
             new = next((mark.kind for mark in self._canvas.set if mark not in before), "")
-            self._keep(arranged(now, new), moved=len(now) == len(before))
+            self._keep(arranged(now, new))
 
-    def _keep(self, marks: tuple[Mark, ...], *, moved: bool = False) -> None:
-        """Set the marks; the moves of a mark that is dragged are one step."""
-        before = self._history[:-1] if moved and self._moved else self._history
-        self._history, self._moved = [*before[-_KEPT:], marks], moved
+    def _keep(self, marks: tuple[Mark, ...]) -> None:
+        self._steps.keep(marks)
         if not self._coming:
             self._coming = True
             self._document.add_timeout_callback(self.draw, _SOON)

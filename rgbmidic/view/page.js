@@ -65,6 +65,12 @@ document.addEventListener("keydown", (event) => {
   const target = event.composedPath()[0];
   const writing = target.tagName === "SELECT" || (target.tagName === "INPUT" && target.type !== "range");
   const page = Bokeh.documents[0];
+  const back = !event.shiftKey && event.key === "z", again = event.key === "y" || (event.shiftKey && event.key === "Z");
+  if (page && !writing && (event.ctrlKey || event.metaKey) && (back || again)) {
+    const button = page.get_model_by_name(back ? "undo" : "redo");
+    if (button) Bokeh.index.get_one(button).el.shadowRoot.querySelector("button").click();
+    event.preventDefault();
+  }
   if (writing || event.ctrlKey || event.altKey || event.metaKey || !page) return;
   const slider = page.get_model_by_name("frame"), play = page.get_model_by_name("play");
   const step = page.get_model_by_name("step").value || 1;

@@ -78,6 +78,16 @@ class DraftFrames:
             calibration = calibration.cropped(draft.frames.crop_origin, shape)
         return cls(series=series, calibration=calibration, shape=shape)
 
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the lights as the calibration has them, else as the run names those of monochrome frames."""
+        known = self.calibration or Calibration()
+        for part in (known.crosstalk, known.registration):
+            if part is not None:
+                return tuple(part.lights)
+        count = max(self.series.turn, len(self.series.lights))
+        return ("light",) if count == 1 else tuple(f"light {number + 1}" for number in range(count))
+
     def raw(self, index: int) -> tuple[Picture, npt.NDArray[np.bool_]]:
         """Read a raw frame as a picture (H, W), and where a channel is saturated (H, W)."""
         frame = self.series.read(index)[0]
@@ -142,10 +152,12 @@ class SetupControls(Controls):
         self.glare = bk.Checkbox(label="mark saturated samples", active=True, **self.small)
         shapes = ["Move", "Rectangle", "Polygon", "Circle"]
         self.mode = bk.RadioButtonGroup(labels=shapes, active=0, name="mode", **wide)
-        self.hole = bk.RadioButtonGroup(labels=["Hole", "Round hole"], active=None, name="hole", **wide)
-        self.undo, self.next, self.clear, self.inspect, self.write = (
-            bk.Button(label=name, **wide) for name in ("Undo", "Next hole", "Clear", "Inspect", "Write TEST.toml")
+        self.hole = bk.RadioButtonGroup(labels=["Hole", "Round hole", "Lamp mask"], active=None, name="hole", **wide)
+        labels = ("Undo", "Redo", "Next", "Clear", "Inspect", "Write TEST.toml")
+        self.undo, self.redo, self.next, self.clear, self.inspect, self.write = (
+            bk.Button(label=name, name=name.lower(), **wide) for name in labels
         )
+        self.light = bk.Select(title="Masks are of", name="light", **wide)
         self.size = bk.Spinner(title="Element size (px)", name="size", low=4, value=size, step=1, **wide)
         self.reference = bk.Spinner(title="Reference", name="reference", value=reference, **number)
         self.first = bk.Spinner(title="First", name="first", value=frames.first, **number)
@@ -156,8 +168,9 @@ class SetupControls(Controls):
         self.go = bk.Button(label="Run", button_type="primary", **wide)
         self.ran = bk.Div(name="ran", **wide)
         line = partial(row, sizing_mode="stretch_width")
-        buttons, numbers = line(self.undo, self.next, self.clear), line(self.reference, self.first, self.last)
-        shown = (self.description, self.picture, self.glare, self.mode, self.hole, buttons, self.size, numbers)
+        buttons = line(self.undo, self.redo, self.next, self.clear)
+        sizes, numbers = line(self.light, self.size), line(self.reference, self.first, self.last)
+        shown = (self.description, self.picture, self.glare, self.mode, self.hole, buttons, sizes, numbers)
         self.side = column(*shown, self.calibration, self.inspect, self.theme, sizing_mode="stretch_width")
 
 
