@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlencode
 
-from rgbmidic.fields import MEASURES
-from rgbmidic.settings import PROBE_NAME, ChannelSettings
+from rgbmidic.fields import MEASURES, Units
+from rgbmidic.settings import PROBE_NAME, ChannelSettings, ScaleSettings
 
 __all__ = ["BESIDE", "CLOCKS", "KINDS", "MARKS", "OVER", "PALETTES", "SCALE", "UNCERTAINTY", "Mark", "Steps"]
 __all__ += ["ViewState", "probe_marks", "probe_place"]
@@ -166,6 +166,8 @@ class ViewState:
         Channel that is drawn beside the curves; empty: none.
     distance, distance_std
         Distance of the two scale marks in mm and its standard uncertainty; 0: not stated.
+    camera
+        File with lens and plane in place of that; empty: none.
     theme
         ``"light"``, ``"dark"``, or empty: as the browser likes it.
     window
@@ -212,6 +214,7 @@ class ViewState:
     beside: str = ""
     distance: float = 0.0
     distance_std: float = 0.0
+    camera: str = ""
     theme: str = ""
     window: tuple[float, ...] = ()
     marks: tuple[Mark, ...] = ()
@@ -265,6 +268,23 @@ class ViewState:
         return ChannelSettings(
             file=base / self.channels, area=self.area or None, force=self.force or None, **clocks[self.clock]
         )
+
+    def scale_settings(self, base: Path, kept: ScaleSettings) -> ScaleSettings | None:
+        """Return ``[scale]`` as it is in view, its file relative to a folder, with the frame rate kept; None: none.
+
+        Raises
+        ------
+        InputError
+            Two scale marks and their distance make no scale.
+        """
+        if self.camera:
+            return ScaleSettings(camera=base / self.camera, frame_rate=kept.frame_rate)
+        ends = [(mark.x, mark.y) for mark in self.marks if mark.kind == SCALE]
+        if len(ends) < 2 or not self.distance:
+            return None
+        units = Units.from_points(ends, self.distance, length_std=self.distance_std)
+        scale = {"mm_per_pixel": units.mm_per_pixel, "mm_per_pixel_std": units.mm_per_pixel_std}
+        return ScaleSettings(**scale, frame_rate=kept.frame_rate)
 
     def query(self) -> str:
         """Return the address without the frame: all that differs from the defaults."""

@@ -21,12 +21,22 @@ from rgbmidic.mesh import Region
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Result
 from rgbmidic.results.files import write_complete
-from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_section, read_toml
-from rgbmidic.view.address import Mark, Steps
+from rgbmidic.settings import (
+    ChannelSettings,
+    FrameSettings,
+    ProbeSettings,
+    RegionSettings,
+    ScaleSettings,
+    TestSettings,
+    plain,
+    read_section,
+    read_toml,
+)
+from rgbmidic.view.address import KINDS, Mark, Steps
 from rgbmidic.view.canvas import Canvas, columns
 
-__all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "RegionDrawing", "arranged", "marks_of"]
-__all__ += ["mask_images", "masks_of", "region_of", "rings"]
+__all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "RegionDrawing", "arranged", "channel_section"]
+__all__ += ["marks_of", "mask_images", "masks_of", "probe_section", "region_of", "rings", "scale_section"]
 
 _FILES = ("frames.path", "calibration.file", "region.mask", "weights.geometry", "weights.height_map", "weights.images")
 _FILES += ("mesh.file", "scale.camera", "channels.file")
@@ -109,6 +119,11 @@ class Draft:
         frames = settings.setdefault("frames", {})
         frames["path"] = [str(base / path) for path in frames.get("path", ())]
         return cls(file=file, text="").changed(settings)
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the file has this content."""
+        return self.file.exists() and self.file.read_text(encoding="utf-8-sig") == self.text
 
     @property
     def document(self) -> dict[str, Any]:
@@ -214,13 +229,58 @@ class Draft:
         write_complete(self.file, lambda file: file.write(self.text.encode("utf-8")))
 
 
+def probe_section(draft: Draft, made: ProbeSettings) -> dict[str, Any]:
+    """Return the keys of ``[probes]`` for probes set with the pointer, to a thousandth of a pixel; others stay."""
+    kept = read_section(ProbeSettings, "probes", draft.section("probes"))
+    keys = {f"{kind}s": [[round(value, 3) for value in place] for place in getattr(made, f"{kind}s")] for kind in KINDS}
+    names = [list(pair) for pair in kept.names if pair[0].rpartition("_")[0] not in KINDS]
+    names += [list(pair) for pair in made.names]
+    measure = {"measure": made.measure} if made.measure != kept.measure else {}
+    return {**{key: value or None for key, value in keys.items()}, "names": names or None, **measure}
+
+
+def channel_section(draft: Draft, stated: ChannelSettings) -> dict[str, Any]:
+    """Return the keys of ``[channels]``, the file relative to the TEST.toml where it is beside it.
+
+    Raises
+    ------
+    ConfigurationError
+        No file is stated.
+    """
+    if stated.file is None:
+        raise ConfigurationError("state the channels' file first (channels.file)")
+    beside = stated.file.resolve().parent == draft.file.parent
+    keys = {**plain(stated), "file": stated.file.name if beside else str(stated.file.resolve())}
+    return {key: value or None for key, value in keys.items()}
+
+
+def scale_section(draft: Draft, stated: ScaleSettings | None) -> dict[str, Any]:
+    """Return the keys of ``[scale]``, the scale rounded as `rgbmidic scale` prints it.
+
+    Raises
+    ------
+    ConfigurationError
+        No scale is stated.
+    """
+    if stated is None:
+        raise ConfigurationError("set two points and state their distance in mm, or name the camera file")
+    keys: dict[str, Any] = dict.fromkeys(("mm_per_pixel", "mm_per_pixel_std", "camera"))
+    if (camera := stated.camera) is not None:
+        return {
+            **keys,
+            "camera": camera.name if camera.resolve().parent == draft.file.parent else str(camera.resolve()),
+        }
+    rounded = {"mm_per_pixel": float(f"{stated.mm_per_pixel:.6g}")}
+    return {**keys, **rounded, "mm_per_pixel_std": float(f"{stated.mm_per_pixel_std:.2g}")}
+
+
 class Confirmation:
     """Second press of a button, which lets files that exist be replaced."""
 
     def __init__(self) -> None:
         self._asked: object = None
 
-    def missing(self, files: Sequence[Path], what: str) -> str:
+    def question(self, files: Sequence[Path], what: str) -> str:
         """Return what to confirm; empty where no file exists, or where the same was asked just before."""
         there = [str(file) for file in files if file.exists()]
         asked = (there, what) if there and self._asked != (there, what) else None

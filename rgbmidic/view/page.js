@@ -34,6 +34,11 @@ const rgbmidic = {
     sections.forEach((one, place) => { one.visible = place === group.active; });
   },
 
+  // While a curve can be dragged the plot itself stays where it is.
+  hold({toggle, pan}) {
+    pan.active = !toggle.active;
+  },
+
   turn({theme}) {
     const address = new URL(location.href);
     address.searchParams.set("theme", theme);

@@ -22,8 +22,18 @@ from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import RegionSettings, read_section
 from rgbmidic.view.canvas import Canvas, Tiles
-from rgbmidic.view.draft import HOLES, MASK, OUTLINES, Confirmation, Draft, RegionDrawing, mask_images, marks_of
-from rgbmidic.view.draft import masks_of, region_of
+from rgbmidic.view.draft import (
+    HOLES,
+    MASK,
+    OUTLINES,
+    Confirmation,
+    Draft,
+    RegionDrawing,
+    marks_of,
+    mask_images,
+    masks_of,
+    region_of,
+)
 from rgbmidic.view.fields import Background, every, guarded, warning
 from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, Overlay, paint, palette
@@ -64,7 +74,7 @@ class SetupPage:
         self.source = DraftFrames.of(draft)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
-        self._inspected, self._opened = 0, draft.file
+        self._inspected, self._opened = 0, draft.file if draft.is_file else None
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.state = SharedState(name="state", asked=reference, shown=reference)
         self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
@@ -95,7 +105,8 @@ class SetupPage:
         p.light.on_change("value", lambda attr, old, new: self._choose_light())
         p.calibration.on_change("value", lambda attr, old, new: self._guarded(self._reopen))
         for button, act in (
-            (p.undo, partial(self.drawing.go, back=True)), (p.redo, partial(self.drawing.go, back=False)), (p.next, self.drawing.next_hole), (p.clear, self.drawing.clear),
+            (p.undo, partial(self.drawing.go, back=True)), (p.redo, partial(self.drawing.go, back=False)),
+            (p.next, self.drawing.next_hole), (p.clear, self.drawing.clear),
             (p.inspect, self._inspect), (p.write, self._write), (p.go, self._run),
         ):  # fmt: skip
             button.on_click(partial(self._guarded, act))
@@ -245,7 +256,7 @@ class SetupPage:
             draft = draft.changed({"weights": {"method": "images", "images": names}})
         draft.check()
         files = [*pictures, *([draft.file] if draft.file != self._opened else [])]
-        if asked := self.confirmation.missing(files, "it" if len(files) == 1 else "them"):
+        if asked := self.confirmation.question(files, "it" if len(files) == 1 else "them"):
             self.parts.message.text = warning(asked)
             return False
         for file, content in pictures.items():

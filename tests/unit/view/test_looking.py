@@ -21,7 +21,7 @@ from rgbmidic.results import FrameRecord, Maps, MapValues, Result, ResultStore
 from rgbmidic.results.histories import write_histories
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.view import curves
-from rgbmidic.view.address import KINDS, Mark, ViewState
+from rgbmidic.view.address import KINDS, Mark, ViewState, probe_marks
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.fields import frame_text, pointer_text, range_of_test, robust_range, watched
 from rgbmidic.view.page import ResultPage
@@ -183,7 +183,7 @@ def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(tmp_
     result = make_result(tmp_path / "result", frames=4, record=smooth_record)
     set_ = [Mark("point", 50, 40), Mark("gauge", 30, 30), Mark("gauge", 90, 30), Mark("point", 60, 40)]
     histories = curves.read(result, set_, 60.0)
-    groups = {name: [told.name for told in own] for name, own in curves.groups(histories).items()}
+    groups = {name: [told.name for told in own] for name, own in curves.groups(histories, probe_marks(set_)).items()}
     assert groups["u (px)"] == ["point_1_u", "point_2_u"]
     assert groups["extension (px)"] == ["gauge_1_extension"]
     write_histories(histories, tmp_path / "own.csv")
@@ -234,7 +234,7 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(5))
     for index in (0, 1, 4):
         store.write_frame(index, smooth_record(index))
-    panel = CurvePanel(Document(), chosen="", select=Select(), message=Div(), hint="")
+    panel = CurvePanel(Document(), chosen="", select=Select(), message=Div(), told=Div(), hint="")
     panel.histories = curves.read(Result.open(store.path, partial=True), [Mark("point", 50, 40)], 60.0)
     shown = []
     for frame in range(5):
