@@ -24,7 +24,7 @@ MARKS = (*KINDS, SCALE)
 CLOCKS = ("offset", "trigger", "correlation")
 """Ways to relate the time of channels to that of the frames."""
 OVER = ("reference", "deformed")
-_LEAST, _LARGEST = {"levels": 2}, 10**9
+_LEAST, _LARGEST = {"levels": 2, "rate_window": 0}, 10**9
 _LONGEST = 1000
 """Letters of a text in an address: a path on a disk has seldom more."""
 _MOST_MARKS = 200
@@ -243,7 +243,7 @@ class ViewState:
         asked = {entry.name: _value(entry.name, texts.get(entry.name, ""), names) for entry in fields(cls)}
         stated: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         view = cls(**{"frame": frame, **stated})
-        view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1)), cls()
+        view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1), since=min(view.since, frames - 1)), cls()
         return view if view.low < view.high else replace(view, low=plain.low, high=plain.high, range="frame")
 
     def with_channels(self, stated: ChannelSettings) -> Self:
@@ -252,9 +252,9 @@ class ViewState:
             return self
         align, align_to = stated.align or ("", "")
         clock = CLOCKS[1] if stated.trigger else CLOCKS[2] if stated.align else CLOCKS[0]
-        texts = {"trigger": stated.trigger or "", "align": align, "align_to": align_to, "force": stated.force or ""}
-        numbers = {"offset": stated.offset, "area": stated.area or 0.0}
-        return replace(self, channels=str(stated.file), clock=clock, **texts, **numbers)
+        keys: dict[str, Any] = {"clock": clock, "offset": stated.offset, "area": stated.area or 0.0}
+        keys |= {"trigger": stated.trigger or "", "align": align, "align_to": align_to, "force": stated.force or ""}
+        return replace(self, channels=str(stated.file), **keys)
 
     def channel_settings(self, base: Path) -> ChannelSettings:
         """Return ``[channels]`` as it is in view, its file relative to a folder; what is not chosen yet is left out."""
@@ -283,8 +283,8 @@ class ViewState:
         if len(ends) < 2 or not self.distance:
             return None
         units = Units.from_points(ends, self.distance, length_std=self.distance_std)
-        scale = {"mm_per_pixel": units.mm_per_pixel, "mm_per_pixel_std": units.mm_per_pixel_std}
-        return ScaleSettings(**scale, frame_rate=kept.frame_rate)
+        std = units.mm_per_pixel_std
+        return ScaleSettings(mm_per_pixel=units.mm_per_pixel, mm_per_pixel_std=std, frame_rate=kept.frame_rate)
 
     def query(self) -> str:
         """Return the address without the frame: all that differs from the defaults."""

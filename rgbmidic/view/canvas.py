@@ -111,6 +111,8 @@ class Canvas:
         self.plot.add_tools(pan, wheel, box, reset, save, *draw)
         self.plot.toolbar.active_drag, self.plot.toolbar.active_scroll, self.plot.toolbar.logo = pan, wheel, None
         if like:
+            self.plot.toolbar_location = None
+            self.plot.on_event(RangesUpdate, like._moved)
             return
         self.plot.name = "plot"
         self.plot.on_event(RangesUpdate, self._moved)

@@ -47,10 +47,10 @@ def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
     for numbered, (kind, place) in zip(stated.numbered, stated.places, strict=True):
         if kind not in KINDS:
             continue
-        (x, y), end = place[:2], place[2:]
+        x, y, *end = place
         marks.append(Mark(kind, x, y, names.get(numbered, "")))
         if KINDS[kind] > 1:
-            marks.append(Mark(kind, x + end[0], y) if kind == "circle" else Mark(kind, *end))
+            marks.append(Mark(kind, x + end[0], y) if kind == "circle" else Mark(kind, end[0], end[1]))
     return tuple(marks)
 
 

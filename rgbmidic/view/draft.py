@@ -38,8 +38,10 @@ from rgbmidic.view.canvas import Canvas, columns
 __all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "RegionDrawing", "arranged", "channel_section"]
 __all__ += ["marks_of", "mask_images", "masks_of", "probe_section", "region_of", "rings", "scale_section"]
 
-_FILES = ("frames.path", "calibration.file", "region.mask", "weights.geometry", "weights.height_map", "weights.images")
-_FILES += ("mesh.file", "scale.camera", "channels.file")
+_FILES = (
+    "frames.path", "calibration.file", "region.mask", "weights.geometry", "weights.height_map", "weights.images",
+    "mesh.file", "scale.camera", "channels.file",
+)  # fmt: skip
 """Keys that name files."""
 
 

@@ -80,6 +80,8 @@ class Controls:
         )
         self.play = bk.Toggle(label="▶ Play", name="play", width=90, **self.small)
         self.step = bk.Spinner(name="step", low=1, high=most, value=1, width=70, **self.small)
+        self.step.html_attributes = {"role": "group", "aria-label": "frames that Play and the arrow keys go on by"}
+        self.description.html_attributes = {"aria-live": "polite"}
         self.player = row(self.play, self.step, self.frame, sizing_mode="stretch_width")
 
     def ask(self, state: SharedState) -> None:
@@ -159,6 +161,8 @@ class ResultControls(Controls):
         self.under = bk.Div(name="under", **wide)
         self.section = bk.RadioButtonGroup(labels=list(SECTIONS), active=0, name="section", **wide)
         self.mode = bk.RadioButtonGroup(labels=list(MODES), active=0, name="mode", **wide)
+        for group, says in ((self.over, "image"), (self.section, "controls shown"), (self.mode, "what a click sets")):
+            group.html_attributes = {"role": "group", "aria-label": says}
         self.curve = bk.Select(title="Curve", name="curve", **wide)
         labels = ("Lock the range", "Undo", "Redo", "Clear", "Save CSV", "Save PNG", "Write", "Take its probes")
         self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.take = (
@@ -244,7 +248,7 @@ class MarkLayer:
         self.colours: dict[str, str] = {}
         self._canvas, self._elements, self._shown = canvas, elements, dict[Mark, Mark]()
         self._drawn: object = None
-        self._joined = bk.ColumnDataSource(columns(_PROBE))
+        self._joined = bk.ColumnDataSource(columns(_PROBE), name="probes")
         canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
         canvas.plot.text("x", "y", "text", source=self._joined, text_color="colour", **LETTERS)
 

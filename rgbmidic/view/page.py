@@ -99,9 +99,15 @@ class ResultPage:
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=self.dark)
         self.canvas = Canvas(document, MARKS, view.window or Canvas.around(result.nodes), self._redraw)
         self.beside: list[Canvas] = []
-        self.directions, self.contours = LineLayer(self.canvas, "directions"), LineLayer(self.canvas, "contours", 0.8)
-        self.arrows, self.blank = LineLayer(self.canvas, "arrows"), LabelLayer(self.canvas, "blank", size=5)
-        self.marks, self.ends = MarkLayer(self.canvas, result.elements), LabelLayer(self.canvas, "extremes", size=9)
+        self.directions, self.contours = (
+            LineLayer(self.canvas, "direction lines"),
+            LineLayer(self.canvas, "contour lines", 0.8),
+        )
+        self.arrows, self.blank = LineLayer(self.canvas, "arrows"), LabelLayer(self.canvas, "blank nodes", size=5)
+        self.marks, self.ends = (
+            MarkLayer(self.canvas, result.elements),
+            LabelLayer(self.canvas, "extreme nodes", size=9),
+        )
         self.timeline = TimeLine(len(result), view.frame)
         texts: dict[str, Any] = {"message": p.message, "told": p.told, "hint": _HELP}
         self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, **texts)
@@ -320,12 +326,17 @@ class ResultPage:
         return [name for name in named if name in self.fields.all]
 
     def _arrange(self, count: int) -> None:
-        """Show so many canvases: side by side, two in a row, or one below the other where the field is wide."""
+        """Show so many canvases: side by side, two in a row, or one below the other where the field is wide.
+
+        They take the place of the curves too where there are none.
+        """
+        self.maps.css_classes = ["alone"] if count > 1 and not self.view.marks else []
         if count == sum(canvas.plot.visible for canvas in (self.canvas, *self.beside)):
             return
         while len(self.beside) < count - 1:
             self.beside.append(Canvas(self.document, (), self.canvas.wanted, self._redraw, like=self.canvas))
             self.beside[-1].plot.on_event(MouseMove, self._hover)
+            self.beside[-1].plot.name = f"plot_{len(self.beside) + 1}"
         for place, canvas in enumerate(self.beside):
             canvas.plot.visible = place < count - 1
         plots = [canvas.plot for canvas in (self.canvas, *self.beside)][:count]
@@ -364,6 +375,9 @@ class ResultPage:
         arrows, title = None, "times their length (0: as there is room)"
         if view.vectors:
             moved = self.fields.displacement(view.frame)[:2].T
+            if self.fields.physical.rectified.camera is not None:  # that is on the plane, the arrows are on the image
+                first = self.result.nodes if view.since < 0 else self.fields.read("u", view.since).moved
+                moved = values.moved - first
             arrows, longer = arrow_lines(window, nodes, moved, view.longer)
             title = f"{title}: {longer:.3g}"
         self.arrows.show(arrows)

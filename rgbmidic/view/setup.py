@@ -6,6 +6,7 @@ import html
 import re
 from collections.abc import Callable
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -260,7 +261,7 @@ class SetupPage:
             self.parts.message.text = warning(asked)
             return False
         for file, content in pictures.items():
-            write_complete(file, lambda out, content=content: out.write(content))
+            write_complete(file, methodcaller("write", content))
         draft.write()
         self.draft, self._opened = draft, draft.file
         written = html.escape(", ".join(map(str, (draft.file, *pictures))))

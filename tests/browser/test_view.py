@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -128,7 +129,7 @@ CUT = """(() => {
     if (one.shadowRoot) walk(one.shadowRoot);
   });
   walk(side);
-  return [cut, document.documentElement.scrollWidth - innerWidth];
+  return [cut, document.documentElement.scrollWidth - innerWidth, side.scrollHeight - side.clientHeight];
 })()"""
 
 
@@ -136,12 +137,140 @@ CUT = """(() => {
 @pytest.mark.parametrize("size", [(1280, 720), (1920, 1080)])
 def test_no_control_is_cut_off(driver, address, size, theme):
     driver.set_window_size(*size)
-    page = Page(driver, f"{address}?theme={theme}&range=hand&low=-1&high=1")
-    page.until("model('low').visible")
-    cut, beyond = page.run(CUT)
-    assert cut == []
-    assert beyond <= 0
+    driver.set_window_size(size[0], 2 * size[1] - driver.execute_script("return innerHeight"))
+    page = Page(driver, f"{address}?theme={theme}&range=hand&low=-1&high=1&second=uncertainty&frame=3")
+    page.until("model('low').visible && model('plot_2') !== null")
+    for name in ("step", "over", "section"):
+        assert page.run(f"Bokeh.index.get_one(model('{name}')).el.getAttribute('aria-label')")
+    assert driver.execute_script("return [innerWidth, innerHeight]") == list(size)
+    for section in range(5):
+        page.keys(str(section + 1))
+        page.until(f"model('section').active === {section}")
+        time.sleep(0.3)
+        cut, beyond, below = page.run(CUT)
+        assert cut == []
+        assert beyond <= 0
+        assert below <= 0, section
     driver.set_window_size(1280, 940)
+
+
+def numbers(text):
+    return [float(number) for number in re.findall(r"-?\d+\.?\d*(?:e[+-]?\d+)?", text)]
+
+
+def test_a_derived_field_and_its_uncertainty_are_those_of_the_library(driver, address, result):
+    page = Page(driver, f"{address}?frame=5&field=exx")
+    shown(page, 5)
+    for name, value in {"gauge": 80, "measure": "'hencky'", "since": 2, "second": "'uncertainty'"}.items():
+        page.do(f"model('{name}').value = {value}")
+    page.do("model('rigid').active = true; model('third').value = 'velocity'")
+    page.until("model('plot_3') && model('plot_3').title.text === 'velocity (px/frame)'")
+    page.until("model('description').text.includes('since frame 2')")
+    assert "Hencky, virtual strain gauge of 80 px" in page.run("model('description').text")
+    maps = Maps.of(result, gauge=80.0, measure="hencky", since=2, rigid_removed=True)
+    read, speed = maps.read("exx", 5), maps.read("velocity", 5)
+    node = int(np.argmin(np.hypot(*(result.nodes - [70, 45]).T)))
+    time.sleep(1)  # the plots take their new sizes
+    page.pointer(("move", *result.nodes[node]))
+    told = page.until("model('under').text.includes('exx = ') && model('under').text")
+    exx, std = numbers(told.partition("exx = ")[2])[:2]
+    assert (exx, std) == pytest.approx((read.values[node], read.std[node]), rel=0.02)
+    assert numbers(told.partition("velocity = ")[2])[0] == pytest.approx(speed.values[node], rel=0.05)
+    for plot, values in (("plot", read), ("plot_2", maps.read("exx_std", 5)), ("plot_3", speed)):
+        ends = page.run(f"[model('{plot}').right[0].color_mapper.low, model('{plot}').right[0].color_mapper.high]")
+        assert ends == pytest.approx(robust_range(values), rel=1e-6)
+    assert page.run("model('plot').x_range === model('plot_3').x_range")
+    held = parse_qs(urlsplit(driver.current_url).query)
+    assert (held["gauge"], held["since"], held["measure"], held["rigid"]) == (["80"], ["2"], ["hencky"], ["1"])
+
+
+def test_a_second_field_is_moved_with_the_first_and_painted_anew(driver, address):
+    from selenium.webdriver.common.action_chains import ActionBuilder
+
+    page = Page(driver, f"{address}?frame=5&field=u&second=v")
+    shown(page, 5)
+    page.until("model('plot_2') !== null && model('plot_2').inner_width > 100")
+    time.sleep(1)  # the plots take their new sizes
+    before = page.run("model('plot').x_range.start")
+    box = page.run(
+        "(() => { const b = Bokeh.index.get_one(model('plot_2')).el.getBoundingClientRect(); "
+        "return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+    )
+    actions = ActionBuilder(driver, duration=50)
+    actions.pointer_action.move_to_location(*map(round, box))
+    actions.pointer_action.pointer_down()
+    actions.pointer_action.move_to_location(round(box[0]) + 60, round(box[1]))
+    actions.pointer_action.pointer_up()
+    actions.perform()
+    page.until(f"model('plot').x_range.start < {before} - 5")
+    for plot in ("plot", "plot_2"):
+        page.until(f"Math.abs(model('{plot}').renderers[0].data_source.data.x[0] - model('plot').x_range.start) < 0.5")
+
+
+def test_extremes_arrows_contours_and_colours(driver, address, result):
+    page = Page(driver, f"{address}?frame=5&field=u")
+    shown(page, 5)
+    values = Maps.of(result).read("u", 5).values
+    page.do("['extremes', 'contours', 'vectors'].forEach((name) => { model(name).active = true; })")
+    page.do("model('levels').value = 8; model('palette').value = 'PuOr_r'")
+    page.until("model('colours').palette.length === 8 && model('extreme nodes').data.x.length === 2")
+    x, y, texts = (page.run(f"Array.from(model('extreme nodes').data.{name})") for name in ("x", "y", "text"))
+    nodes = [int(np.argmin(values)), int(np.argmax(values))]
+    np.testing.assert_allclose(np.transpose([x, y]), result.nodes[nodes])
+    assert [numbers(text)[0] for text in texts] == pytest.approx(values[nodes], rel=1e-4)
+    assert f"largest {values.max():.5g} px" in page.run("model('description').text")
+    low, high = robust_range(Maps.of(result).read("u", 5))
+    at = np.array(page.run("Array.from(model('contour lines').data.x0)"))
+    levels = np.unique(np.round(0.01 * (at - 60), 9))
+    np.testing.assert_allclose(levels, np.linspace(low, high, 9)[1:-1], atol=1e-6)
+    page.do("model('longer').value = 3")
+    page.until("model('longer').title.endsWith(': 3')")
+    x0, x1 = (np.array(page.run(f"Array.from(model('arrows').data.{name})")) for name in ("x0", "x1"))
+    shafts = len(x0) // 3
+    np.testing.assert_allclose((x1 - x0)[:shafts], 3 * 0.01 * (x0[:shafts] - 60), atol=1e-6)
+
+
+def test_a_range_is_locked_where_it_is(driver, address, result):
+    page = Page(driver, f"{address}?frame=5&field=u")
+    shown(page, 5)
+    page.do("model('section').active = 1")
+    page.until("document.querySelector('.side')")
+    ends = robust_range(Maps.of(result).read("u", 5))
+    page.driver.execute_script(*click("Lock the range"))
+    page.until("model('range').value === 'hand' && model('low').visible")
+    page.do("model('frame').value = 2")
+    shown(page, 2)
+    assert page.run("[model('colours').low, model('colours').high]") == pytest.approx(ends)
+    assert page.run("[model('low').value, model('high').value]") == pytest.approx(ends)
+
+
+def test_means_over_a_box_and_a_circle_stay_on_the_map(driver, address, result):
+    page = Page(driver, f"{address}?frame=5&field=u")
+    shown(page, 5)
+    for mode, ends in ((5, ((30, 20), (60, 60))), (6, ((80, 40), (90, 40))), (1, ((40, 30),))):
+        page.do(f"model('mode').active = {mode}")
+        page.pointer(*(("click", *end) for end in ends))
+    page.until("model('probes').data.text.length === 3")
+    for frame in (5, 2):
+        page.do(f"model('frame').value = {frame}")
+        shown(page, frame)
+        told = {
+            text.partition(":")[0]: numbers(text.partition(":")[2])
+            for text in page.run("Array.from(model('probes').data.text)")
+        }
+        for name, x in (("region 1 mean", 45), ("circle 1 mean", 80), ("point 1", 40)):
+            assert told[name][0] == pytest.approx(0.002 * frame * (x - 60), abs=0.006)
+            assert 0 < told[name][1] <= 0.0101
+    expected = read_histories(result, ProbeSettings(regions=((30, 20, 60, 60),)))["region_1_u"]
+    assert told["region 1 mean"][1] == pytest.approx(expected.std[2], rel=0.05)
+
+
+def test_nodes_without_data_have_their_reason(driver, address):
+    page = Page(driver, f"{address}?frame=3&blank=1")
+    shown(page, 3)
+    page.until(f"model('blank nodes').data.x.length === {NODES}")
+    page.pointer(("move", 60, 40))
+    page.until("model('under').text.includes('no light sees enough texture here')")
 
 
 def test_curves_of_a_gauge_that_is_set_and_dragged_are_those_of_history(driver, address, result):
@@ -153,6 +282,7 @@ def test_curves_of_a_gauge_that_is_set_and_dragged_are_those_of_history(driver, 
     page.pointer(("press", *ends(page)[1]), ("move", 90, 50), ("release", 80, 60))
     page.until("model('marks').data.y[1] > 55")
     check_gauge(page, result)
+    page.do("model('section').active = 4")
     page.do(
         "window.saved = ''; URL.createObjectURL = (blob) => { blob.text().then((t) => window.saved = t); return '#'; }"
     )

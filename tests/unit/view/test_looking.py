@@ -14,16 +14,18 @@ from bokeh.events import MouseMove
 from bokeh.models import Div, Select
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from results import LIGHTS, NODES, make_origin, make_result, random_record, smooth_record
+from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record, smooth_record
 
+from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import FrameRecord, Maps, MapValues, Result, ResultStore
-from rgbmidic.results.histories import write_histories
+from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.view import curves
-from rgbmidic.view.address import KINDS, Mark, ViewState, probe_marks
+from rgbmidic.view.address import KINDS, PALETTES, UNCERTAINTY, Mark, ViewState, probe_marks
+from rgbmidic.view.canvas import arrow_lines, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
-from rgbmidic.view.fields import frame_text, pointer_text, range_of_test, robust_range, watched
+from rgbmidic.view.fields import frame_text, pointer_text, probe_text, range_of_test, robust_range, watched
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, palette_name
 
@@ -37,6 +39,15 @@ looks = st.builds(
     over=st.sampled_from(["reference", "deformed"]),
     symmetric=st.booleans(),
     directions=st.booleans(),
+    second=st.sampled_from(["", UNCERTAINTY, *NAMES]),
+    palette=st.sampled_from(["", *PALETTES]),
+    levels=st.integers(2, 256),
+    hatched=st.booleans(),
+    longer=numbers.map(abs),
+    gauge=numbers.map(abs),
+    measure=st.sampled_from(MEASURES),
+    since=st.integers(-1, 9),
+    rate_window=st.integers(0, 99),
     curve=st.text("abc ()/²", max_size=9),
     theme=st.sampled_from(["", "light", "dark"]),
     marks=marks,
@@ -65,6 +76,9 @@ def test_an_address_of_nonsense_opens_something_that_can_be_shown(query):
     assert view.field in NAMES
     assert view.low < view.high
     assert 0 <= view.opacity <= 1
+    assert -1 <= view.since < 10
+    assert view.levels >= 2
+    assert view.rate_window >= 0
     assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in KINDS for mark in view.marks)
 
 
@@ -95,6 +109,60 @@ def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
     assert np.isnan(fraction[record.node_status != 0]).all()
     for name in (name for name in fields.all if not any(word in name for word in TIMED)):
         assert fields.read(name, 3).values.shape == (NODES,)
+
+
+def test_a_contour_lies_where_the_field_has_its_level_and_nowhere_beside_nodes_without_data():
+    nodes, elements = MESH.nodes, MESH.elements
+    values = nodes[:, 0] + 2 * nodes[:, 1]
+    values[7] = np.nan
+    lines = contour_lines(nodes, elements, values, [100.0, 130.0])
+    ends = lines.reshape(-1, 2)
+    np.testing.assert_allclose(np.unique(np.round(ends @ [1, 2], 9)), [100, 130])
+    beside = elements[(elements == 7).any(axis=1)].ravel()
+    low, high = nodes[beside].min(axis=0), nodes[beside].max(axis=0)
+    assert not ((ends > low + 1) & (ends < high - 1)).all(axis=1).any()
+    assert not len(contour_lines(nodes, elements, values, []))
+
+
+def test_arrows_point_along_the_displacement_and_the_longest_reaches_to_the_next():
+    window = Window(left=0, top=0, right=240, bottom=120, width=800, height=400)
+    moved = np.tile([0.3, -0.4], (NODES, 1))
+    lines, longer = arrow_lines(window, MESH.nodes, moved, 0.0)
+    shaft = (lines[:, 2:] - lines[:, :2])[: len(lines) // 3]
+    np.testing.assert_allclose(shaft, np.tile([0.6, -0.8], (len(shaft), 1)) * 0.9 * 10)
+    assert longer == pytest.approx(18)
+    assert arrow_lines(window, MESH.nodes, moved, 5.0)[1] == 5
+    point = lines[len(lines) // 3 :]
+    assert (np.einsum("md,d->m", point[:, 2:] - point[:, :2], [0.6, -0.8]) < 0).all(), "back from the end"
+
+
+def test_what_is_hatched_lies_below_zero():
+    window = Window(left=10, top=5, right=110, bottom=75, width=400, height=280)
+    over = {"nodes": MESH.nodes, "elements": MESH.elements, "values": np.ones(NODES), "ends": (0.0, 2.0)}
+    over |= {"colours": palette("viridis")}
+    grey = np.full((80, 120), 90, dtype=np.uint8)
+    plain, hatched = (paint(window, grey, Overlay(**over, beyond=beyond)) for beyond in (None, MESH.nodes[:, 0] - 60))
+    changed = plain != hatched
+    assert not changed[:, 202:].any()
+    assert changed[:, 2:198].mean() == pytest.approx(0.25, abs=0.02)
+    assert (hatched[changed] == 0xFF000000).all()
+
+
+def test_the_value_of_a_probe_is_its_mean_with_the_uncertainty_of_one(tmp_path):
+    result = make_result(tmp_path / "result", frames=6, record=smooth_record)
+    maps, box = Maps.of(result), (30.0, 20.0, 60.0, 60.0)
+    for name, most in (("u", ""), ("exx", " at most"), ("misfit", "")):
+        text = probe_text(maps, maps.all[name], maps.read(name, 5), "region", box)
+        assert text.endswith(most)
+        history = read_histories(result, ProbeSettings(regions=(box,)))["region_1_u"]
+        if name == "u":
+            assert text == f" mean: {maps.all[name].text(history.values[5], history.std[5])}"
+    assert probe_text(maps, maps.all["misfit"], maps.read("misfit", 5), "point", (50.0, 40.0)) == ": 1"
+    assert probe_text(maps, maps.all["node_status"], maps.read("node_status", 5), "point", (50.0, 40.0)) == ": measured"
+    assert probe_text(maps, maps.all["u"], maps.read("u", 5), "region", (200.0, 200.0, 300.0, 300.0)) == ""
+    exx = maps.read("exx", 5)
+    told = probe_text(maps, maps.all["exx"], exx, "region", box)
+    assert float(told.split("±")[1].split()[0]) <= exx.std.max() * 1.05
 
 
 def map_values(values, std):
@@ -370,6 +438,32 @@ def test_a_range_by_hand_that_makes_no_sense_is_told(tmp_path):
     page.parts.of["high"].value = 9.0
     assert "The colours go" not in page.parts.description.text
     assert (page.canvas.colours.low, page.canvas.colours.high) == (5, 9)
+
+
+def test_a_choice_that_cannot_be_is_told_and_the_next_one_counts(tmp_path):
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
+    page.parts.of["gauge"].value = 5.0
+    assert "at least 56.12 px long" in page.parts.description.text
+    assert page.values is None
+    page.parts.of["gauge"].value = 70.0
+    page.parts.of["field"].value = "exx"
+    assert "virtual strain gauge of 70 px" in page.parts.description.text
+    page.parts.of["field"].value = "velocity"
+    assert "rates need 4 measured frames or more; there are 2" in page.parts.description.text
+
+
+def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
+    reason = "the solve stopped because " + "of this and that " * 20
+    store = ResultStore.create(tmp_path / "result", make_origin(1))
+    store.write_frame(0, FrameRecord.failed(reason, nodes=NODES, lights=3))
+    store.finish()
+    maps = Maps.of(Result.open(tmp_path / "result"))
+    text = frame_text(maps, 0, maps.all["u"], maps.read("u", 0), "")
+    summary, _, rest = text.partition("</summary>")
+    assert "failed: the solve stopped because" in summary
+    assert summary.endswith("… more")
+    assert summary.rpartition("<b")[2].count("this and that") < 5
+    assert rest.count("this and that") > 15
 
 
 def test_a_page_whose_browser_has_gone_is_not_watched():
