@@ -41,7 +41,6 @@ from uncertainty_scenes import (
 from rgbmidic import correlate
 from rgbmidic.correlation import Solution
 from rgbmidic.fields import (
-    MEASURES,
     Nodal,
     NodalCovariance,
     at_nodes,
@@ -480,7 +479,7 @@ def probes(quick: bool) -> None:
     heading("probe", "quantity", "ratio", "covered", "ratio of the change")
     row("nodes", "u, v", rms(nodal), f"{covered(nodal):.1%}", "")
     for number, (kind, place) in enumerate(PLACES):
-        probe = make_probe(covariance, kind, number, place, MEASURES[0])
+        probe = make_probe(covariance, kind, number, place)
         read = [probe.histories(Nodal(**dict(zip(NODAL, draw[..., probe.nodes], strict=True)))) for draw in fields]
         for histories in zip(*read, strict=True):
             error, std = (np.stack([getattr(one, name) for one in histories]) for name in ("values", "std"))

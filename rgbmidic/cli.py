@@ -192,12 +192,6 @@ def batch(
     table: Annotated[
         Path | None, typer.Option("--table", help="CSV: a column test, and keys of TEST.toml that its values replace.")
     ] = None,
-    channels: Annotated[
-        Path | None, typer.Option("--channels", help="CSV beside each TEST.toml: time_s, then a column each.")
-    ] = None,
-    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
-    area: Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")] = None,
-    force: Annotated[str | None, typer.Option("--force", help="Channel with the force (_N or _kN).")] = None,
     elastic: Annotated[
         str, typer.Option("--elastic", metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
     ] = "0.0005:0.0025",
@@ -212,10 +206,9 @@ def batch(
     from rgbmidic.report import REPORT, write_batch_page, write_report
     from rgbmidic.results.files import writing
 
-    readings = series.Readings(channels=channels, offset=offset, area=area, force=force)
     if table is not None and len(tests) != 1:
         raise InputError(f"--table goes with one TEST.toml, the template, not with {len(tests)}")
-    chosen = series.read_tests(tests, readings) if table is None else series.read_table(tests[0], table, readings)
+    chosen = series.read_tests(tests) if table is None else series.read_table(tests[0], table)
     limits = command.read_pair(elastic, "--elastic")
     if not 0 <= limits[0] < limits[1]:
         raise InputError(f"--elastic is a smaller and a larger strain, not {elastic}")
@@ -611,7 +604,6 @@ def compare(
     simulation = Simulation.read(fe, mesh=numbered, unit=unit, field=field, interval=interval, offset=offset)
     comparison = Comparison(result, simulation, placement, scale=scale, frames=chosen, remove_rigid=rigid == "remove")
     check_folder(out, comparison_files(comparison), overwrite=overwrite)
-    out.mkdir(parents=True, exist_ok=True)
     with _progress("comparing") as progress:
         done = write_comparison(comparison, out, progress)
     _note(f"placed: {placement.summary()}")
@@ -622,7 +614,7 @@ def compare(
         numbers = (made.fit.scale, made.fit.scale_std, *squares, made.fit.chi_square)
         rows.append([f"{made.frame}", *(f"{number:.4g}" for number in numbers)])
     _print_table(f"{len(done)} frames against {fe}", headings, rows)
-    print(scale_text(*comparison.best_scale([made.fit for made in done])))
+    print(scale_text(comparison, done))
     print(f"page: {out / PAGE}")
 
 

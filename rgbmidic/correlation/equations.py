@@ -14,6 +14,7 @@ import numpy as np
 from rgbmidic.correlation.assembly import RigidMotions
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
@@ -45,12 +46,6 @@ _PASS_ITERATIONS = 12
 _PATIENCE = 1
 """Iterations of a pass after which a tenth of the nodes may still move: with the weights of the next pass they do so
 faster. With 5 a plate under glare took 9 to 22 iterations instead of 6 to 11 (benchmarks/fast_event.py)."""
-
-
-_SLOW, _LARGEST_SUM, _CLOSE = 0.15, 2.0, 0.03
-"""Fraction of its last motion, along or against it, from which a node's motion is taken for the term of a series, the
-most that is made of it, and the last motion (px) up to which it is: beyond, the images are not linear. With 3 and .1 px
-twice as many frames of a fragment's rim swung (benchmarks/fast_event.py)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,14 +119,10 @@ class Equations:
             The matrix is singular in double precision.
         """
         assembly = reference.assembly
-        gradient = reference.mesh.nodal_gradient(displacement)
-        # the rotation is the polar factor of I + grad u in the plane
-        angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
-        cos, sin = np.cos(angle), np.sin(angle)
-        rotation = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
-        functions = _turned_back(rotation, functions)
         per_light = reference.hessians(weights)
         blocks = np.sum(per_light, axis=0)
+        rotation = _rotation(reference.mesh, displacement, blocks)
+        functions = _turned_back(rotation, functions)
         own = assembly.node_blocks(blocks)
         textured, scale = _observability(own, assembly.nodal_area, SEEN if given is None else _INFORMED)
         if given is not None:
@@ -191,6 +182,20 @@ class Equations:
     def turned_back(self, columns: FloatArray) -> FloatArray:
         """Turn nodal vectors (2 N, m) into the axes of the reference."""
         return _turned_back(self.rotation, columns)
+
+
+def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> FloatArray:
+    """Rotation (N, 2, 2) of the surface around each node: the polar factor of I + grad u in the plane.
+
+    Elements count by what they show: one that is half on another body, and left out, turns in a way of its own.
+    """
+    texture = np.einsum("eaad->ed", blocks)[:, [0, 2]].sum(axis=1)
+    shown = texture + 1e-6 * (texture.mean() or 1.0)  # where nothing is shown all count alike
+    gradient = mesh.element_gradient(displacement)
+    spin, trace = gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1]
+    angle = np.arctan2(mesh.to_nodes(shown * spin), mesh.to_nodes(shown * trace))
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
 
 
 def _turned_back(rotation: FloatArray, columns: FloatArray) -> FloatArray:
@@ -302,9 +307,8 @@ def iterate(
         The iteration diverged.
     """
     known: FloatImage | None = residual.difference_from(values)
-    before: FloatArray | None = None
     for turn in range(min(_PASS_ITERATIONS, problem.options.max_iterations - len(estimate.increments))):
-        estimate, before = _stepped(problem, equations, values, estimate, known, before)
+        estimate = _stepped(problem, equations, values, estimate, known)
         known = None
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
@@ -321,24 +325,9 @@ def _stepped(
     values: FloatImage,
     estimate: Estimate,
     known: FloatImage | None,
-    before: FloatArray | None,
-) -> tuple[Estimate, FloatArray | None]:
-    """One Gauss-Newton iteration.
-
-    `known` is the difference (k, P) of the states at the estimate, if it is. A node half of whose pixels match nothing,
-    or whose lights err, has another Hessian than the reference's, and its motions shrink by a fraction of their own:
-    from that `before` (N, 2) the sum of the series follows. What is returned with the estimate is the motion for the
-    next iteration, None after such a sum.
-    """
+) -> Estimate:
+    """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
     motion, shifts = equations.increment(*_right_sides(problem, equations, values, estimate, known))
-    plain: FloatArray | None = motion
-    if before is not None:
-        square = (before**2).sum(axis=1)
-        ratio = np.divide((motion * before).sum(axis=1), square, out=np.zeros(len(square)), where=square > 0)
-        slow = (np.abs(ratio) > _SLOW) & (square < _CLOSE**2)
-        if slow.any():
-            factor = np.where(slow, 1 / np.maximum(1 - ratio, 1 / _LARGEST_SUM), 1.0)
-            motion, plain = motion * factor[:, None], None
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
     rigid = estimate.rigid.copy()
@@ -347,13 +336,12 @@ def _stepped(
         rigid[1:] += shifts
         longest = max(longest, float(np.abs(problem.functions @ shifts.T).max()))
     bounded = motion * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
-    stepped = Estimate(
+    return Estimate(
         displacement=estimate.displacement + bounded,
         rigid=rigid,
         increments=(*estimate.increments, length),
         longest=longest,
     )
-    return stepped, plain
 
 
 def _right_sides(

@@ -30,6 +30,7 @@ __all__ = [
     "matching_elements",
     "misfit",
     "one_sided_texture",
+    "torn_elements",
 ]
 
 LOST = 0.5
@@ -180,6 +181,27 @@ def matching_elements(
         typical = np.median(coefficient[textured][nearest], axis=1)
     matched[between] = coefficient[between] >= 1 - _WORSE * (1 - typical)
     return matched
+
+
+_TORN = 0.5
+"""Stretch (norm of C) beyond that of the elements around from which an element is torn, not strained: a strain of 20 %
+in both directions more than theirs gives .6."""
+
+
+def torn_elements(mesh: Tri3Mesh, displacement: FloatArray) -> BoolArray:
+    """Find the elements (E,) whose nodes have gone with different bodies, as a displacement (N, 2) has it.
+
+    Their stretch C, the right Cauchy-Green tensor, differs from the median of the elements around.
+    """
+    deformation = np.eye(2) + mesh.element_gradient(displacement)
+    stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
+    torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > _TORN)
+    if torn.any():
+        centre = mesh.nodes[mesh.elements].mean(axis=1)
+        around = cKDTree(centre).query(centre[torn], k=[*range(1, min(_AROUND, len(centre)) + 1)])[1]
+        beyond = stretch[torn] - np.median(stretch[around], axis=1)
+        torn[torn] = np.linalg.norm(beyond, axis=(1, 2)) > _TORN
+    return torn
 
 
 def correlation_around(residual: Residual) -> FloatArray:

@@ -28,6 +28,7 @@ from rgbmidic.correlation.nodes import (
     matching_elements,
     misfit,
     one_sided_texture,
+    torn_elements,
 )
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -59,12 +60,16 @@ _STARTED = 0.25
 nearer. Chosen; with half or twice of it results do not change (benchmarks/constants.py)."""
 _RETURNS = 2
 """Passes after which elements may take part again. At a fragment's edge some come and go with every pass: with 4 plates
-under glare took up to 22 iterations instead of 16 (plates it was chosen on; three others take up to 13); with 1 they
-took 11, but what a crack or another body pulls at first is left out for good (benchmarks/fast_event.py)."""
+under glare took up to 22 iterations instead of 16; with 1 the frames of a turning fragment take a twentieth less, but
+what a crack or another body pulls at first is left out for good (benchmarks/fast_event.py)."""
 _WANDERING = 0.1
 """Motion (px) in the last iteration of a pass, and more than half of that in the one before, from which the elements
 around a node are left out after `_RETURNS` passes: its own pixels match nothing. Chosen: ten times what ends the first
 pass."""
+_ELSEWHERE = 0.05
+"""Motion (px) of more than `_SWINGING` of the nodes from where weights and grey levels were learnt, after which those
+of several lights are learnt once more: what all lights alike show of the motion hides which of them is the precise one.
+Under glare rms errors are up to 3 % less for it, for two iterations; at .02 as much (benchmarks/fast_event.py)."""
 _SETTLED = 1e-3
 """Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
 change (benchmarks/constants.py)."""
@@ -97,6 +102,8 @@ class Weighting:
         Of the lights; None: not learnt.
     returned : int
         Number of the pass after the last one in which elements took part again.
+    learnt_at : ndarray, shape (N, 2)
+        Displacement at which precision and grey levels were learnt, px.
     """
 
     residual: Residual
@@ -104,6 +111,7 @@ class Weighting:
     matched: BoolArray
     precision: Precision | None = None
     returned: int = 0
+    learnt_at: FloatArray
 
     @property
     def seen(self) -> BoolArray:
@@ -139,7 +147,8 @@ def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
     return Weighting(
         residual=residual,
         values=corrected_values(residual, "none" if problem.options.brightness == "none" else "global"),
-        matched=matching_elements(residual, least=_STARTED),
+        matched=_matched(problem, residual, estimate, least=_STARTED),
+        learnt_at=estimate.displacement,
     )
 
 
@@ -148,8 +157,10 @@ def next_weighting(
     problem: Problem, last: Weighting, equations: Equations, estimate: Estimate, number: int
 ) -> Weighting:
     """Find matching, grey levels and precision anew at the displacement found by pass `number`."""
-    residual = compare(problem, last.values, estimate)
-    matched = matching_elements(residual, last.precision)
+    residual, method = compare(problem, last.values, estimate), problem.method
+    # without the precision of the lights, which the first pass has not, an element half on another body may match
+    precision = last.precision if number or method is None else method.precision(residual)
+    matched = _matched(problem, residual, estimate, precision)
     if not matched.all() or estimate.longest > FIRST_PASS:
         std = standard_uncertainty(residual, equations, last.precision)
         # a node that its own pixels do not hold leaves the next pass, but not for a one-sided texture: that matches
@@ -162,16 +173,35 @@ def next_weighting(
     if number >= _RETURNS:
         matched &= last.matched
     # where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in
-    # the pass in which they do the residual is still that of a wrong match
-    returned = number + 1 if (matched & ~last.matched).any() else last.returned
+    # the pass in which they do the residual is still that of a wrong match; and once where it was learnt elsewhere
+    motion = np.hypot(*(estimate.displacement - last.learnt_at).T)[equations.textured]
+    returned = last.returned
+    if (matched & ~last.matched).any():
+        returned = number + 1
+    elif number == 1 < len(residual.values) and (motion > _ELSEWHERE).mean() > _SWINGING:
+        returned = max(returned, number)
     weighting = replace(last, residual=residual, matched=matched, returned=returned)
     if not refining(problem, weighting, number + 1):
         return weighting
     return replace(
         weighting,
         values=corrected_values(residual, problem.options.brightness),
-        precision=None if problem.method is None else problem.method.precision(residual),
+        precision=precision if number == 0 or method is None else method.precision(residual),
+        learnt_at=estimate.displacement,
     )
+
+
+def _matched(
+    problem: Problem,
+    residual: Residual,
+    estimate: Estimate,
+    precision: Precision | None = None,
+    *,
+    least: float | None = None,
+) -> BoolArray:
+    """Elements (E,) that match and are whole."""
+    torn = torn_elements(problem.reference.mesh, estimate.displacement)
+    return matching_elements(residual, precision, least=least) & ~torn
 
 
 def settled(weighting: Weighting, equations: Equations) -> bool:
@@ -277,7 +307,7 @@ def _begin(problem: Problem, estimate: Estimate) -> tuple[Estimate, Weighting]:
     nearer = first_weighting(problem, moved)
     if nearer.matched.sum() <= weighting.matched.sum():
         return estimate, weighting
-    return moved, replace(nearer, matched=matching_elements(nearer.residual))
+    return moved, replace(nearer, matched=_matched(problem, nearer.residual, moved))
 
 
 @stage("equations")

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic.correlation.nodes import correlation_around
+from rgbmidic.correlation.nodes import correlation_around, torn_elements
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, follow
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status, rank
@@ -371,10 +371,9 @@ class Start:
         """
         if not measured.any():
             return self
-        gradient = mesh.element_gradient(np.where(measured[:, None], displacement, 0.0))
-        deformation = np.eye(2) + gradient
-        stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
-        intact = measured[mesh.elements].all(axis=1) & (np.linalg.norm(stretch, axis=(1, 2)) < _TORN)
+        known = np.where(measured[:, None], displacement, 0.0)
+        gradient = mesh.element_gradient(known)
+        intact = measured[mesh.elements].all(axis=1) & ~torn_elements(mesh, known)
         weight = np.where(intact, mesh.areas, 0.0)
         around = mesh.to_nodes(weight)
         nearest = mesh.nearest(measured & (around > 0) if intact.any() else measured)[1]
@@ -385,8 +384,6 @@ class Start:
         return replace(self, displacement=filled, unmeasured=float((~measured).mean()))
 
 
-_TORN = 0.5
-"""Stretch (norm of C - 1) from which an element is torn, not strained: 20 % of strain in both directions give .6."""
 LARGEST_TURN = 30.0
 """Turn (degrees) that the search finds, with strains of 20 % or alone (benchmarks/starts.py)."""
 NEEDED = 0.15

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields.cracks import CrackTip, JumpAlong, Williams
-from rgbmidic.fields.history import History, Nodal, Probe
+from rgbmidic.fields.history import History, Nodal, Probe, Units
 from rgbmidic.fields.measures import MEASURES, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.plane import Rectification
@@ -254,21 +254,19 @@ PROBES: dict[str, tuple[int, int, _Make]] = {
 
 
 def make_probe(
-    rectified: Rectification,
     covariance: NodalCovariance,
     kind: str,
     number: int,
     place: Sequence[float],
-    settings: ProbeSettings,
+    settings: ProbeSettings | None = None,
+    rectified: Rectification | None = None,
 ) -> Probe:
     """Make a probe, named by its kind and number, or as the settings do.
 
     Parameters
     ----------
-    rectified
-        Change from px of the image, and the scale.
     covariance
-        Of the mesh in rectified px.
+        Of the mesh, in rectified px where `rectified` is given.
     kind
         One of `PROBES`.
     number
@@ -276,14 +274,16 @@ def make_probe(
     place
         The numbers of `PROBES`, px of the image.
     settings
-        Strain measure of a strain gauge; material and fit of a crack's tip; names.
+        Strain measure of a strain gauge; material and fit of a crack's tip; names. None: the defaults.
+    rectified
+        Change from px of the image, and the scale, which a crack's tip needs; None: places are in px of the mesh.
 
     Raises
     ------
     InputError
         The place is outside the region, or no place for it.
     """
-    points, lengths, make = PROBES[kind]
+    (points, lengths, make), settings = PROBES[kind], settings or ProbeSettings()
     name = dict(settings.names).get(f"{kind}_{number}", f"{kind}_{number}")
     if len(place) != 2 * points + lengths:
         raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(place)}")
@@ -296,8 +296,8 @@ def make_probe(
             youngs_modulus=settings.youngs_modulus,
             poissons_ratio=settings.poissons_ratio,
             plane=settings.plane,
-            units=rectified.units,
+            units=Units() if rectified is None else rectified.units,
             terms=settings.terms,
             fit_tip=settings.fit_tip,
         )
-    return make(covariance, name, *rectified.place(place, points), **more)
+    return make(covariance, name, *(place if rectified is None else rectified.place(place, points)), **more)

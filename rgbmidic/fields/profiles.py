@@ -1,10 +1,11 @@
 """Profiles: a field along a line in every frame, and the speed of a front or peak that travels along it.
 
-At each position the series over time is smoothed by local straight lines (tricube weights: Cleveland, J Am Stat Assoc
-74, 1979). The peak arrives at the maximum of the smooth curve, the front where the curve last rises through a fraction
-of that maximum before it. To first order an arrival time is a linear functional of the series, so that the covariance
-of two arrival times follows from the noise of the frames and its correlation between the positions; the speed is that
-of the straight line through the arrival times by generalised least squares (Aitken, Proc R Soc Edinb 55, 1936).
+At each position the series over time is smoothed by local parabolas (tricube weights: Cleveland, J Am Stat Assoc 74,
+1979), which frames that are missing do not shift. The peak arrives at the maximum of the smooth curve, the front where
+the curve last rises through a fraction of that maximum before it. To first order an arrival time is a linear functional
+of the series, so that the covariance of two arrival times follows from the noise of the frames and its correlation
+between the positions; the speed is that of the straight line through the arrival times by generalised least squares
+(Aitken, Proc R Soc Edinb 55, 1936).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Self
 
@@ -42,8 +44,10 @@ _LOPSIDED = 0.1
 """Elements by which the middle of a gauge's nodes may lie off its own along a line: a tenth of what an edge does."""
 _CLEAR = 5.0
 """Standard uncertainties that a peak must reach: noise alone does in one of 3,500 series of 500 frames."""
-_SMOOTHEST = 2.5
-"""Least half-width of the smoothing in frames: a straight line through four or more of them."""
+_SMOOTHEST = 3.5
+"""Least half-width of the smoothing in frames: a parabola through six or more of them."""
+_DETERMINED = 1e-4
+"""Least determinant of a parabola's normal equations over that of its weights; with all frames it is .01."""
 _FINE = 8
 """Places of the smooth curve to an interval of the frames. With 16 the arrival times change by less than 1e-3 of it."""
 _ROWS = 1000
@@ -51,10 +55,11 @@ _ROWS = 1000
 _RISE = (0.2, 0.8)
 """Fractions of the peak between which a front rises, by which the smoothing is chosen: nearly straight for a half sine
 and for an error function."""
-_PEAK = 2.0
-"""Rises that the smoothing of a peak is wide: with 1, noise of 5 % of the peak moves it to another maximum."""
-_ABRUPT = 1.5
-"""Frames: within a shorter rise the frames do not resolve when the front arrives between two of them."""
+_WIDTHS = {"front": 1.5, "peak": 3.0}
+"""Rises that the smoothing is wide on either side: with half of it, noise of 5 % of the peak moves it to another
+maximum."""
+_ABRUPT = 1.2
+"""Rises of a step, smoothed, within which the frames do not resolve when the front arrives between two of them."""
 _INDEPENDENT = 0.5
 """Correlation of the noise between neighbouring positions of a fit, at most: beyond it positions add little, and the
 inverse of their covariance amplifies what is not known of it."""
@@ -160,7 +165,7 @@ class ProfileLine:
             Key of `correlations`.
         """
         values, std = values[self.nodes], std[self.nodes]
-        weights = self._weights(np.isfinite(values))
+        weights = _weights(self, np.isfinite(values).tobytes())
         parts = np.nan_to_num(weights) * std
         spread = np.einsum("pn,nm,pm->p", parts, self.correlations[kind], parts, optimize=True)
         found = weights @ np.nan_to_num(values)
@@ -168,21 +173,23 @@ class ProfileLine:
 
     def correlation(self, kind: str = "") -> FloatArray:
         """Compute the correlation (P, P) of the noise of a field between the points; 0 outside the mesh."""
-        weights = np.nan_to_num(self._weights(np.ones(len(self.nodes), dtype=bool)))
+        weights = np.nan_to_num(_weights(self, np.ones(len(self.nodes), dtype=bool).tobytes()))
         return _unit(weights @ self.correlations[kind] @ weights.T)
 
-    def _weights(self, measured: BoolArray) -> FloatArray:
-        """Return the weight (P, n) of every node at each point; NaN outside the mesh and beside missing nodes."""
-        mesh, places = self.places.mesh, self.places
-        used = np.asarray(measured[mesh.elements].all(axis=1))
-        value, *slopes = (operator.toarray() for operator in quadratic_fit(mesh, used))
-        value, total = np.eye(len(value)), np.zeros((len(self.points), len(value)))
-        for node, shape in zip(mesh.elements[places.element].T, places.barycentric.T, strict=True):
-            x, y = (self.points - mesh.nodes[node]).T
-            terms = zip((np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2), (value, *slopes), strict=True)
-            total += shape[:, None] * sum(factor[:, None] * operator[node] for factor, operator in terms)
-        total[~(places.inside & used[places.element])] = np.nan
-        return total
+
+@lru_cache(maxsize=4)
+def _weights(line: ProfileLine, measured: bytes) -> FloatArray:
+    """Return the weight (P, n) of every node at each point; NaN outside the mesh and beside missing nodes."""
+    mesh, places = line.places.mesh, line.places
+    used = np.asarray(np.frombuffer(measured, dtype=bool)[mesh.elements].all(axis=1))
+    _, *slopes = (operator.toarray() for operator in quadratic_fit(mesh, used))
+    value, total = np.eye(len(mesh.nodes)), np.zeros((len(line.points), len(mesh.nodes)))
+    for node, shape in zip(mesh.elements[places.element].T, places.barycentric.T, strict=True):
+        x, y = (line.points - mesh.nodes[node]).T
+        terms = zip((np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2), (value, *slopes), strict=True)
+        total += shape[:, None] * sum(factor[:, None] * operator[node] for factor, operator in terms)
+    total[~(places.inside & used[places.element])] = np.nan
+    return total
 
 
 def _unit(covariance: Any) -> FloatArray:
@@ -242,9 +249,9 @@ def arrival_times(
 ) -> Arrivals:
     """Find when a front or peak arrives at each of P positions, with its standard uncertainty.
 
-    The sign of the wave is that of the largest value over its uncertainty. The smoothing has the half-width of the
-    median rise from 20 to 80 % of the peak, 2.5 frames at least; it shifts all arrivals alike where the wave keeps its
-    form.
+    The sign of the wave is that of the largest value over its uncertainty. The smoothing has a half-width of 1.5 times
+    the median rise from 20 to 80 % of the peak, for a peak of 3 times, and 3.5 frames at least; it shifts all arrivals
+    alike where the wave keeps its form.
 
     Parameters
     ----------
@@ -286,11 +293,11 @@ def arrival_times(
     rises = [first.rise(series[:, p], known[:, p]) for p in np.flatnonzero((np.abs(size) > _CLEAR).any(axis=0))]
     rises = [rise for rise in rises if math.isfinite(rise)]
     rise = float(np.median(rises)) if rises else math.nan
-    wide = rise * (1 if what == "front" else _PEAK)
-    smooth = _Smooth(when, max(_SMOOTHEST * interval, wide if rises else 0.0))
+    smooth = _Smooth(when, max(_SMOOTHEST * interval, _WIDTHS[what] * rise if rises else 0.0))
     found, errors, weights = np.full(y.shape[1], np.nan), np.full(y.shape[1], np.nan), np.zeros(y.T.shape)
     own = np.eye(len(when)) if between_frames is None else between_frames
-    abrupt = bool(rises) and rise < _ABRUPT * interval
+    step = first.rise((when > when[len(when) // 2]) * 1.0, np.ones(len(when), dtype=bool))
+    abrupt = bool(rises) and rise < _ABRUPT * step
     for p in range(y.shape[1]):
         at = smooth.arrival(series[:, p], np.where(known[:, p], spread[:, p], np.nan), what, level)
         if at is not None:
@@ -303,7 +310,7 @@ def arrival_times(
 
 
 class _Smooth:
-    """Smooth curve through a series by local straight lines, and the places where it peaks and rises.
+    """Smooth curve through a series by local parabolas, and the places where it peaks and rises.
 
     Parameters
     ----------
@@ -327,13 +334,15 @@ class _Smooth:
         return self._kept[key]
 
     def _rows(self, places: FloatArray, known: BoolArray) -> FloatArray:
-        away = self.times[None] - places[:, None]
-        w = np.clip(1 - np.abs(away / self.half) ** 3, 0, None) ** 3 * known
-        total, first, second = w.sum(axis=1), (w * away).sum(axis=1), (w * away**2).sum(axis=1)
-        determinant = total * second - first**2
-        enough = determinant > 1e-6 * (total * self.half) ** 2
-        weights = w * (second[:, None] - first[:, None] * away)
-        return np.asarray(weights / np.where(enough, determinant, np.nan)[:, None])
+        away = (self.times[None] - places[:, None]) / self.half
+        w = np.clip(1 - np.abs(away) ** 3, 0, None) ** 3 * known
+        powers = np.stack([np.ones_like(away), away, away**2], axis=1)
+        normal = np.einsum("gt,git,gjt->gij", w, powers, powers, optimize=True)
+        enough = np.linalg.det(normal) > _DETERMINED * normal[:, 0, 0] ** 3
+        normal[~enough] = np.nan
+        first = np.full((len(places), 3), np.nan)
+        first[enough] = np.linalg.inv(normal[enough])[:, 0]
+        return np.asarray(w * np.einsum("gi,git->gt", first, powers))
 
     def rise(self, series: FloatArray, known: BoolArray) -> float:
         """Return how long a series rises between the `_RISE` fractions of its peak; NaN where it does not."""

@@ -54,7 +54,8 @@ class FiniteElementMesh:
     element_numbers : ndarray, shape (E,), int64
         Labels of the elements in the file that the triangles are from.
     fields : mapping of str to ndarray, shape (N, ...)
-        Nodal data of the file, in its own unit and components: a vector's component along x is ``[:, axes[0]]``.
+        Nodal data of the file (none of Abaqus and of gmsh in text), in its own unit and components: a vector's
+        component along x is ``[:, axes[0]]``.
     axes : tuple of int
         Which coordinates (0, 1, 2) of the file are x and y.
     unit_mm : float
@@ -183,6 +184,7 @@ class Placement:
         up, down = (cls._fitted(given, camera, reflected) for reflected in (True, False))
         rms_up, rms_down = up.rms, down.rms
         if len(given) == 2:
+            up._report_residuals(where)
             return up
         if max(rms_up, rms_down) < _DECIDED * max(min(rms_up, rms_down), _POINTING):
             logger.warning(
@@ -195,6 +197,7 @@ class Placement:
             best = up
         else:
             best = min(up, down, key=lambda one: one.rms)
+        best._report_residuals(where)
         best._report_outlier(where)
         return best
 
@@ -206,10 +209,22 @@ class Placement:
         z, w = pairs[:, 0] + sign * 1j * pairs[:, 1], image[:, 0] + 1j * image[:, 1]
         a = np.vdot(z - z.mean(), w - w.mean()) / np.vdot(z - z.mean(), z - z.mean())
         if camera is not None:
+            stretch = float(np.std(w) / np.std(z))
+            if not 1 / _STRETCHED < stretch < _STRETCHED:
+                raise InputError(
+                    f"the pairs of mesh.points lie {stretch:.4g} times as far apart on the camera's plane as on the "
+                    "mesh, where both are in mm: look at mesh.unit, the points and the calibration"
+                )
             a /= abs(a)
         b = w.mean() - a * z.mean()
         matrix = np.array([[a.real, -sign * a.imag], [a.imag, sign * a.real]])
         return cls(matrix=matrix, shift=np.array([b.real, b.imag]), camera=camera, pairs=pairs)
+
+    def _report_residuals(self, where: str) -> None:
+        """Warn of residuals that are more than those of points set by hand."""
+        if self.rms > _DECIDED * _POINTING:
+            each = ", ".join(f"{length:.1f}" for length in np.hypot(*self.residuals.T))
+            logger.warning("%s leaves residuals of %.1f px rms (its pairs: %s px)", where, self.rms, each)
 
     def _report_outlier(self, where: str) -> None:
         """Warn of the pair that lies farthest from where the others place it, if they do not explain it.
@@ -381,6 +396,9 @@ _POINTING = 0.5
 """Residuals (px) that a point set by hand may have, and that decide nothing: a click is on a whole pixel (chosen)."""
 _DECIDED = 3.0
 """How many times larger the residuals of the other sense must be for pairs to decide (chosen: beyond any scatter)."""
+_STRETCHED = 1.05
+"""Ratio of lengths on the mesh and on a camera's plane beyond which they contradict each other (chosen: a wrong unit is
+25 or more, a scale that is known to 5 % is no calibration)."""
 _UNLIKELY = 0.01
 """Probability of naming any pair as an outlier where none is one (chosen)."""
 

@@ -13,7 +13,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,14 @@ import numpy as np
 
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
 from rgbmidic.pipeline.run import measure
-from rgbmidic.results import Channels, Histories, Maps, Result, shared_part
+from rgbmidic.results import Histories, Maps, Result, shared_part
 from rgbmidic.results.files import write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import TestSettings, read_toml, regular
 from rgbmidic.typing import FloatArray
 
-__all__ = ["BatchTest", "Outcome", "Readings", "modulus", "read_table", "read_tests", "run_batch", "summary_rows"]
+__all__ = ["BatchTest", "Outcome", "modulus", "read_table", "read_tests", "run_batch", "summary_rows"]
 
 logger = logging.getLogger(__name__)
 
@@ -44,28 +44,6 @@ ELASTIC = (0.0005, 0.0025)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Readings:
-    """How channels beside a test are read.
-
-    Attributes
-    ----------
-    channels
-        CSV file with the force; None: none.
-    offset
-        Seconds added to its times.
-    area
-        Cross-section in square mm; None: no stress.
-    force
-        Name of the channel with the force, where there are several.
-    """
-
-    channels: Path | None = None
-    offset: float = 0.0
-    area: float | None = None
-    force: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class BatchTest:
     """A test of a batch.
 
@@ -75,14 +53,11 @@ class BatchTest:
         Its name and that of its folder.
     document, base
         Sections of its settings, and the folder that relative paths start from.
-    readings
-        Channels beside it.
     """
 
     name: str
     document: Mapping[str, Any]
     base: Path
-    readings: Readings = Readings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,15 +85,13 @@ class Outcome:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
-def read_tests(paths: Sequence[Path], readings: Readings) -> list[BatchTest]:
+def read_tests(paths: Sequence[Path]) -> list[BatchTest]:
     """Name the tests of TEST.toml files, by the file, or by its folder where several are called alike.
 
     Parameters
     ----------
     paths
         The files.
-    readings
-        Of all tests; a relative path of channels starts from each test's folder.
 
     Raises
     ------
@@ -126,18 +99,17 @@ def read_tests(paths: Sequence[Path], readings: Readings) -> list[BatchTest]:
         Two tests would have one name.
     """
     stems = [path.stem for path in paths]
-    names = [stem if stems.count(stem) == 1 else path.resolve().parent.name for path, stem in zip(paths, stems)]  # noqa: B905
+    names = [
+        stem if stems.count(stem) == 1 else path.resolve().parent.name for path, stem in zip(paths, stems, strict=True)
+    ]
     tests = []
     for path, name in zip(paths, names, strict=True):
-        beside = readings.channels and path.parent / readings.channels
         document: dict[str, Any] = {"path": str(path)}  # read when its turn comes: a damaged one does not stop the rest
-        tests.append(
-            BatchTest(name=name, document=document, base=path.parent, readings=replace(readings, channels=beside))
-        )
+        tests.append(BatchTest(name=name, document=document, base=path.parent))
     return _checked(tests)
 
 
-def read_table(template: Path, table: Path, readings: Readings) -> list[BatchTest]:
+def read_table(template: Path, table: Path) -> list[BatchTest]:
     """Make tests from a template and a table: a row a test, with values that replace keys of the template.
 
     Parameters
@@ -145,11 +117,9 @@ def read_table(template: Path, table: Path, readings: Readings) -> list[BatchTes
     template
         A TEST.toml; paths in it and in the table are relative to it.
     table
-        CSV file. Its first column is ``test``, the name; the others are keys such as ``frames.path``, with values as
-        TOML writes them (a text may go without quotes; an empty field leaves the template's), or ``channels``,
-        ``offset``, ``area`` and ``force``.
-    readings
-        Where the table states none.
+        CSV file. Its first column is ``test``, the name; the others are keys such as ``frames.path`` or
+        ``channels.area``, with values as TOML writes them (a text may go without quotes; an empty field leaves the
+        template's).
 
     Raises
     ------
@@ -159,49 +129,27 @@ def read_table(template: Path, table: Path, readings: Readings) -> list[BatchTes
         The template is missing or no TOML.
     """
     document = read_toml(template, "settings file")
-    if readings.channels is not None:
-        readings = replace(readings, channels=template.parent / readings.channels)
     try:
         rows = [row for row in csv.reader(io.StringIO(regular(table).read_text(encoding="utf-8-sig"))) if any(row)]
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"the table {table} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     head = [name.strip() for name in rows[0]] if rows else []
-    odd = [name for name in head[1:] if "." not in name and name not in _READINGS]
-    if head[:1] != ["test"] or odd:
+    if head[:1] != ["test"] or not all("." in name for name in head[1:]):
         raise InputError(
-            f'the table {table} needs a first column "test" and keys such as "frames.path", or {", ".join(_READINGS)}; '
-            f"its columns are {', '.join(head) or 'none'}"
+            f'the table {table} needs a first column "test" and keys such as "frames.path"; its columns are '
+            f"{', '.join(head) or 'none'}"
         )
     tests = []
     for number, row in enumerate(rows[1:], 2):
         if len(row) != len(head):
             raise InputError(f"row {number} of the table {table} has {len(row)} fields, the header {len(head)}")
         changed = {section: dict(keys) if isinstance(keys, Mapping) else keys for section, keys in document.items()}
-        stated: dict[str, Any] = {}
         for name, text in zip(head[1:], map(str.strip, row[1:]), strict=True):
-            if text and name in _READINGS:
-                stated[name] = _reading(name, text, template.parent, f"row {number} of the table {table}")
-            elif text:
+            if text:
                 section, key = name.split(".", 1)
                 changed.setdefault(section, {})[key] = _value(text)
-        tests.append(
-            BatchTest(name=row[0].strip(), document=changed, base=template.parent, readings=replace(readings, **stated))
-        )
+        tests.append(BatchTest(name=row[0].strip(), document=changed, base=template.parent))
     return _checked(tests)
-
-
-_READINGS = ("channels", "offset", "area", "force")
-
-
-def _reading(name: str, text: str, base: Path, where: str) -> Any:
-    if name == "channels":
-        return base / text
-    if name == "force":
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{name} in {where} is not a number: {text!r}") from None
 
 
 def _value(text: str) -> Any:
@@ -297,7 +245,7 @@ def _outcome(
     if good < _LARGE_PART:
         raise ResultError(f"{int((ends != 0).sum())} of {len(ends)} deformed frames failed or did not converge")
     values = {"frames": float(len(ends)), "converged": good} | dict(_peaks(result, settings))
-    values |= dict(_probed(result, settings, test.readings, elastic))
+    values |= dict(_probed(result, settings, elastic))
     return Outcome(name=test.name, folder=folder, measured=moved, values=values)
 
 
@@ -319,17 +267,11 @@ def _peaks(result: Result, settings: TestSettings) -> Iterator[tuple[str, float]
             yield from {label: best[0], f"{label}_std": best[1]}.items()
 
 
-def _probed(
-    result: Result, settings: TestSettings, readings: Readings, elastic: tuple[float, float]
-) -> Iterator[tuple[str, float]]:
+def _probed(result: Result, settings: TestSettings, elastic: tuple[float, float]) -> Iterator[tuple[str, float]]:
     """Yield the peak of every quantity of the probes and channels, and the modulus where a stress is known."""
     if not settings.probes.places and settings.probes.rigid_motion == "none":
         return
-    channels = None if readings.channels is None else Channels.read(readings.channels, readings.offset)
-    area = readings.area if channels is not None else None
-    read = read_histories(
-        result, settings.probes, scale=settings.scale, channels=channels, area=area, force=readings.force
-    )
+    read = read_histories(result, settings.probes, scale=settings.scale, channels=settings.channels)
     for quantity in read.quantities:
         if quantity.name.endswith(("_before", "_after", "_direction")) or not np.isfinite(quantity.values).any():
             continue

@@ -17,7 +17,7 @@ from rgbmidic.report import style
 from rgbmidic.report.document import Page
 from rgbmidic.report.figures import spread
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Agreement, Comparison, FrameComparison
-from rgbmidic.results.files import write_complete
+from rgbmidic.results.files import write_complete, writing
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -34,6 +34,9 @@ _REACH = 4.0
 """Ratios to the standard uncertainty at the ends of the colours: beyond lies one in 16,000 of a right simulation."""
 _UNLIKELY = 0.01
 """Probability of chi-square under which a warning names the frame (chosen)."""
+_SHAPE = 1.5
+"""Chi-square of what the best scale leaves above which the shape differs: 1.2 times the stated uncertainty, more than
+that is wrong by in any scene of docs/uncertainty.md."""
 _ROUNDING = 1e-6
 """Relative uncertainty of a scale under which it is not worth a word."""
 _BINS = np.linspace(-6, 6, 49)
@@ -65,7 +68,7 @@ def write_comparison(
     comparison
         Of a result and a simulation.
     out
-        Existing folder; files of these names are replaced.
+        Folder, made where it does not exist; files of these names are replaced.
     progress
         Called with the number of frames done, that of all, and a text.
 
@@ -84,6 +87,8 @@ def write_comparison(
     shown = spread(comparison.frames, _SHOWN)
     done: list[FrameComparison] = []
     optional("meshio", "fe")
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
 
     def pass_over(file: BinaryIO) -> None:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
@@ -306,22 +311,26 @@ def scale_figure(comparison: Comparison, done: Sequence[FrameComparison]) -> Fig
     return style.draw_figure(draw, count=2, aspect=0.75, beside=style.NUMBERS)
 
 
-def scale_text(scale: float, std: float) -> str:
-    """Say what the best-fitting scale is, and what it means for a modulus."""
+def scale_text(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
+    """Say what the best-fitting scale of all frames is, and what it means for a modulus."""
+    scale, std = comparison.best_scale([made.fit for made in done])
     if not np.isfinite(scale):
         return "the simulation is a rigid motion in all frames: it has no scale to be found"
-    text = f"{scale:.4f} ± {std:.2g} times the simulation fits the measurement best, with any shift and rotation"
-    away = abs(scale - 1) / std if std else np.inf
+    text = f"{scale:.4f} ± {std:.2g} times the simulation fits the measurement best, with any shift and rotation: "
+    away, rest = abs(scale - 1) / std if std else np.inf, float(np.median([made.fit.chi_square for made in done]))
     if away <= 2:
-        return f"{text}: 1 is within two standard uncertainties"
-    return f"{text}: {away:.1f} standard uncertainties from 1; where the loads are right, divide the moduli by it"
+        text += "1 is within two standard uncertainties"
+    else:
+        text += f"{away:.1f} standard uncertainties from 1; where the loads are right, divide the moduli by it"
+    if rest > _SHAPE:
+        text += f"; the shape differs (chi-square of what is left: {rest:.3g}), which this uncertainty does not hold"
+    return text
 
 
 def _page(comparison: Comparison, done: Sequence[FrameComparison]) -> Page:
     result = comparison.result
     page = Page(f"Comparison: {result.path.resolve().name} with {Path(comparison.simulation.name).name}")
-    scale = comparison.best_scale([made.fit for made in done])
-    page.text(f"Best-fitting scale: {scale_text(*scale)}.")
+    page.text(f"Best-fitting scale: {scale_text(comparison, done)}.")
     page.text(
         "Differences are measured minus simulated, at the simulation's nodes and along its axes: displacement, mm, and "
         f"Green-Lagrange strain over the shortest virtual strain gauge ({comparison.gauge:.3g} mm). At the nodes the "
@@ -338,9 +347,10 @@ def _page(comparison: Comparison, done: Sequence[FrameComparison]) -> Page:
             f"The scale of the image is known to {comparison.relative_std:.2g} of itself: one factor in all "
             "displacements, which counts in their uncertainty and in that of the best-fitting scale."
         )
-    page.heading("Over the frames")
-    caption = "best-fitting scale with two standard uncertainties, and chi-square"
-    page.picture(style.embedded(scale_figure(comparison, done)), caption)
+    if len(done) > 1:
+        page.heading("Over the frames")
+        caption = "best-fitting scale with two standard uncertainties, and chi-square"
+        page.picture(style.embedded(scale_figure(comparison, done)), caption)
     for made in (one for one in done if one.measured):
         page.heading(f"Frame {made.frame} ({result.names[made.frame]})")
         fit = made.fit

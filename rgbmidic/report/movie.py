@@ -280,7 +280,6 @@ class _Drawer:
             low, high = limits or part.ends or style.colour_range(known_values)
             ends.append((low, high))
             beyond.append((bool(known_values.min() < low), bool(known_values.max() > high)))
-        maps = replace(maps, result=replace(result))
         return cls(
             maps=maps,
             fields=fields,
@@ -433,6 +432,10 @@ def _pages(drawer: _Drawer, frames: list[int], processes: int) -> Iterator[Page]
         canvas = drawer.opened()
         yield from map(canvas.page, frames)
         return
+    maps = replace(
+        drawer.maps, result=replace(drawer.maps.result)
+    )  # without what was read, which each reads for itself
+    drawer = replace(drawer, maps=maps)
     context, started, ends = multiprocessing.get_context("spawn"), [], []
     try:
         for part in range(processes):

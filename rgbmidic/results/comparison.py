@@ -224,7 +224,7 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
             raise InputError(f"row {number} of {path} is not numbers: {row}") from None
     table = np.array(rows, dtype=np.float64).reshape(-1, len(wanted))
     index = {number: place for place, number in enumerate(mesh.node_numbers.tolist())}
-    places = [index.get(int(number), -1) for number in table[:, 0]]
+    places = [index.get(number, -1) for number in table[:, 0].tolist()]
     known = np.array(places, dtype=np.int64) >= 0
     if not known.any():
         raise InputError(f"{path} has no row for a node of {mesh.name}")
@@ -538,10 +538,18 @@ class Comparison:
         """
         known = np.isfinite(measured + noise + levelled).all(axis=0) & (noise > 0).all(axis=0)
         if known.sum() < 3:
-            raise InputError(
-                f"frame {index} has data at {known.sum()} nodes that the simulation covers, 3 are needed: leave it out "
-                "(--frames)"
+            logger.warning("frame %d has data at %d nodes that the simulation covers: too few", index, known.sum())
+            fit = Fit(
+                scale=math.nan,
+                scale_std=math.nan,
+                rigid=np.full(3, math.nan),
+                rigid_std=np.full(3, math.nan),
+                chi_square=math.nan,
+                template=np.zeros(measured.shape),
+                projection=0.0,
+                information=0.0,
             )
+            return fit, np.full(measured.shape, math.nan), 0.0
         x, y = self.mesh.nodes.T - self.mesh.nodes[known].mean(axis=0)[:, None]
         motions = np.array([[np.ones_like(x), 0 * x], [0 * x, np.ones_like(x)], [-y, x]])
         weighted = np.where(known, motions / np.where(known, noise, 1), 0)
@@ -735,6 +743,8 @@ def _matched(
     for index in asked or ():
         if result.frame(index).status == _FAILED:
             raise InputError(f"frame {index} of {result.path} is not measured; compare another one (--frames)")
+        if index not in result.deformed:
+            raise InputError(f"frame {index} of {result.path} is of the reference, against which nothing has moved")
     known = [index for index in result.deformed if result.finished[index] and result.status[index] != _FAILED]
     frames = list(known if asked is None else asked)
     if not frames:

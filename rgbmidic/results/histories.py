@@ -199,7 +199,7 @@ def read_histories(
     made = []
     for kind, place in probes.places:
         counts[kind] = counts.get(kind, 0) + 1
-        made.append(make_probe(rectified, covariance, kind, counts[kind], place, probes))
+        made.append(make_probe(covariance, kind, counts[kind], place, probes, rectified))
     clock = result.number[there].astype(np.float64) if times is None else times
     each = result.table.each(["u", "v", "u_std", "v_std"], there.tolist())
     nodal, rigid, speed = _read(each, rectified, covariance, made, probes.rigid_motion, clock)

@@ -39,9 +39,9 @@ __all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "RegionDrawing"
 __all__ += ["marks_of", "mask_images", "masks_of", "probe_section", "region_of", "rings", "scale_section"]
 
 _FILES = (
-    "frames.path", "calibration.file", "region.mask", "weights.geometry", "weights.height_map", "weights.images",
-    "mesh.file", "scale.camera", "channels.file",
-)  # fmt: skip
+    *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera", "channels.file"),
+    *("weights.geometry", "weights.height_map", "weights.images"),
+)
 """Keys that name files."""
 
 

@@ -20,7 +20,7 @@ from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import spread
 from rgbmidic.report.style import colour_range, ordinary_values, time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Result
-from rgbmidic.settings import ProbeSettings, TestSettings
+from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.picture import Picture, element_at, grey_picture
 
@@ -225,7 +225,7 @@ def probe_text(maps: Maps, field: MapField, values: MapValues, kind: str, place:
         return ""
     try:
         kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
-        probe = make_probe(maps.physical.rectified, maps.physical.covariance, kind, 1, place, ProbeSettings())
+        probe = make_probe(maps.physical.covariance, kind, 1, place, rectified=maps.physical.rectified)
     except InputError:
         return ""
     assert isinstance(probe, Mean)

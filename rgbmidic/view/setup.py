@@ -18,10 +18,10 @@ from bokeh.models import ColumnDataSource
 
 from rgbmidic.lab.inspection import Inspection
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.plan import read_region
+from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
-from rgbmidic.settings import RegionSettings, read_section
+from rgbmidic.settings import RegionSettings, TestSettings, read_section
 from rgbmidic.view.canvas import Canvas, Tiles
 from rgbmidic.view.draft import (
     HOLES,
@@ -172,27 +172,42 @@ class SetupPage:
 
     def _make_mesh(self) -> None:
         content = region_of(self.drawing.marks)
-        if content is None or not self.parts.size.value:
+        if self.draft.section("mesh").get("file"):
+            mesh = self._of_file()[0]
+        elif content is None or not self.parts.size.value:
             self.parts.message.text = _HELP
             return
-        mesh = Tri3Mesh.from_region(self._region(content), float(self.parts.size.value))
+        else:
+            mesh = Tri3Mesh.from_region(self._region(content), float(self.parts.size.value))
         self.parts.message.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
         if len(mesh.elements) <= _MOST_EDGES:
             corners = mesh.nodes[mesh.elements][:, [0, 1, 2, 0]]
             self._edges.data = {"xs": list(corners[..., 0]), "ys": list(corners[..., 1])}
+
+    def _of_file(self) -> tuple[Tri3Mesh, Region]:
+        """Place the mesh of ``mesh.file`` by its points; what is drawn restricts it."""
+        document = {**self.draft.document, "region": self.drawing.region or self.draft.section("region")}
+        settings = TestSettings.from_mapping(document, self.draft.file.parent)
+        _, _, mesh, region = finite_elements_of(settings, self.source.shape)
+        return mesh, region
 
     def _region(self, content: dict[str, Any]) -> Region:
         return read_region(read_section(RegionSettings, "region", content), self.source.shape)
 
     def _inspect(self) -> None:
         """Inspect the frame in view as `rgbmidic inspect` does, in another thread."""
-        content = region_of(self.drawing.marks)
-        if content is None:
+        content, size = region_of(self.drawing.marks), float(self.parts.size.value)
+        if self.draft.section("mesh").get("file"):
+            mesh, region = self._of_file()
+            size = mesh.size
+        elif content is None:
             self.parts.message.text = "Draw the region first."
             return
+        else:
+            region = self._region(content)
         self.parts.message.text = "inspecting …"
-        index, size = int(self.parts.frame.value), float(self.parts.size.value)
-        work = partial(self.source.inspected, index, self._region(content), size)
+        index = int(self.parts.frame.value)
+        work = partial(self.source.inspected, index, region, size)
         self._reader.ask(work, lambda found: self._guarded(partial(self._have, found, index)))
 
     def _have(self, inspected: Callable[[], Inspection], index: int) -> None:
@@ -217,7 +232,9 @@ class SetupPage:
         frames["last"] = None if int(p.last.value) == end else int(p.last.value)
         if int(p.reference.value) != self.draft.frames.reference[0]:
             frames["reference"] = [int(p.reference.value)]
-        changes: dict[str, dict[str, Any]] = {"frames": frames, "mesh": {"element_size": float(p.size.value)}}
+        changes: dict[str, dict[str, Any]] = {"frames": frames}
+        if not self.draft.section("mesh").get("file"):
+            changes["mesh"] = {"element_size": float(p.size.value)}
         if p.calibration.value:
             changes["calibration"] = {"file": p.calibration.value}
         if content is not None:

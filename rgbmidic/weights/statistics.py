@@ -98,8 +98,6 @@ def _best_fractions(covariance: FloatImage, least: np.float32) -> FloatImage:
     C is the residuals' `covariance` (k, k, h, w), with variances of `least` or more.
     """
     lights = range(len(covariance))
-    if len(covariance) == 1:
-        return np.ones_like(covariance[0])
     matrices = covariance.copy()
     matrices[lights, lights] = np.maximum(matrices[lights, lights], least)
     for a, b in combinations(lights, 2):
@@ -113,4 +111,4 @@ def _best_fractions(covariance: FloatImage, least: np.float32) -> FloatImage:
         fractions[b] -= ratio * fractions[a]
     for a in reversed(lights):
         fractions[a] = (fractions[a] - (matrices[a, a + 1 :] * fractions[a + 1 :]).sum(axis=0)) / matrices[a, a]
-    return fractions
+    return np.asarray(fractions)

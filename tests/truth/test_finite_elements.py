@@ -11,7 +11,7 @@ import pytest
 import tifffile
 from textures import Affine, Texture
 
-from rgbmidic import Result, Tri3Mesh, measure_sequence
+from rgbmidic import CameraCalibration, Result, Tri3Mesh, measure_sequence
 from rgbmidic.cli import app
 from rgbmidic.command import execute
 from rgbmidic.fields import NodalCovariance, StrainGauges
@@ -181,3 +181,23 @@ def test_small_elements_and_bad_input_are_told(
     caplog.clear()
     Plan.from_settings(read_test(test_file))
     assert "triangles have sides under 3 speckles" in caplog.text
+
+
+def test_the_set_up_page_draws_the_mesh_of_the_file_and_keeps_its_section(test_file: Path) -> None:
+    document = pytest.importorskip("bokeh.document")
+    setup = pytest.importorskip("rgbmidic.view.setup")
+    page = setup.SetupPage(document.Document(), setup.Draft.of(test_file), [], dark=False)
+    page._make_mesh()
+    assert len(page._edges.data["xs"]) == len(MESH.elements)
+    assert page._changed().text == test_file.read_text()
+
+
+def test_with_a_camera_the_mesh_lies_on_its_plane(test_file: Path) -> None:
+    homography = np.array([[0.1, 0, 15], [0, 0.1, 15], [0, 0, 1]])
+    CameraCalibration(shape=SHAPE, homography=homography).write(test_file.with_name("camera.json"))
+    path = test_file.with_name("by_camera.toml")
+    path.write_text(test_file.read_text() + '[scale]\ncamera = "camera.json"\n')
+    plan = Plan.from_settings(read_test(path))
+    assert plan.placement is not None
+    assert plan.placement.mm_per_pixel is None
+    assert plan.reference.mesh.nodes + plan.window.origin == pytest.approx(MESH.nodes, abs=1e-6)

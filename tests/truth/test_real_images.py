@@ -152,7 +152,7 @@ def test_the_tension_test_converges_to_a_plausible_strain(grey, frame, stretch):
 def check_three_gauges_and_an_extensometer(found):
     """The mean strain along a line is that of its ends, whatever the gauge; a longer one is more certain."""
     ends, std = np.array([[180, 400], [180, 1600]]), []
-    along = make_probe(covariance(found), "gauge", 1, ends.ravel(), "biot")
+    along = make_probe(covariance(found), "gauge", 1, ends.ravel())
     part = [found.displacement[along.nodes].T, found.displacement_std[along.nodes].T]
     read = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), np.concatenate(part)[:, None], strict=True)))
     _, strain = along.histories(read)

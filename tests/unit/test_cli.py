@@ -500,3 +500,51 @@ def test_a_parameter_is_gathered_from_its_options():
     for arguments in (["x"], ["x", "--b", "c", "--flag", "--a", "3"]):
         assert execute(app, arguments) == 0
     assert gathered == [("x", {"a": None, "b": None}, False), ("x", {"a": 3, "b": "c"}, True)]
+
+
+def test_movie_and_profile_write_what_is_asked_for_or_nothing(command: Run, tmp_path: Path) -> None:
+    result, movie, table = tmp_path / "result", tmp_path / "m.gif", tmp_path / "p.csv"
+    make_result(result, frames=6, record=smooth_record)
+    line = ("--line", "20,40:100,45")
+    for arguments, message in (
+        (("movie", result, "--out", movie, "--range", "1"), "--range is LOW:HIGH"),
+        (("movie", result, "--out", movie, "--over", "mask"), "--over is reference or frame"),
+        (("movie", result, "--out", movie, "--frames", "7:9"), "none of them is measured"),
+        (("movie", result, "--out", movie, "--field", "w"), 'there is no field "w"'),
+        (("profile", result, "--out", table, "--line", "1,2"), "--line is X0,Y0:X1,Y1"),
+        (("profile", result, "--out", table, *line, "--field", "misfit"), "a field with an uncertainty"),
+        (("profile", result, "--out", table, *line, "--speed", "wave"), "front or peak"),
+        (("profile", result, "--out", table, *line, "--field", "exx", "--speed", "front"), "no front"),
+        (("profile", result, "--out", table, "--line", "20,40:900,40"), "half or more of the line"),
+    ):
+        status, out, err = command(*arguments)
+        assert (status, out) == (2, "")
+        assert message in err
+        assert not list(tmp_path.glob("*.*"))
+    assert command("movie", result, "--out", movie, "--field", "u,exx", "--range", "-.01:.01", "--width", 400)[0] == 0
+    assert command("profile", result, "--out", table, *line, "--field", "u", "--curves", "2,5")[0] == 0
+    assert movie.read_bytes()[:3] == b"GIF"
+    assert table.with_suffix(".png").is_file()
+    rows = [line.split(",") for line in table.read_text().splitlines()]
+    assert rows[0] == ["frame", "number", "position_px", "x_px", "y_px", "u_px", "u_px_std"]
+    numbers = np.array(rows[1:], dtype=float)
+    np.testing.assert_allclose(numbers[:, 5], 0.002 * numbers[:, 0] * (numbers[:, 3] - 60), atol=1e-6)
+    for name in ("movie", "profile"):
+        status, _, err = command(
+            name, result, "--out", {"movie": movie, "profile": table}[name], *line[: 2 * (name != "movie")]
+        )
+        assert status == 2
+        assert "already exists" in err
+
+
+def test_batch_goes_on_after_a_failure_and_ends_with_status_1(command: Run, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.toml").write_text(TEST)
+    status, _, err = command("batch", tmp_path / "a.toml", tmp_path / "b.toml", "--out", tmp_path / "out")
+    assert status == 1
+    assert "2 of 2 tests failed: a, b" in err
+    assert (tmp_path / "out" / "summary.csv").read_text().count("no frame") == 2
+    assert "Failed" in (tmp_path / "out" / "summary.html").read_text()
+    status, _, err = command("batch", tmp_path / "a.toml", "--out", tmp_path / "out2", "--elastic", "2:1")
+    assert status == 2
+    assert not (tmp_path / "out2").exists()

@@ -41,7 +41,7 @@ def nodal(nodes: np.ndarray, motion: np.ndarray) -> Nodal:
 @pytest.mark.parametrize("kind", PLACES)
 def test_every_probe_is_covered_by_what_it_states(kind):
     """100 draws: of the errors 86 to 100 % within 1.96, rms over stated .8 to 1.2 (3 standard deviations of either)."""
-    probe = make_probe(COVARIANCE, kind, 1, PLACES[kind], "green-lagrange")
+    probe = make_probe(COVARIANCE, kind, 1, PLACES[kind])
     truth = np.broadcast_to(MESH.nodes @ np.array([[0.02, 0.005], [-0.004, -0.01]]), NOISE.shape)
     found, true = (probe.histories(nodal(probe.nodes, motion)) for motion in (truth + NOISE, truth))
     for measured, exact in zip(found, true, strict=True):
@@ -51,7 +51,7 @@ def test_every_probe_is_covered_by_what_it_states(kind):
 
 
 def test_a_mean_over_neighbours_is_less_certain_than_their_number_says():
-    probe = make_probe(COVARIANCE, "region", 1, (20, 30, 150, 160), "green-lagrange")
+    probe = make_probe(COVARIANCE, "region", 1, (20, 30, 150, 160))
     (mean, _) = probe.histories(nodal(probe.nodes, NOISE))
     parts = probe.weights * STD[probe.nodes]
     together = dense_correlation(MESH)[np.ix_(probe.nodes, probe.nodes)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, NodalTest
 
-from rgbmidic.fields import MEASURES, Nodal, StrainGauges, make_probe, rates, reference_fraction
+from rgbmidic.fields import Nodal, StrainGauges, make_probe, rates, reference_fraction
 from rgbmidic.typing import FloatArray
 
 RIGHT, RATES = (0.9, 1.1), (0.7, 1.2)
@@ -74,7 +74,7 @@ def true_rates(test: NodalTest) -> tuple[FloatArray, FloatArray]:
 
 def strain_errors(test: NodalTest, window: float, measured: FloatArray) -> Iterator[tuple[str, FloatArray]]:
     """Finite strain of a gauge in every frame, and its rate."""
-    probe = make_probe(COVARIANCE, "strain_gauge", 1, (110, 90, 80), MEASURES[0])
+    probe = make_probe(COVARIANCE, "strain_gauge", 1, (110, 90, 80))
     std = test.std[:, probe.nodes]
     read = [
         probe.histories(Nodal(u=f[:, probe.nodes, 0], v=f[:, probe.nodes, 1], u_std=std, v_std=std))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import pickle
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -253,6 +255,14 @@ def test_files_that_are_no_mesh_are_refused(tmp_path: Path, name: str, content: 
         read_mesh(tmp_path / "missing.inp")
 
 
+def test_a_missing_meshio_is_told_with_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path / "a.vtu")
+    for module in ("meshio", "meshio.vtu"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=r'needs the package meshio.*: pip install "rgbmidic\[fe\]"'):
+        read_mesh(path)
+
+
 MM = np.array([[0.0, 0.0], [50.0, 0.0], [50.0, 30.0], [0.0, 30.0], [20.0, 10.0]])
 
 
@@ -311,6 +321,7 @@ def test_a_pair_beyond_what_the_others_explain_is_named(caplog: pytest.LogCaptur
     assert not caplog.text
     given[3, 2] += 25
     Placement.fit(given)
+    assert "leaves residuals of" in caplog.text
     assert "mesh.points[3]" in caplog.text
 
 
@@ -349,6 +360,8 @@ def test_a_camera_gives_lens_and_tilt_and_the_pairs_a_rigid_motion() -> None:
     assert placement.residuals == pytest.approx(0, abs=1e-6)
     assert placement.reflected
     assert placement.mm_per_pixel is None
+    with pytest.raises(InputError, match=r"0\.001 times as far apart"):  # the mesh's points in um
+        Placement.fit(np.hstack([MM * 300, camera.to_px(plane)]), camera)
     inside = placement.to_px(MM * 0.3)
     steps = [(placement.to_mm(inside + step) - placement.to_mm(inside - step)) / 2e-3 for step in 1e-3 * np.eye(2)]
     assert placement.jacobian(inside) == pytest.approx(np.stack(steps, axis=2), rel=1e-5, abs=1e-9)
@@ -366,7 +379,7 @@ def plate() -> FiniteElementMesh:
 
 
 def test_what_lies_outside_the_image_or_the_region_is_left_out_and_counted(caplog: pytest.LogCaptureFixture) -> None:
-    mesh, placement = plate(), Placement.fit([[0, 0, 10, 50], [10, 0, 20, 50]])
+    mesh, placement = pickle.loads(pickle.dumps((plate(), Placement.fit([[0, 0, 10, 50], [10, 0, 20, 50]]))))
     kept, placed, region = on_image(mesh, placement, (80, 80))
     assert len(kept.elements) == len(mesh.elements)
     assert np.abs(region.mask.sum() - placed.areas.sum()) < 0.05 * placed.areas.sum()

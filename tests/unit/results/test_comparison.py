@@ -18,6 +18,7 @@ from rgbmidic.command import execute
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
+from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
 from rgbmidic.results.comparison import Comparison, Levelling, Simulation, measured_mesh, place
 
@@ -159,10 +160,20 @@ def test_a_rigid_motion_is_stated_and_taken_off(tmp_path):
     assert np.mean(squares) == pytest.approx(1, abs=0.025)
 
 
+def test_a_simulation_of_another_shape_has_no_scale_without_a_word(tmp_path):
+    result = measured(tmp_path / "r", stretch()[None] + noise(1))
+    right, wrong = (compared(result, 0.9 * stretch(bend=bend)) for bend in (0.05, 0.5))
+    assert "the shape differs" not in scale_text(right, [right.frame(0)])
+    assert "; the shape differs (chi-square of what is left: " in scale_text(wrong, [wrong.frame(0)])
+
+
 def test_nodes_without_data_are_left_out_and_so_is_their_strain(tmp_path):
     field = stretch()
     field[7] = np.nan
-    made = compared(measured(tmp_path / "r", field[None] + noise(1)), np.nan_to_num(stretch())).frame(0)
+    frames = np.stack([field, np.full(field.shape, np.nan)]) + noise(2)
+    made, blank = compared(measured(tmp_path / "r", frames), stretch()).each()
+    assert np.isnan(blank.fit.scale)
+    assert blank.agreement["levelled", "displacement"].nodes == 0
     assert np.flatnonzero(np.isnan(made.ratio("levelled", "u"))).tolist() == [7]
     around = MESH.beside(np.arange(NODES) == 7)
     assert np.isnan(made.ratio("nodes", "eyy")).tolist() == around.tolist()
@@ -307,6 +318,7 @@ def option(*words: str) -> Callable[[list[str]], None]:
         (no_points, "is not known: state two points or more, --points"),
         (option("--points", "1,2"), "--points is X_MM,Y_MM:X_PX,Y_PX, such as"),
         (option("--frames", "99"), "there is no frame 99"),
+        (option("--frames", "1,0"), "is of the reference, against which nothing has moved"),
         (option("--frames", "a"), "--frames are whole numbers"),
         (option("--rigid", "keep"), '--rigid is tell or remove, not "keep"'),
         (option("--fe", "missing.vtu"), "missing.vtu"),
@@ -319,7 +331,7 @@ def option(*words: str) -> Callable[[list[str]], None]:
     ],
 )
 def test_what_cannot_be_compared_is_refused_in_a_line_and_nothing_is_written(tmp_path, states, capsys, change, message):
-    result = measured(tmp_path / "r", np.arange(3)[:, None, None] * stretch())
+    result = measured(tmp_path / "r", np.arange(3)[:, None, None] * stretch(), references=[0])
     out = tmp_path / "out"
     arguments = ["compare", str(result.path), f"--out={out}", "--fe", str(states.parent / "all.pvd"), *POINTS]
     change(arguments)

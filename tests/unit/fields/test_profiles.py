@@ -1,0 +1,139 @@
+"""A field along a line, arrival times of a front or peak, and its speed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rgbmidic.errors import InputError
+from rgbmidic.fields import NodalCovariance, ProfileLine, StrainGauges
+from rgbmidic.fields.profiles import arrival_times, fit_front, rate_correlation
+from rgbmidic.mesh import Region, Tri3Mesh
+
+MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 10, 490, 90), (100, 500)), 20)
+COVARIANCE = NodalCovariance.from_mesh(MESH)
+GAUGES = StrainGauges.at_nodes(COVARIANCE)
+LINE = ProfileLine.between(COVARIANCE, GAUGES, 20, 45, 480, 55)
+ROOT = np.linalg.cholesky(COVARIANCE.correlation.toarray() + 1e-9 * np.eye(len(MESH.nodes)))
+SPEED, LENGTH, FRAMES = 9.0, 160.0, 80
+TRUE = SPEED * np.hypot(460, 10) / 460
+"""Along the line, which is not quite parallel to x."""
+
+
+def wave(noise: float, seed: int) -> np.ndarray:
+    """u (T, N) of a longitudinal pulse along x, with noise as the solve leaves it and that of a common reference."""
+    random = np.random.default_rng(seed)
+    behind = (SPEED * np.arange(FRAMES)[:, None] - MESH.nodes[:, 0]) / LENGTH
+    pulse = np.where((behind > 0) & (behind < 1), 1.5 * np.sin(np.pi * behind) ** 2, 0.0)
+    errors = random.normal(0, noise, (FRAMES + 1, len(MESH.nodes))) @ ROOT.T
+    return pulse + errors[1:] - errors[0]
+
+
+def along(field: str, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The field u or exx and its uncertainty along the line, (T, P)."""
+    std, nothing, read = np.full(len(MESH.nodes), noise * np.sqrt(2)), np.zeros(len(MESH.nodes)), []
+    for u in wave(noise, seed):
+        if field == "u":
+            read.append(LINE.read(u, std))
+        else:
+            strain = GAUGES.strain(u, nothing, std, std, measure="engineering")
+            read.append(LINE.read(strain.components[:, 0], strain.components_std[:, 0], "exx"))
+    return np.array([pair[0] for pair in read]), np.array([pair[1] for pair in read])
+
+
+def test_a_quadratic_field_is_read_exactly() -> None:
+    x, y = MESH.nodes.T
+    values, std = LINE.read(1e-4 * x**2 - 2e-4 * x * y + y, np.full(len(x), 0.01))
+    x, y = LINE.points.T
+    np.testing.assert_allclose(values, 1e-4 * x**2 - 2e-4 * x * y + y, atol=1e-6)
+    assert np.all((std > 0) & (std < 0.012))
+
+
+def test_the_stated_uncertainty_is_that_of_noise() -> None:
+    random = np.random.default_rng(1)
+    draws = np.array([LINE.read(ROOT @ random.normal(0, 0.01, len(MESH.nodes)), np.full(len(MESH.nodes), 0.01))
+                      for _ in range(300)])  # fmt: skip
+    ratio = draws[:, 0].std(axis=0) / draws[0, 1]
+    assert 0.9 < np.sqrt((ratio**2).mean()) < 1.1
+
+
+def test_a_point_beside_a_missing_node_is_not_measured() -> None:
+    values = np.zeros(len(MESH.nodes))
+    near = np.hypot(*(MESH.nodes - (250, 50)).T).argmin()
+    values[near] = np.nan
+    read, std = LINE.read(values, np.full(len(values), 0.01))
+    away = np.abs(LINE.points[:, 0] - MESH.nodes[near, 0])
+    assert np.isnan(read[away < 5]).all()
+    assert np.isfinite(read[away > 25]).all()
+    np.testing.assert_array_equal(np.isnan(read), np.isnan(std))
+
+
+@pytest.mark.parametrize(("field", "what"), [("u", "front"), ("exx", "peak")])
+def test_the_speed_of_a_pulse_lies_within_its_uncertainty(field: str, what: str) -> None:
+    kind, errors, stds = "" if field == "u" else "exx", [], []
+    for seed in range(100, 120):
+        values, std = along(field, 0.03, seed)
+        arrivals = arrival_times(np.arange(FRAMES), values, std, what=what)
+        front = fit_front(LINE.positions, arrivals, std, LINE.correlation(kind), usable=LINE.even)
+        errors.append(front.speed - TRUE)
+        stds.append(front.speed_std)
+    ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(stds)))
+    assert 0.6 < ratio < 1.5  # .84 to 1.17 over 80 draws; 20 of them leave a spread of .16
+    assert np.mean(stds) < 0.003 * TRUE
+
+
+def test_a_wave_that_comes_back_has_a_negative_speed() -> None:
+    values, std = along("u", 0.01, 0)
+    arrivals = arrival_times(np.arange(FRAMES), values[:, ::-1], std)
+    assert fit_front(LINE.positions, arrivals, std, LINE.correlation()).speed == pytest.approx(-TRUE, rel=0.01)
+
+
+def test_noise_alone_and_uniform_motion_have_no_front() -> None:
+    random = np.random.default_rng(0)
+    noise, std = random.normal(0, 1, (FRAMES, len(LINE.points))), np.ones((FRAMES, len(LINE.points)))
+    arrivals = arrival_times(np.arange(FRAMES), noise, std)
+    with pytest.raises(InputError, match="no front: something arrives at 0 of"):
+        fit_front(LINE.positions, arrivals, std, LINE.correlation())
+    together = noise + 40 * (np.arange(FRAMES) > 30)[:, None] * np.exp(-np.arange(FRAMES) / 60)[:, None]
+    arrivals = arrival_times(np.arange(FRAMES), together, std)
+    with pytest.raises(InputError, match="no front travels along the line"):
+        fit_front(LINE.positions, arrivals, std, LINE.correlation())
+
+
+def test_arrival_times_state_their_noise_and_skip_missing_frames() -> None:
+    random, times = np.random.default_rng(2), np.delete(np.arange(60.0), [20, 27])
+    pulse = np.exp(-(((times - 30.3) / 6) ** 2))[:, None]
+    std = np.full((len(times), 400), 0.03)
+    values = pulse + random.normal(0, 0.03, std.shape)
+    values[15, :200] = np.nan
+    for what in ("front", "peak"):
+        found = arrival_times(times, values, std, what=what, common_fraction=0.0)
+        assert 0.85 < found.times.std() / np.median(found.std) < 1.15
+        if what == "peak":
+            assert found.times.mean() == pytest.approx(30.3, abs=0.1)
+
+
+def test_an_abrupt_front_is_uncertain_by_the_interval_of_the_frames() -> None:
+    step = np.repeat((np.arange(40) > 20)[:, None] * 1.0, 5, axis=1)
+    found = arrival_times(np.arange(40), step * (1 - 0.001 * np.arange(40))[:, None], np.full(step.shape, 1e-4))
+    assert found.abrupt
+    np.testing.assert_allclose(found.std, 1 / np.sqrt(12), rtol=0.01)
+
+
+def test_the_correlation_of_rates_between_frames_is_that_of_slopes_in_noise() -> None:
+    times = np.arange(21.0)
+    fit = np.zeros((21, 21))
+    for t in range(3, 18):
+        window = np.arange(t - 3, t + 4)
+        fit[t, window] = (window - t) / 28
+    inner = slice(3, 18)
+    covariance = (fit @ fit.T)[inner, inner]
+    np.testing.assert_allclose(rate_correlation(times, 6.0)[inner, inner], covariance * 28, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"), [((20, 50, 20, 50), "two different points"), ((20, 50, 20, 5000), "half or more of the line")]
+)
+def test_a_line_that_is_none_is_refused(line: tuple[float, ...], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        ProfileLine.between(COVARIANCE, GAUGES, *line)

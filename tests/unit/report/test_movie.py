@@ -1,0 +1,130 @@
+"""Movies: formats, colours, processes, interruption, wrong input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from results import NODES, make_result, smooth_record
+
+from rgbmidic.errors import InputError, ResultError
+from rgbmidic.report import movie
+from rgbmidic.report.movie import Curve, write_movie
+from rgbmidic.results import FrameRecord, Maps
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Maps:
+    folder = tmp_path_factory.mktemp("movie") / "result"
+    more = {"notes": {"frame_rate": 1e5}, "reference": np.full((3, 80, 120), 90.0)}
+    return Maps.of(make_result(folder, frames=6, record=smooth_record, **more))
+
+
+def decoded(path: Path) -> np.ndarray:
+    """Frames (T, H, W, 3) of a movie as ffmpeg reads it."""
+    reader = imageio_ffmpeg.read_frames(str(path))
+    width, height = next(reader)["size"]
+    return np.array([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader])
+
+
+@pytest.mark.parametrize("ending", [".mp4", ".webm", ".gif"])
+def test_a_movie_shows_the_field_in_each_frame(maps: Maps, tmp_path: Path, ending: str) -> None:
+    out = write_movie(maps, tmp_path / f"m{ending}", ["u", "exx"], width=640, frames=[1, 3, 5])
+    frames = decoded(out).astype(int)
+    assert frames.shape[0] == 3
+    canvas = movie._Drawer.of(maps, ("u", "exx"), [1, 3, 5], None, images=None, curve=None, colours=None)
+    page = replace(canvas, width=640).opened().page(3)[..., :3].astype(int)
+    part = frames[1][: page.shape[0], : page.shape[1]]
+    assert np.abs(part - page).mean() < 4  # what the encoders leave: 1 to 3 of 255
+    assert np.abs(frames[0] - frames[2]).mean() > 2
+
+
+def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
+    from matplotlib import colormaps
+
+    drawer = movie._Drawer.of(maps, ("u",), [5], (-0.5, 0.5), images=None, curve=None, colours=None)
+    canvas = drawer.opened()
+    page, (step, left), (_, top) = canvas.page(5), *canvas._steps()
+    rows, columns, _ = canvas._boxes[0]
+    for x, y in ((30, 40), (60, 30), (95, 60)):
+        value = 0.01 * (x - 60)
+        at = page[rows.start + round((y - top) / step), columns.start + round((x - left) / step), :3] / 255
+        np.testing.assert_allclose(at, colormaps["viridis"](value + 0.5)[:3], atol=0.03)
+
+
+def test_pages_are_the_same_for_any_number_of_processes(maps: Maps) -> None:
+    curve = Curve(name="force_N", times=np.linspace(0, 5e-5, 9), values=np.arange(9.0), timed=True)
+    drawer = movie._Drawer.of(maps, ("exx", "velocity"), [0, 2, 4], None, images=None, curve=curve, colours=None)
+    alone, shared = (list(movie._pages(drawer, [0, 2, 4], count)) for count in (1, 2))
+    assert all(np.array_equal(a, b) for a, b in zip(alone, shared, strict=True))
+    assert not np.array_equal(alone[0], alone[1])
+
+
+def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) -> None:
+    def shifted(index: int) -> FrameRecord:
+        both = {
+            "u": np.full(NODES, 30.0 * index),
+            "v": np.zeros(NODES),
+            "u_std": np.ones(NODES),
+            "v_std": np.ones(NODES),
+        }
+        rest = {"exx": np.zeros(NODES), "misfit": np.ones(NODES), "light_fraction": np.full((NODES, 3), 1 / 3)}
+        return FrameRecord.of(
+            nodes=NODES, lights=3, number=index, status=0, node_status=np.zeros(NODES), **both, **rest
+        )
+
+    maps = Maps.of(make_result(tmp_path / "r", frames=2, record=shifted, notes={"frame_shape": [80, 200]}))
+    grey = lambda index: np.full((80, 200), 100, dtype=np.uint8)  # noqa: E731
+    drawer = movie._Drawer.of(maps, ("u",), [0, 1], None, images=grey, curve=None, colours=None)
+    canvas = drawer.opened()
+    (step, left), (_, top) = canvas._steps()
+    rows, columns, _ = canvas._boxes[0]
+    page = canvas.page(1)[rows, columns]
+    grey_at = lambda x: np.ptp(page[round((40 - top) / step), round((x - left) / step), :3]) == 0  # noqa: E731
+    assert grey_at(25)  # where the mesh begins on the reference
+    assert not grey_at(135)  # beyond its end there
+
+
+def test_nothing_is_left_of_a_movie_that_is_interrupted(maps: Maps, tmp_path: Path) -> None:
+    def stop(done: int, total: int, line: str) -> None:
+        raise KeyboardInterrupt
+
+    for ending in (".mp4", ".gif"):
+        with pytest.raises(KeyboardInterrupt):
+            write_movie(maps, tmp_path / f"m{ending}", ["u"], width=320, progress=stop)
+    assert not list(tmp_path.iterdir())
+
+
+def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path: Path) -> None:
+    for message, name, fields, more in (
+        ("name ends in .mp4, .webm, .gif", "m.avi", ["u"], {}),
+        ("there is no field", "m.gif", ["w"], {}),
+        ("fields of numbers", "m.gif", ["node_status"], {}),
+        ("no frame", "m.gif", ["u"], {"frames": [6]}),
+        ("from a smaller to a larger", "m.gif", ["u"], {"limits": (1.0, 1.0)}),
+        (".1 to 240 frames", "m.gif", ["u"], {"fps": 0.0}),
+        ("no colours", "m.gif", ["u"], {"colours": "none"}),
+    ):
+        with pytest.raises(InputError, match=message):
+            write_movie(maps, tmp_path / name, fields, **more)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "there.gif").write_text("kept")
+    with pytest.raises(ResultError, match="already exists"):
+        write_movie(maps, tmp_path / "there.gif", ["u"])
+    assert (tmp_path / "there.gif").read_text() == "kept"
+
+
+def test_a_curve_is_a_column_of_a_history_or_a_channel(tmp_path: Path) -> None:
+    history, channels = tmp_path / "h.csv", tmp_path / "c.csv"
+    history.write_text("frame,number,status,time_s,a_px,a_px_std,b\n0,0,0,0.5,1,.1,\n1,1,0,1.5,2,.1,7\n")
+    channels.write_text("time_ms,load_N\n0,1\n10,3\n")
+    assert Curve.read(history).name == "a_px"
+    curve = Curve.read(history, "b")
+    np.testing.assert_array_equal(curve.times, [0.5, 1.5])
+    np.testing.assert_array_equal(curve.values, [np.nan, 7])
+    assert Curve.read(channels, offset=1.0).times[0] == 1.0
+    with pytest.raises(InputError, match="it has a_px, b"):
+        Curve.read(history, "c")
