@@ -186,7 +186,7 @@ class SetupPage:
 
     def _of_file(self) -> tuple[Tri3Mesh, Region]:
         """Place the mesh of ``mesh.file`` by its points; what is drawn restricts it."""
-        document = {**self.draft.document, "region": self.drawing.region or self.draft.section("region")}
+        document = {**self.draft.document, "region": region_of(self.drawing.marks) or self.draft.section("region")}
         settings = TestSettings.from_mapping(document, self.draft.file.parent)
         _, _, mesh, region = finite_elements_of(settings, self.source.shape)
         return mesh, region
