@@ -104,6 +104,8 @@ def _probe(quantity: HistoryColumn, names: Iterable[str]) -> str:
 
 
 _LINES, _BANDS = "xs ys colour name", "xs ys colour"
+_BESIDE, _MARGIN = OKABE_ITO["vermillion"], 0.1
+"""Colour of a channel beside the curves; room above and below it, as Bokeh's own ranges have."""
 _STRETCHES = 1500
 """Stretches of a channel that are drawn: as many as a wide screen has columns for them."""
 _AT_ONCE = 100
@@ -254,7 +256,7 @@ class CurvePanel:
         self._reader = Background(document)
         self._lines = bk.ColumnDataSource(columns(_LINES), name="lines")
         self._bands = bk.ColumnDataSource(columns(_BANDS), name="bands")
-        self._recorded = bk.ColumnDataSource(columns(_LINES), name="recorded")
+        self._recorded = bk.ColumnDataSource(columns("xs ys"), name="recorded")
         self.plot, self.now = self._new_plot(), bk.Span(**NOW)
         self.plot.add_layout(self.now)
         select.on_change("value", lambda attr, old, new: self.draw())
@@ -269,11 +271,12 @@ class CurvePanel:
         style = {"line_color": "colour", "line_width": 1.5, "legend_field": "name"}
         drawn = plot.multi_line("xs", "ys", source=self._lines, **style)
         plot.x_range.renderers = plot.y_range.renderers = [drawn]  # the values rule, not the widest band
-        plot.extra_y_ranges = {"channel": bk.DataRange1d()}
-        beside = plot.multi_line("xs", "ys", source=self._recorded, line_dash="dashed", y_range_name="channel", **style)
-        plot.extra_y_ranges["channel"].renderers = [beside]
-        texts = dict.fromkeys(("major_label_text_font_size", "axis_label_text_font_size"), "12px")
-        self._axis = bk.LinearAxis(y_range_name="channel", visible=False, **texts)
+        self._range = bk.Range1d(0, 1)
+        plot.extra_y_ranges = {"channel": self._range}
+        look: dict[str, Any] = {"line_color": _BESIDE, "line_dash": "dashed", "y_range_name": "channel"}
+        beside = plot.multi_line("xs", "ys", source=self._recorded, line_width=1.5, **look)
+        texts: dict[str, Any] = dict.fromkeys(("major_label_text_font_size", "axis_label_text_font_size"), "12px")
+        self._axis = bk.LinearAxis(y_range_name="channel", visible=False, axis_label_text_color=_BESIDE, **texts)
         plot.add_layout(self._axis, "right")
         self._curves, self._all = [drawn], [drawn, beside]
         hover.renderers, hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
@@ -333,7 +336,7 @@ class CurvePanel:
         """Draw the chosen curve of all probes."""
         if self.histories is None:
             self._bands.data, self._lines.data = columns(_BANDS), columns(_LINES)
-            self._recorded.data, self._axis.visible = columns(_LINES), False
+            self._recorded.data, self._axis.visible = columns("xs ys"), False
             self.plot.legend.visible = False
             self.plot.xaxis.axis_label = self.plot.yaxis.axis_label = None
             return
@@ -358,10 +361,13 @@ class CurvePanel:
             ends = np.searchsorted(channels.times, [2 * first - last, 2 * last - first])
             part = slice(*ends) if ends[0] < ends[1] else slice(None)
             x, y = _thinned(time_unit(times)[0] * channels.times[part], channels.values[self.beside][part])
-            rows = [(x, y, OKABE_ITO["vermillion"], f"{self.beside} (right)")]
+            rows = [(x, y)]
+            low, high = np.nanmin(y), np.nanmax(y)
+            margin = (high - low or 1.0) * _MARGIN
+            self._range.update(start=low - margin, end=high + margin)
             if ends[0] == ends[1] or not self._lines.data["xs"]:
                 self.plot.x_range.renderers = self._all
-        self._recorded.data = columns(_LINES, rows)
+        self._recorded.data = columns("xs ys", rows)
         self._axis.update(visible=bool(rows), axis_label=self.beside)
 
     def grab(self, x: float) -> None:

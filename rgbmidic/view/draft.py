@@ -117,7 +117,8 @@ class Draft:
             raise ConfigurationError(f"{file} must end in .toml and be in {' or '.join(sorted(map(str, folders)))}")
         if file.exists():
             return cls.of(file)
-        settings = {name: dict(section) for name, section in result.provenance.get("settings", {}).items()}
+        stated = result.provenance.get("settings", {})
+        settings = {name: dict(section) for name, section in stated.items() if section}
         frames = settings.setdefault("frames", {})
         frames["path"] = [str(base / path) for path in frames.get("path", ())]
         return cls(file=file, text="").changed(settings)

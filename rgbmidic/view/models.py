@@ -99,7 +99,7 @@ WRITTEN = ("probes", "channels", "scale")
 MODES = ("Move", "Point", "Gauge", "Line", "Strain", "Box", "Circle")
 _ENDS = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
 _NUMBER = {"mode": "float"}
-_CLOCKS = [("offset", "an offset"), ("trigger", "a trigger channel"), ("correlation", "correlation with a curve")]
+_CLOCKS = [("offset", "an offset"), ("trigger", "a trigger"), ("correlation", "correlation")]
 CONTROLS: tuple[tuple[str, str, type[bk.Widget], str, dict[str, Any]], ...] = (
     ("field", "Field", bk.Select, "Field", {}),
     ("second", "Field", bk.Select, "Second field", {}),
@@ -126,7 +126,7 @@ CONTROLS: tuple[tuple[str, str, type[bk.Widget], str, dict[str, Any]], ...] = (
     ("rate_window", "Derived", bk.Spinner, "Rates over frames (0: as stated, or 9)", {"low": 0}),
     ("along", "Probes", bk.Select, "Along x", {}),
     ("channels", "Channels", bk.TextInput, "CSV file beside the test", {}),
-    ("beside", "Channels", bk.Select, "Channel beside the curves", {}),
+    ("beside", "Channels", bk.Select, "Beside the curves", {}),
     ("clock", "Channels", bk.Select, "Its time by", {"options": _CLOCKS}),
     ("offset", "Channels", bk.NumericInput, "Offset, s", _NUMBER),
     ("trigger", "Channels", bk.Select, "Trigger channel", {}),
@@ -191,7 +191,8 @@ class ResultControls(Controls):
         parts["Probes"] = [self.mode, *lines, *buttons, self.message]
         file, beside, clock, offset, trigger, align, align_to, force, area = parts["Channels"]
         pairs = row(align, align_to, **flat), row(force, area, **flat)
-        parts["Channels"] = [file, beside, clock, trigger, pairs[0], offset, self.drag, pairs[1], self.told]
+        shown = row(beside, clock, **flat), trigger, pairs[0], offset, self.drag, pairs[1]
+        parts["Channels"] = [file, *shown, self.told]
         distance = row(*parts["File"][:2], **flat)
         writes = self.file, self.what, row(self.write, self.take, **flat), self.written
         parts["File"] = [self.scale, distance, self.of["camera"], self.scaled, *writes]

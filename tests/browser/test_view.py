@@ -143,7 +143,7 @@ def test_no_control_is_cut_off(driver, address, size, theme):
     for name in ("step", "over", "section"):
         assert page.run(f"Bokeh.index.get_one(model('{name}')).el.getAttribute('aria-label')")
     assert driver.execute_script("return [innerWidth, innerHeight]") == list(size)
-    for section in range(5):
+    for section in range(7):
         page.keys(str(section + 1))
         page.until(f"model('section').active === {section}")
         time.sleep(0.3)
