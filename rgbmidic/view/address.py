@@ -266,7 +266,7 @@ class ViewState:
             "correlation": {"align": (self.align, self.align_to) if self.align and self.align_to else None},
         }
         return ChannelSettings(
-            file=base / self.channels, area=self.area or None, force=self.force or None, **clocks[self.clock]
+            file=base / self.channels, area=max(self.area, 0) or None, force=self.force or None, **clocks[self.clock]
         )
 
     def scale_settings(self, base: Path, kept: ScaleSettings) -> ScaleSettings | None:

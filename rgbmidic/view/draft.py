@@ -392,6 +392,7 @@ def _corners(name: str, marks: Sequence[Mark]) -> Ring:
 _SOON = 60
 """Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
 _COLOURS = list(OKABE_ITO.values())
+"""Of the masks; the first two are those of holes and outline."""
 
 
 class RegionDrawing:
@@ -448,7 +449,7 @@ class RegionDrawing:
         self._coming = False
         self._canvas.place(self.marks)
         outline, holes = rings(self.marks)
-        masks = [(ring, _COLOURS[at % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
+        masks = [(ring, _COLOURS[(at + 2) % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
         closed = [[*ring, *ring[:1]] for ring in (outline, *holes, *(ring for ring, _ in masks))]
         self._rings.data = {
             "xs": [[x for x, _ in ring] for ring in closed],

@@ -172,7 +172,7 @@ class ResultControls(Controls):
         self.name = bk.TextInput(title="its name", name="name", **wide)
         self.drag = bk.Toggle(label="Drag the channel along the time", name="drag", **wide)
         self.scale = bk.RadioButtonGroup(labels=["Move", "Two points of a distance"], name="scale", **wide)
-        self.file = bk.TextInput(title="TEST.toml", name="file", **wide)
+        self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", **wide)
         self.what = bk.CheckboxButtonGroup(labels=list(WRITTEN), active=[0], name="what", **wide)
         self.told, self.written, self.scaled = (bk.Div(name=name, **wide) for name in ("told", "written", "scaled"))
 
@@ -191,8 +191,8 @@ class ResultControls(Controls):
         parts["Probes"] = [self.mode, *lines, *buttons, self.message]
         file, beside, clock, offset, trigger, align, align_to, force, area = parts["Channels"]
         pairs = row(align, align_to, **flat), row(force, area, **flat)
-        shown = row(beside, clock, **flat), trigger, pairs[0], offset, self.drag, pairs[1]
-        parts["Channels"] = [file, *shown, self.told]
+        clocks = row(beside, clock, **flat), trigger, pairs[0], offset, self.drag
+        parts["Channels"] = [file, *clocks, pairs[1], self.told]
         distance = row(*parts["File"][:2], **flat)
         writes = self.file, self.what, row(self.write, self.take, **flat), self.written
         parts["File"] = [self.scale, distance, self.of["camera"], self.scaled, *writes]

@@ -60,9 +60,8 @@ _CONTOURS = 10
 _CURVES = {entry for entry, section, *_ in CONTROLS if section == "Channels"} | {"along"}
 """Entries of the view that the curves alone depend on."""
 _HELP = (
-    "Choose a probe, then click on the field (Gauge, Line, Box and Circle: twice): its curve appears beside it, the "
-    "value, or mean, at it. Drag a mark to move it; Backspace removes a chosen one. Keys: ← → a frame, space plays, "
-    "1 to 7 the sections above, Ctrl-Z undoes."
+    "Choose a probe, click on the field (Gauge, Line, Box, Circle: twice). Drag marks; Backspace removes one. "
+    "Keys: ← → a frame, space plays, 1 to 7 sections, Ctrl-Z undoes, Ctrl-Y redoes."
 )
 
 
@@ -128,7 +127,7 @@ class ResultPage:
         p, view = self.parts, self.view
         self._offer_fields()
         self._offer()
-        p.file.value = str(self._base / "TEST.toml")
+        p.file.value = "TEST.toml"
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
         p.message.text, p.head.text = _HELP, self._title()

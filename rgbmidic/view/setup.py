@@ -50,8 +50,9 @@ _EXPECTED = "expected uncertainty"
 _GLARE = np.uint32(0xFF2030FF)
 _HELP = (
     "1. Choose a shape and click on the frame: Rectangle (two opposite corners), Polygon, Circle (centre, then "
-    "a place on it); holes likewise. Marks can be dragged; Backspace removes a chosen one.<br>2. Choose the element "
-    "size.<br>3. <b>Inspect</b> shows what uncertainty to expect.<br>4. Write the file, and run it."
+    "a place on it); holes and lamp masks (polygons where a light does not count) likewise, Next begins another. Marks "
+    "can be dragged; Backspace removes a chosen one; Ctrl-Z undoes.<br>2. Choose the element size.<br>"
+    "3. <b>Inspect</b> shows what uncertainty to expect.<br>4. Write the file, and run it."
 )
 
 

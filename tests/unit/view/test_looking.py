@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import parse_qs
 
@@ -20,9 +21,9 @@ from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import FrameRecord, Maps, MapValues, Result, ResultStore
 from rgbmidic.results.histories import read_histories, write_histories
-from rgbmidic.settings import ProbeSettings, TestSettings
+from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.view import curves
-from rgbmidic.view.address import KINDS, PALETTES, UNCERTAINTY, Mark, ViewState, probe_marks
+from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
 from rgbmidic.view.canvas import arrow_lines, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.fields import frame_text, pointer_text, probe_text, range_of_test, robust_range, watched
@@ -30,8 +31,16 @@ from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, palette_name
 
 NAMES = ("u", "v", "e1")
+
+
+def replace_name(mark, name):
+    return replace(mark, name=name if len(name) % 2 else "")
+
+
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
-marks = st.lists(st.builds(Mark, st.sampled_from(list(KINDS)), numbers, numbers), max_size=4).map(tuple)
+marks = st.lists(st.builds(Mark, st.sampled_from(MARKS), numbers, numbers), max_size=4).map(tuple)
+names = st.sets(st.from_regex(PROBE_NAME, fullmatch=True), min_size=4, max_size=4)
+named = st.builds(lambda marks, names: tuple(map(replace_name, marks, names)), marks, names)
 looks = st.builds(
     ViewState,
     frame=st.integers(0, 9),
@@ -50,7 +59,10 @@ looks = st.builds(
     rate_window=st.integers(0, 99),
     curve=st.text("abc ()/²", max_size=9),
     theme=st.sampled_from(["", "light", "dark"]),
-    marks=marks,
+    channels=st.text("abc /.ä", max_size=9),
+    clock=st.sampled_from(CLOCKS),
+    offset=st.floats(-1e9, 1e9),
+    marks=named,
 )
 
 
@@ -79,7 +91,81 @@ def test_an_address_of_nonsense_opens_something_that_can_be_shown(query):
     assert -1 <= view.since < 10
     assert view.levels >= 2
     assert view.rate_window >= 0
-    assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in KINDS for mark in view.marks)
+    assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in MARKS for mark in view.marks)
+
+
+@given(st.lists(named, max_size=6))
+def test_every_step_is_undone_and_done_again(states):
+    steps = Steps(())
+    for state in states:
+        steps.keep(state)
+    back = [steps.now]
+    while (state := steps.go(back=True)) != back[-1] or len(back) <= len(states):
+        back.append(state)
+        if len(back) > len(states) + 1:
+            break
+    assert steps.now == ()
+    for _ in back:
+        steps.go(back=False)
+    assert steps.now == (states[-1] if states else ())
+
+
+def test_the_moves_of_a_drag_are_one_step_and_those_of_another_mark_another():
+    one, two = Mark("point", 1, 1), Mark("point", 9, 9)
+    steps = Steps((one, two))
+    for x in (2, 3, 4):
+        steps.keep((replace(one, x=x), two))
+    steps.keep((replace(one, x=4), replace(two, y=5)))
+    assert steps.go(back=True) == (replace(one, x=4), two)
+    assert steps.go(back=True) == (one, two)
+    steps.keep((one,))
+    assert steps.go(back=False) == (one,)
+
+
+@given(named, st.floats(1, 99))
+def test_marks_of_the_probes_that_marks_make_make_the_same(set_, gauge):
+    made = curves.probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
+    assert curves.probes(curves.marks_of(made), gauge, ProbeSettings()) == made
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"offset": -1.23456789012e-3, "area": 20.0},
+        {"trigger": "ttl_V", "force": "a_N"},
+        {"align": ("a", "gauge_1_strain")},
+        {},
+    ],
+)
+def test_channels_that_are_stated_are_those_of_the_address(stated):
+    channels = ChannelSettings(file=Path("/x/daq.csv"), **stated)
+    view = ViewState().with_channels(channels)
+    assert opened(view.query()).channel_settings(Path("/y")) == channels
+    assert ViewState(channels="b.csv").with_channels(channels).channels == "b.csv"
+    assert ViewState(channels="b.csv", area=-1.0).channel_settings(Path("/y")).area is None
+
+
+def test_a_thinned_curve_keeps_its_peaks():
+    x, y = np.arange(100_000.0), np.zeros(100_000)
+    y[[777, 50_001]] = 5, -3
+    thin = curves._thinned(x, y)
+    assert len(thin[0]) <= 3000
+    assert (x[y.argmax()], x[y.argmin()]) == (thin[0][thin[1].argmax()], thin[0][thin[1].argmin()])
+
+
+def test_channels_off_the_frames_are_shown_where_they_are_and_told(tmp_path):
+    result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
+    (tmp_path / "daq.csv").write_text("time_s,a_N\n" + "".join(f"{5 + n},{n}\n" for n in range(9)), encoding="utf-8")
+    page = ResultPage(Document(), result, ViewState(channels="daq.csv", beside="a_N"), Progress(4))
+    page._read_curves()
+    assert "span 5 to 13 s" in page.parts.told.text
+    assert list(page.curves._recorded.data["ys"][0]) == list(range(9))
+    page.parts.of["offset"].value = -5.0
+    assert "has no value in" not in page.parts.told.text
+    page.parts.of["area"].value = 2.0
+    np.testing.assert_allclose(page.curves.histories["stress"].values, 0.5 * 2e-5 * np.arange(4), atol=1e-15)
+    page._save()
+    assert page.state.csv.splitlines()[0] == "frame,number,status,time_s,a_N,stress_MPa"
 
 
 @pytest.fixture(scope="module")
