@@ -94,7 +94,8 @@ def test_an_address_of_nonsense_opens_something_that_can_be_shown(query):
     assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in MARKS for mark in view.marks)
 
 
-@given(st.lists(named, max_size=6))
+@given(st.lists(marks, max_size=6))
+@settings(max_examples=30)
 def test_every_step_is_undone_and_done_again(states):
     steps = Steps(())
     for state in states:
@@ -123,6 +124,7 @@ def test_the_moves_of_a_drag_are_one_step_and_those_of_another_mark_another():
 
 
 @given(named, st.floats(1, 99))
+@settings(max_examples=20)
 def test_marks_of_the_probes_that_marks_make_make_the_same(set_, gauge):
     made = curves.probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
     assert curves.probes(curves.marks_of(made), gauge, ProbeSettings()) == made
