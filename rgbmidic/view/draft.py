@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -12,13 +12,10 @@ from typing import Any, Self
 import cv2
 import numpy as np
 import tomlkit
-from bokeh.document import Document
-from bokeh.models import ColumnDataSource
 from tomlkit.exceptions import TOMLKitError
 
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
-from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Result
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import (
@@ -32,10 +29,9 @@ from rgbmidic.settings import (
     read_section,
     read_toml,
 )
-from rgbmidic.view.address import KINDS, Mark, Steps
-from rgbmidic.view.canvas import Canvas, columns
+from rgbmidic.view.address import KINDS, Mark
 
-__all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "RegionDrawing", "arranged", "channel_section"]
+__all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "arranged", "channel_section"]
 __all__ += ["marks_of", "mask_images", "masks_of", "probe_section", "region_of", "rings", "scale_section"]
 
 _FILES = (
@@ -387,95 +383,3 @@ def _corners(name: str, marks: Sequence[Mark]) -> Ring:
         radius, angles = math.dist((x, y), on), np.arange(_ROUND) * 2 * np.pi / _ROUND
         places = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
     return [[round(float(x), 1), round(float(y), 1)] for x, y in places]
-
-
-_SOON = 60
-"""Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
-_COLOURS = list(OKABE_ITO.values())
-"""Of the masks; the first two are those of holes and outline."""
-
-
-class RegionDrawing:
-    """Marks of the region on a canvas, which can be undone, and the lines that they make.
-
-    Parameters
-    ----------
-    document
-        Document of the page.
-    canvas
-        Plot on which they are set and drawn.
-    marks
-        Marks at first.
-    changed
-        Called when they have changed.
-
-    Attributes
-    ----------
-    light
-        Name of the light of which masks are drawn from now on.
-    """
-
-    def __init__(
-        self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], changed: Callable[[], None]
-    ) -> None:
-        self._document, self._canvas, self._changed = document, canvas, changed
-        self.light = ""
-        self._steps, self._hole, self._coming = Steps(marks), 1, False
-        self._rings = ColumnDataSource(columns("xs ys colour"), name="rings")
-        canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
-        canvas.marks.on_change("data", lambda attr, old, new: self._marked())
-
-    @property
-    def marks(self) -> tuple[Mark, ...]:
-        """The marks."""
-        return self._steps.now
-
-    def go(self, *, back: bool) -> None:
-        """Return to the marks before the last step, or do it again."""
-        self._steps.go(back=back)
-        self.draw()
-
-    def clear(self) -> None:
-        """Remove all marks."""
-        self._keep(())
-
-    def next_hole(self) -> None:
-        """Let the marks of a hole or a mask that are set from now on belong to another one."""
-        numbers = [mark.kind.split(" ")[1] for mark in self.marks if mark.kind.startswith(("hole ", MASK))]
-        self._hole = max(map(int, numbers), default=0) + 1
-
-    def draw(self) -> None:
-        """Draw the marks and the lines."""
-        self._coming = False
-        self._canvas.place(self.marks)
-        outline, holes = rings(self.marks)
-        masks = [(ring, _COLOURS[(at + 2) % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
-        closed = [[*ring, *ring[:1]] for ring in (outline, *holes, *(ring for ring, _ in masks))]
-        self._rings.data = {
-            "xs": [[x for x, _ in ring] for ring in closed],
-            "ys": [[y for _, y in ring] for ring in closed],
-            "colour": ["#56b4e9", *["#e69f00"] * len(holes), *(colour for _, colour in masks)],
-        }
-        self._changed()
-
-    def _marked(self) -> None:
-        """Take the marks as they are on the plot; a new mark of a hole gets the number of its hole.
-
-        A polygon's number is that of the present hole; a round hole is complete with two marks.
-        """
-        before, now = self.marks, list[Mark]()
-        for mark in self._canvas.set:
-            kind, number = mark.kind, self._hole
-            if kind == "round hole":
-                number = 1 + sum(other.kind.startswith("round hole ") for other in now) // HOLES["round hole"]
-            kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
-            now.append(Mark(kind, mark.x, mark.y))
-        if tuple(self._canvas.set) != before:
-            new = next((mark.kind for mark in self._canvas.set if mark not in before), "")
-            self._keep(arranged(now, new))
-
-    def _keep(self, marks: tuple[Mark, ...]) -> None:
-        self._steps.keep(marks)
-        if not self._coming:
-            self._coming = True
-            self._document.add_timeout_callback(self.draw, _SOON)

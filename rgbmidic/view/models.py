@@ -161,8 +161,6 @@ class ResultControls(Controls):
         self.under = bk.Div(name="under", **wide)
         self.section = bk.RadioButtonGroup(labels=list(SECTIONS), active=0, name="section", **wide)
         self.mode = bk.RadioButtonGroup(labels=list(MODES), active=0, name="mode", **wide)
-        for group, says in ((self.over, "image"), (self.section, "controls shown"), (self.mode, "what a click sets")):
-            group.html_attributes = {"role": "group", "aria-label": says}
         self.curve = bk.Select(title="Curve", name="curve", **wide)
         labels = ("Lock the range", "Undo", "Redo", "Clear", "Save CSV", "Save PNG", "Write", "Take its probes")
         self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.take = (
@@ -175,6 +173,10 @@ class ResultControls(Controls):
         self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", **wide)
         self.what = bk.CheckboxButtonGroup(labels=list(WRITTEN), active=[0], name="what", **wide)
         self.told, self.written, self.scaled = (bk.Div(name=name, **wide) for name in ("told", "written", "scaled"))
+        groups: dict[Any, str] = {self.over: "image", self.section: "controls shown", self.mode: "what a click sets"}
+        groups |= {self.scale: "points of the scale", self.what: "sections that are written"}
+        for group, says in groups.items():
+            group.html_attributes = {"role": "group", "aria-label": says}
 
     @property
     def side(self) -> Any:

@@ -505,9 +505,10 @@ class ResultPage:
         if isinstance(event, PanStart):
             self.curves.grab(event.x)
         offset = self.curves.drag(event.x)
-        if offset is not None:
-            self.parts.drag.label = f"Offset {offset:.6g} s"
-        if offset is not None and isinstance(event, PanEnd):
+        if offset is None:
+            return
+        self.parts.drag.label = f"Offset {offset:.6g} s"
+        if isinstance(event, PanEnd):
             self.parts.of["clock"].value, self.parts.of["offset"].value = "offset", float(f"{offset:.9g}")
 
     def _write(self) -> None:

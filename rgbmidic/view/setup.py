@@ -29,7 +29,6 @@ from rgbmidic.view.draft import (
     OUTLINES,
     Confirmation,
     Draft,
-    RegionDrawing,
     marks_of,
     mask_images,
     masks_of,
@@ -38,7 +37,7 @@ from rgbmidic.view.draft import (
 from rgbmidic.view.fields import Background, every, guarded, warning
 from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, Overlay, paint, palette
-from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, pictures, side_by_side
+from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, pictures, side_by_side
 
 __all__ = ["SetupPage"]
 

@@ -6,6 +6,7 @@ import html
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,20 +15,25 @@ from typing import IO, Any, Self
 import bokeh.models as bk
 import numpy as np
 import numpy.typing as npt
+from bokeh.document import Document
 from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource
 
 from rgbmidic.errors import ResultError
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.inspection import Inspection, inspect_frame
 from rgbmidic.mesh import Region
+from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE
-from rgbmidic.view.draft import Draft
+from rgbmidic.view.address import Mark, Steps
+from rgbmidic.view.canvas import Canvas, columns
+from rgbmidic.view.draft import HOLES, MASK, Draft, arranged, masks_of, rings
 from rgbmidic.view.models import Controls
 from rgbmidic.view.picture import Picture, grey_picture, stretched
 
-__all__ = ["RAW", "DraftFrames", "Run", "SetupControls", "pictures", "side_by_side"]
+__all__ = ["RAW", "DraftFrames", "RegionDrawing", "Run", "SetupControls", "pictures", "side_by_side"]
 
 RAW = "raw frame"
 
@@ -118,6 +124,98 @@ def side_by_side(inspection: Inspection, named: dict[str, Picture], raw: Picture
     lights = len(inspection.images.names)
     pairs = [(RAW, raw), *((name.replace("reflection index", "index"), picture) for name, picture in named.items())]
     return [dict(row) for row in (pairs[: lights + 1], pairs[lights + 1 :]) if row]
+
+
+_SOON = 60
+"""Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
+_COLOURS = list(OKABE_ITO.values())
+"""Of the masks; the first two are those of holes and outline."""
+
+
+class RegionDrawing:
+    """Marks of the region on a canvas, which can be undone, and the lines that they make.
+
+    Parameters
+    ----------
+    document
+        Document of the page.
+    canvas
+        Plot on which they are set and drawn.
+    marks
+        Marks at first.
+    changed
+        Called when they have changed.
+
+    Attributes
+    ----------
+    light
+        Name of the light of which masks are drawn from now on.
+    """
+
+    def __init__(
+        self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], changed: Callable[[], None]
+    ) -> None:
+        self._document, self._canvas, self._changed = document, canvas, changed
+        self.light = ""
+        self._steps, self._hole, self._coming = Steps(marks), 1, False
+        self._rings = ColumnDataSource(columns("xs ys colour"), name="rings")
+        canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
+        canvas.marks.on_change("data", lambda attr, old, new: self._marked())
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The marks."""
+        return self._steps.now
+
+    def go(self, *, back: bool) -> None:
+        """Return to the marks before the last step, or do it again."""
+        self._steps.go(back=back)
+        self.draw()
+
+    def clear(self) -> None:
+        """Remove all marks."""
+        self._keep(())
+
+    def next_hole(self) -> None:
+        """Let the marks of a hole or a mask that are set from now on belong to another one."""
+        numbers = [mark.kind.split(" ")[1] for mark in self.marks if mark.kind.startswith(("hole ", MASK))]
+        self._hole = max(map(int, numbers), default=0) + 1
+
+    def draw(self) -> None:
+        """Draw the marks and the lines."""
+        self._coming = False
+        self._canvas.place(self.marks)
+        outline, holes = rings(self.marks)
+        masks = [(ring, _COLOURS[(at + 2) % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
+        closed = [[*ring, *ring[:1]] for ring in (outline, *holes, *(ring for ring, _ in masks))]
+        self._rings.data = {
+            "xs": [[x for x, _ in ring] for ring in closed],
+            "ys": [[y for _, y in ring] for ring in closed],
+            "colour": ["#56b4e9", *["#e69f00"] * len(holes), *(colour for _, colour in masks)],
+        }
+        self._changed()
+
+    def _marked(self) -> None:
+        """Take the marks as they are on the plot; a new mark of a hole gets the number of its hole.
+
+        A polygon's number is that of the present hole; a round hole is complete with two marks.
+        """
+        before, now = self.marks, list[Mark]()
+        for mark in self._canvas.set:
+            kind, number = mark.kind, self._hole
+            if kind == "round hole":
+                number = 1 + sum(other.kind.startswith("round hole ") for other in now) // HOLES["round hole"]
+            kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
+            now.append(Mark(kind, mark.x, mark.y))
+        if tuple(self._canvas.set) != before:
+            new = next((mark.kind for mark in self._canvas.set if mark not in before), "")
+            self._keep(arranged(now, new))
+
+    def _keep(self, marks: tuple[Mark, ...]) -> None:
+        self._steps.keep(marks)
+        if not self._coming:
+            self._coming = True
+            self._document.add_timeout_callback(self.draw, _SOON)
 
 
 class SetupControls(Controls):

@@ -141,7 +141,7 @@ def test_no_control_is_cut_off(driver, address, size, theme):
     more = "range=hand&low=-1&high=1&second=uncertainty&frame=3&clock=correlation"
     page = Page(driver, f"{address}?theme={theme}&{more}")
     page.until("model('low').visible && model('plot_2') !== null")
-    for name in ("step", "over", "section"):
+    for name in ("step", "over", "section", "scale", "what"):
         assert page.run(f"Bokeh.index.get_one(model('{name}')).el.getAttribute('aria-label')")
     assert driver.execute_script("return [innerWidth, innerHeight]") == list(size)
     for section in range(7):
