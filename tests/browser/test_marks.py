@@ -248,12 +248,8 @@ def test_masks_are_painted_undone_and_written_as_images_that_are_replaced_when_c
         np.testing.assert_array_equal(masks, [np.ones(shape), whole.without([ring]).mask])
         assert 600 < (masks[1] == 0).sum() < 900
         before = cv2.imread(str(weights.images[1]))
-        page.do("model('mode').active = 0")
         page.pointer(("press", *placed[2]), ("move", 50, 70), ("release", 50, 80))
-        page.pointer(("click", 5, 5))
-        page.do("model('hole').active = 2")
-        page.pointer(("press", *placed[2]), ("move", 50, 70), ("release", 50, 80))
-        page.until("model('marks').data.y.some((y) => Math.abs(y - 80) < 2)")
+        page.until("Array.from(model('rings').data.ys[1]).some((y) => Math.abs(y - 80) < 2)")
         driver.execute_script(*click("Write TEST.toml"))
         page.until("model('message').text.includes('press again to replace')")
         np.testing.assert_array_equal(cv2.imread(str(weights.images[1])), before)
