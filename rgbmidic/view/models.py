@@ -134,9 +134,9 @@ CONTROLS: tuple[tuple[str, str, type[bk.Widget], str, dict[str, Any]], ...] = (
     ("align_to", "Channels", bk.Select, "alike to", {}),
     ("force", "Channels", bk.Select, "Force", {}),
     ("area", "Channels", bk.NumericInput, "Section, mm²", {**_NUMBER, "low": 0}),
-    ("distance", "File", bk.NumericInput, "Distance, mm", {**_NUMBER, "low": 0}),
+    ("distance", "File", bk.NumericInput, "Length, mm", {**_NUMBER, "low": 0}),
     ("distance_std", "File", bk.NumericInput, "± mm", {**_NUMBER, "low": 0}),
-    ("camera", "File", bk.TextInput, "or camera file", {}),
+    ("camera", "File", bk.TextInput, "or camera", {}),
 )
 """Every control that sets an entry of the view: entry, section, kind, text and options."""
 
@@ -195,9 +195,9 @@ class ResultControls(Controls):
         pairs = row(align, align_to, **flat), row(force, area, **flat)
         clocks = row(beside, clock, **flat), trigger, pairs[0], offset, self.drag
         parts["Channels"] = [file, *clocks, pairs[1], self.told]
-        distance = row(*parts["File"][:2], **flat)
+        known = row(*parts["File"], **flat)
         writes = self.file, self.what, row(self.write, self.take, **flat), self.written
-        parts["File"] = [self.scale, distance, self.of["camera"], self.scaled, *writes]
+        parts["File"] = [self.scale, known, self.scaled, *writes]
         shown = [column(*parts[name], visible=not place, **flat) for place, name in enumerate(SECTIONS)]
         self.section.js_on_change("active", script("turnTo", group=self.section, sections=shown))
         return column(self.description, self.section, *shown, self.theme, **flat)
