@@ -33,11 +33,11 @@ from scipy.ndimage import map_coordinates
 
 from rgbmidic._kernels.threads import threads
 from rgbmidic.fields import at_pixels
+from rgbmidic.illumination.crosstalk import align, unmix
 from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.registration import Registration
 from rgbmidic.illumination.separation import DEMOSAICERS, separate
-from rgbmidic.illumination.unmixing import align, unmix
 from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import correlate

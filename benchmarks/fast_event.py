@@ -40,7 +40,7 @@ from rgbmidic.frames import Mosaic, Window, cfa_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.separation import Separation, correlated, reference_images
+from rgbmidic.pipeline.source import Separation, correlated, reference_images
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE, IlluminationSettings, SolverSettings
 from rgbmidic.typing import FloatArray, FloatImage

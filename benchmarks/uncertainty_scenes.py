@@ -18,10 +18,10 @@ import numpy as np
 from demosaicing import TILT, painted
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.illumination.crosstalk import unmix
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
-from rgbmidic.illumination.unmixing import unmix
 from rgbmidic.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
 from rgbmidic.scene.camera import PIXEL
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage

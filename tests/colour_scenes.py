@@ -5,10 +5,9 @@ from naive_demosaic import colour_by_colour
 from scipy.ndimage import gaussian_filter
 
 from rgbmidic.frames.data import cfa_channels
-from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.separation import DEMOSAICERS, separate
-from rgbmidic.illumination.unmixing import unmix
 
 A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 CROSSTALK = Crosstalk(matrix=A, lights=("red", "green", "blue"))

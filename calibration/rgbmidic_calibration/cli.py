@@ -234,7 +234,7 @@ def check(
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import named_patterns
-    from rgbmidic_calibration.verdict import check_calibration, read_limits
+    from rgbmidic_calibration.verify import check_calibration, read_limits
 
     limits, calibration = read_limits(limit or ()), Calibration.read(file)
     found = captures(calibration=calibration, together=named_patterns(together or (), "--together"))

@@ -21,7 +21,7 @@ from rgbmidic_calibration.design import Design
 from rgbmidic_calibration.jobs import CameraEstimate
 from rgbmidic_calibration.noise import NoiseEstimate
 from rgbmidic_calibration.registration import RegistrationEstimate
-from rgbmidic_calibration.verdict import Verdict
+from rgbmidic_calibration.verify import Verdict
 
 __all__ = ["calibration", "camera", "crosstalk", "designs", "draw_camera", "merged", "noise", "registration", "verdict"]
 

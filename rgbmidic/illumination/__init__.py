@@ -7,10 +7,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rgbmidic.illumination.crosstalk import unmix
     from rgbmidic.illumination.images import REFLECTING, IlluminationImages
     from rgbmidic.illumination.linear import linearise
     from rgbmidic.illumination.separation import demosaic, separate
-    from rgbmidic.illumination.unmixing import unmix
 
 __all__ = ["REFLECTING", "IlluminationImages", "demosaic", "linearise", "separate", "unmix"]
 

@@ -43,10 +43,9 @@ from rgbmidic.illumination.colour_factors import (
     scaled,
     widened,
 )
-from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.crosstalk import Crosstalk, needed
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmixing import needed
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = [
@@ -302,7 +301,7 @@ class ReflectionAwareDemosaicer:
             The linearised frame.
         mixing : (n, 3), or None
             Mixtures of the channels to give instead of them; not valid where a channel that matters in one
-            (`rgbmidic.illumination.unmixing.needed`) is not.
+            (`rgbmidic.illumination.crosstalk.needed`) is not.
 
         Returns
         -------

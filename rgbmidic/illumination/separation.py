@@ -10,7 +10,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.crosstalk import Crosstalk, align, unmix
 from rgbmidic.illumination.demosaicing import (
     SMALLEST_FRAME,
     Demosaicer,
@@ -22,7 +22,6 @@ from rgbmidic.illumination.demosaicing import (
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmixing import align, unmix
 from rgbmidic.typing import FloatArray
 
 __all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "demosaic", "reconstructed_lights", "separate"]

@@ -25,7 +25,7 @@ from rgbmidic.fields import CameraCalibration, at_nodes, field_rms
 from rgbmidic.fields.plane import undistorted
 from rgbmidic.frames import open_series
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.unmixing import align
+from rgbmidic.illumination.crosstalk import align
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, correlate, measure
 from rgbmidic.results import Result

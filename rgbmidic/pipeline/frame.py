@@ -1,7 +1,7 @@
 """One frame of a test to one record, whatever the frame is like.
 
 read -> one image per light -> weights -> images of the solve -> displacement and its uncertainty -> gaps filled ->
-brightness of the lights -> record.
+brightness of the lights -> record. `correlate` is the same for one pair of states, arrays in and out.
 """
 
 from __future__ import annotations
@@ -10,27 +10,42 @@ import ctypes
 import logging
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation import Deformed, Solution, Start, Status, fill
+from rgbmidic._kernels.threads import aside
+from rgbmidic.correlation import Deformed, PrecisionMethod, Reference, Solution, Start, Status, fill, solve, track
+from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import brightness_change
-from rgbmidic.errors import FrameError, RgbmidicError
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.images import normalise as divide_by_local_mean
+from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import Plan, exposure_fault, too_small
-from rgbmidic.pipeline.separation import RawState, correlated
+from rgbmidic.pipeline.source import RawState, correlated
 from rgbmidic.results import FrameRecord
+from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
-from rgbmidic.weights import precision_method
+from rgbmidic.weights import Statistics, as_weights, precision_method
 
-__all__ = ["failed_frame", "measure_frame", "next_reference", "read_state", "solve_frame"]
+__all__ = [
+    "as_weights",
+    "correlate",
+    "failed_frame",
+    "initial_displacement",
+    "measure_frame",
+    "next_reference",
+    "read_state",
+    "solve_frame",
+    "solver_settings",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -252,3 +267,121 @@ def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> No
 
 def _in_bytes(shares: FloatImage) -> npt.NDArray[np.uint8]:
     return np.round(shares * 255).astype(np.uint8)
+
+
+def correlate(
+    reference: npt.ArrayLike,
+    deformed: npt.ArrayLike,
+    *,
+    region: Sequence[float] | Region | None = None,
+    element_size: float = ELEMENT_SIZE,
+    cracks: Sequence[npt.ArrayLike] = (),
+    weights: npt.ArrayLike | None = None,
+    initial: npt.ArrayLike | None = None,
+    deformed_weights: npt.ArrayLike | None = None,
+    normalise: float | None = None,
+    statistics: bool | PrecisionMethod = True,
+    **options: Any,
+) -> Solution:
+    """Measure the displacement between two states seen under k lights (k = 1: plain DIC).
+
+    Parameters
+    ----------
+    reference, deformed : array_like, shape (H, W) or (k, H, W)
+        Grey levels; NaN marks an invalid pixel.
+    region
+        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None takes the whole image.
+    element_size
+        Side of the triangles in px.
+    cracks
+        Paths, each of corners (x, y) in px, along which the mesh is split, see `Tri3Mesh.from_region`.
+    weights : array_like, shape (H, W) or (k, H, W), optional
+        Weight of each light at each pixel of the reference, finite and not negative; 0 excludes.
+    initial : array_like, shape (2,) or (N, 2), optional
+        Initial guess of the displacement (u, v) in px; None searches for it.
+    deformed_weights
+        Like `weights`, on the deformed images.
+    normalise
+        Standard deviation in px of the local mean by which every image is divided first; None leaves grey levels.
+    statistics
+        Weight the lights by what the residual around each pixel shows (`rgbmidic.weights.Statistics`), by a method of
+        one's own, or, if False, by `weights` alone.
+    **options
+        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, fill,
+        tolerance, max_iterations.
+
+    Returns
+    -------
+    Solution
+        With `nodes` (N, 2), `elements` (E, 3), `displacement` (N, 2) in px, `displacement_std` (N, 2) in px,
+        `status`, and more.
+
+    Raises
+    ------
+    InputError
+        Images of different shapes, a weight or initial guess that does not fit, an unknown setting.
+    RegionError
+        The region is empty, too small or outside the image.
+    """
+    f, g = as_light_stack(reference, "reference"), as_light_stack(deformed, "deformed")
+    if f.shape != g.shape:
+        raise InputError(f"reference and deformed images must have one shape; given are {f.shape} and {g.shape}")
+    height, width = f.shape[1:]
+    if not isinstance(region, Region):
+        region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
+    mesh = Tri3Mesh.from_region(region, element_size, cracks)
+    solver = solver_settings(options)
+    if normalise is not None:
+        f, g = (divide_by_local_mean(stack, normalise, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
+    given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
+    second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
+    first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)
+    method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
+    start = initial_displacement(initial, len(mesh.nodes))
+    if start is None:
+        solution = track(first, second.result(), Start(displacement=None), solver, method)
+    else:
+        solution = solve(first, second.result(), start, solver, method)
+    return fill(mesh, solution, solver.fill) if solver.fill else solution
+
+
+def solver_settings(options: dict[str, Any]) -> SolverSettings:
+    """The settings of the solve that options of a function state.
+
+    Raises
+    ------
+    InputError
+        An option is unknown or out of range.
+    """
+    try:
+        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
+        return SolverSettings(**options)
+    except ConfigurationError as error:
+        raise InputError(str(error)) from None
+
+
+def initial_displacement(initial: npt.ArrayLike | None, nodes: int) -> FloatArray | None:
+    """Return an initial guess as an array, or None where none is given.
+
+    Parameters
+    ----------
+    initial : array_like, shape (2,) or (N, 2), optional
+        Displacement (u, v) in px.
+    nodes
+        Number N of nodes of the mesh.
+
+    Returns
+    -------
+    ndarray, shape (N, 2), or None
+
+    Raises
+    ------
+    InputError
+        Not (2,) or (N, 2), or not finite.
+    """
+    if initial is None:
+        return None
+    values = np.asarray(initial, dtype=np.float64)
+    if values.shape not in ((2,), (nodes, 2)) or not np.isfinite(values).all():
+        raise InputError(f"initial must be finite with shape (2,) or ({nodes}, 2); given is shape {values.shape}")
+    return np.broadcast_to(values, (nodes, 2)).copy()

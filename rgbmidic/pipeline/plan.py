@@ -31,20 +31,21 @@ from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.mesh.files import on_image
-from rgbmidic.pipeline.pair import as_weights
-from rgbmidic.pipeline.separation import (
+from rgbmidic.pipeline.source import (
+    FrameSequence,
     LightSeparation,
     RawState,
     Separation,
+    Series,
     WindowedSeparation,
     correlated,
     light_images,
+    open_sequence,
     reference_images,
 )
-from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
 from rgbmidic.settings import RegionSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-from rgbmidic.weights import LightWeights, prepare_weights
+from rgbmidic.weights import LightWeights, as_weights, prepare_weights
 
 __all__ = [
     "HARDLY_ENOUGH",

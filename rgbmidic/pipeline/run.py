@@ -25,12 +25,10 @@ from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame
-from rgbmidic.pipeline.pair import solver_settings
+from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame, solver_settings
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank_of
-from rgbmidic.pipeline.separation import LightSeparation
-from rgbmidic.pipeline.source import FrameSequence, describe
+from rgbmidic.pipeline.source import FrameSequence, LightSeparation, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance

@@ -33,8 +33,8 @@ from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.equations import SEEN
 from rgbmidic.correlation.nodes import LOST
 from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset, mass_matrix
+from rgbmidic.illumination.crosstalk import NEGLIGIBLE
 from rgbmidic.illumination.linear import QUANTISATION
-from rgbmidic.illumination.unmixing import NEGLIGIBLE
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.scene.camera import Floating
 from rgbmidic.scene.scene import Scene

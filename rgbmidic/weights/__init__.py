@@ -1,7 +1,13 @@
 """How much each light counts at each pixel."""
 
-from rgbmidic.weights.light_weights import LightWeights, MaskWeights, precision_method, prepare_weights
-from rgbmidic.weights.statistics import Statistics
+from rgbmidic.weights.light_weights import (
+    LightWeights,
+    MaskWeights,
+    Statistics,
+    as_weights,
+    precision_method,
+    prepare_weights,
+)
 from rgbmidic.weights.threshold import (
     DisturbedZone,
     SetUpThreshold,
@@ -17,6 +23,7 @@ __all__ = [
     "MaskWeights",
     "SetUpThreshold",
     "Statistics",
+    "as_weights",
     "blurred",
     "disturbed_zone",
     "precision_method",

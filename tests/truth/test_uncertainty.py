@@ -14,10 +14,10 @@ from textures import Affine, Texture
 from rgbmidic import correlate
 from rgbmidic.correlation import NodeStatus, Solution, fill
 from rgbmidic.fields import at_nodes, field_rms
+from rgbmidic.illumination.crosstalk import unmix
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import linearise
 from rgbmidic.illumination.separation import separate
-from rgbmidic.illumination.unmixing import unmix
 from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.weights.threshold import threshold_weights

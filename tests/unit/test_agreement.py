@@ -172,6 +172,11 @@ def _two_scales(folder: Path, out: Path) -> tuple[list[str], Sequence[str]]:
     return _changed(_colour(folder), scale, out), [r"scale\.camera", r"scale\.mm_per_pixel"]
 
 
+def _two_meshes(folder: Path, out: Path) -> tuple[list[str], Sequence[str]]:
+    mesh = '[mesh]\nfile = "specimen.inp"\npoints = [[0, 0, 10, 10], [9, 0, 90, 10]]\nelement_size = 20\n'
+    return _changed(_colour(folder), mesh, out), [r"mesh\.file", r"mesh\.element_size"]
+
+
 def _another_test_than_the_result(folder: Path, out: Path) -> tuple[list[str], Sequence[str]]:
     test = _colour(folder)
     arguments = _changed(test, "", out)
@@ -196,6 +201,7 @@ CASES: Mapping[tuple[str, str, str], Case] = {
     ("size of the scene", "the file", "SCENE.toml"): _scene_of_another_size,
     ("size of lens and plane", "the file", "`scale.camera`"): _camera_of_another_size,
     ("scale", "`scale.mm_per_pixel`", "`scale.camera`"): _two_scales,
+    ("the mesh", "`mesh.file`", "`mesh.element_size`"): _two_meshes,
     ("the test", "the result", "`run --resume`"): _another_test_than_the_result,
 }
 
@@ -203,7 +209,7 @@ CASES: Mapping[tuple[str, str, str], Case] = {
 def test_every_pair_of_the_table_is_walked_through() -> None:
     pairs = {(row, *pair) for row, sayers in ROWS.items() for pair in combinations(sayers, 2)}
     assert pairs == set(CASES)
-    assert len(ROWS) == 13
+    assert len(ROWS) == 15
 
 
 @pytest.mark.parametrize("pair", CASES, ids=lambda pair: "-".join(pair).replace("`", ""))

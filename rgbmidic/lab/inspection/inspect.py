@@ -13,13 +13,13 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.crosstalk import align, unmix
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME, ReflectionAwareDemosaicer
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.illumination.unmixing import align, unmix
 from rgbmidic.lab.inspection.prediction import CONTRAST_WIDTH, LocalContrast, Prediction, SeparationErrors, predict
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture, surroundings

@@ -14,8 +14,7 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.registration import Registration, frame_geometry
 from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.ratio import block_means
-from rgbmidic_calibration.verdict import read_limits
-from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, registration_left
+from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, read_limits, registration_left
 
 MATRIX = MATRICES[1.5]
 LIGHTS = ("red", "green", "blue")

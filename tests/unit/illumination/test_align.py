@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.crosstalk import align
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.registration import Registration
-from rgbmidic.illumination.unmixing import align
 
 SHAPE = (120, 140)
 LIMIT = 2e-3  # of the contrast; cubic splines on waves of 16 px or longer

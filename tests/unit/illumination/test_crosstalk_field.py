@@ -8,9 +8,8 @@ from naive_calibration import unmix_field as naive_unmix_field
 
 from rgbmidic._kernels.lights import unmix as unmix_kernel
 from rgbmidic.errors import CalibrationError, InputError
-from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
+from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products, unmix
 from rgbmidic.illumination.linear import LinearChannels
-from rgbmidic.illumination.unmixing import unmix
 
 LIGHTS = ("red", "green", "blue")
 MATRIX = np.array([[1, 0.2, 0.05], [0.15, 1, 0.3], [0.02, 0.25, 1]])

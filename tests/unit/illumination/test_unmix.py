@@ -9,9 +9,9 @@ from rgbmidic import illumination
 from rgbmidic.errors import InputError
 from rgbmidic.frames import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.crosstalk import NEGLIGIBLE, unmix
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.separation import DEMOSAICERS, separate
-from rgbmidic.illumination.unmixing import NEGLIGIBLE, unmix
 
 A = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
 LIGHTS = ("red", "green", "blue")

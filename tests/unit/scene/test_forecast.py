@@ -15,9 +15,9 @@ from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.errors import InputError
 from rgbmidic.fields import at_nodes
+from rgbmidic.illumination.crosstalk import unmix
 from rgbmidic.illumination.linear import LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
-from rgbmidic.illumination.unmixing import unmix
 from rgbmidic.lab.virtual import Scene, State, record, render, strained_plate, truth, turned
 from rgbmidic.lab.virtual.rendering import paint, plate_scene, sphere_scene
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh

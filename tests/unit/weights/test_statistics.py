@@ -9,7 +9,7 @@ from rgbmidic.correlation import Precision
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh import Region
 from rgbmidic.weights import MaskWeights, Statistics
-from rgbmidic.weights.statistics import _OWN, _best_fractions
+from rgbmidic.weights.light_weights import _OWN, _best_fractions
 
 SIDE = 160
 REGION = (15, 15, SIDE - 16, SIDE - 16)
