@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record, smooth_record
 
+from rgbmidic import CameraCalibration
 from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import FrameRecord, Maps, MapValues, Result, ResultStore
@@ -552,6 +553,23 @@ def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
     assert summary.endswith("… more")
     assert summary.rpartition("<b")[2].count("this and that") < 5
     assert rest.count("this and that") > 15
+
+
+def test_a_camera_s_plane_is_that_of_the_page_and_a_wrong_file_changes_nothing(tmp_path):
+    made = make_result(tmp_path / "result", record=smooth_record)
+    CameraCalibration(shape=(80, 120), homography=np.diag([0.5, 0.5, 1])).write(tmp_path / "camera.json")
+    page = ResultPage(Document(), made, ViewState(frame=1), Progress(2))
+    page.show()
+    before = page.values.values
+    page.parts.of["camera"].value = "camera.json"
+    assert page.canvas.plot.title.text == "u (mm)"
+    assert ("u", "u (mm)") in [tuple(pair) for group in page.parts.of["field"].options.values() for pair in group]
+    np.testing.assert_allclose(page.values.values, 0.5 * before, atol=1e-9)
+    page.parts.of["camera"].value = "none.json"
+    assert "none.json" in page.parts.scaled.text
+    assert page.canvas.plot.title.text == "u (mm)"
+    page.parts.of["camera"].value = ""
+    assert page.canvas.plot.title.text == "u (px)"
 
 
 def test_a_page_whose_browser_has_gone_is_not_watched():
