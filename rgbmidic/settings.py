@@ -25,6 +25,7 @@ __all__ = [
     "BAYER_PATTERNS",
     "ELEMENT_SIZE",
     "LENGTH_UNITS",
+    "PROBE_NAME",
     "WIDER_AT_CRACKS",
     "ChannelSettings",
     "FrameKind",
@@ -379,6 +380,10 @@ _Place3 = tuple[tuple[float, float, float], ...]
 _Place4 = tuple[tuple[float, float, float, float], ...]
 
 
+PROBE_NAME = re.compile(r"[^\W_](?:[^\W_]|[ .-]){0,59}")
+"""Name of a probe: without ``_``, which parts it from that of the quantity in a column, nor what parts an address."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeSettings(_Checked):
     """Probes that `rgbmidic history` evaluates on a result (``[probes]``); the measurement does not depend on them.
@@ -416,6 +421,8 @@ class ProbeSettings(_Checked):
     rigid_motion
         ``"tell"``: shift and rotation of the measured field as a whole are reported beside the probes; ``"remove"``:
         they are also subtracted from the displacements.
+    names
+        Pairs of a probe, kind and number, such as ``"gauge_1"``, and the name that it has in tables and curves.
     """
 
     section = "probes"
@@ -437,6 +444,7 @@ class ProbeSettings(_Checked):
     measure: Literal["green-lagrange", "hencky", "biot", "engineering"] = "green-lagrange"
     window: int = bounded(0, at_least=0)
     rigid_motion: Literal["none", "tell", "remove"] = "none"
+    names: tuple[tuple[str, str], ...] = ()
 
     def _check(self) -> None:
         _require(
@@ -457,6 +465,21 @@ class ProbeSettings(_Checked):
             f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}',
         )
         _require(self.terms != 1, "probes.terms must be 0 (chosen by a test) or at least 2, not 1")
+        check_names((probe for probe, _ in self.names), self.numbered, "probe", "probes.names")
+        given = [name for _, name in self.names]
+        for name in given:
+            _require(
+                PROBE_NAME.fullmatch(name) and given.count(name) == 1,
+                'probes.names must be different, of letters, digits, spaces, "." and "-" (60 at most), not "'
+                + name
+                + '"',
+            )
+
+    @property
+    def numbered(self) -> list[str]:
+        """Kind and number of every probe, such as ``"straight_gauge_1"``."""
+        kinds = [kind for kind, _ in self.places]
+        return [f"{kind}_{kinds[: at + 1].count(kind)}" for at, kind in enumerate(kinds)]
 
     @property
     def places(self) -> list[tuple[str, tuple[float, ...]]]:
@@ -464,7 +487,7 @@ class ProbeSettings(_Checked):
         return [
             (entry.name[:-1], place)
             for entry in fields(self)
-            if isinstance(getattr(self, entry.name), tuple)
+            if isinstance(getattr(self, entry.name), tuple) and entry.name != "names"
             for place in getattr(self, entry.name)
         ]
 

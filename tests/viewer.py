@@ -123,22 +123,22 @@ class Page:
             time.sleep(0.03)
         raise AssertionError(f"never: {script}; the page says: {self.run('document.body.innerText')}")
 
-    def place(self, x: float, y: float) -> tuple[int, int]:
-        """Where a point of the image is in the browser's window."""
+    def place(self, x: float, y: float, plot: str = "plot") -> tuple[int, int]:
+        """Where a point of the image, or of another plot, is in the browser's window."""
         script = f"""(() => {{
-            const view = Bokeh.index.get_one(model("plot")), box = view.el.getBoundingClientRect();
+            const view = Bokeh.index.get_one(model("{plot}")), box = view.el.getBoundingClientRect();
             return [box.x + view.frame.x_scale.compute({x}), box.y + view.frame.y_scale.compute({y})];
         }})()"""
         left, top = self.run(script)
         return round(left), round(top)
 
-    def pointer(self, *steps: tuple[str, float, float]) -> None:
-        """``("move" | "click" | "press" | "release", x, y)`` at points of the image."""
+    def pointer(self, *steps: tuple[str, float, float], plot: str = "plot") -> None:
+        """``("move" | "click" | "press" | "release", x, y)`` at points of the image, or of another plot."""
         from selenium.webdriver.common.action_chains import ActionBuilder
 
         actions = ActionBuilder(self.driver, duration=50)
         for what, x, y in steps:
-            actions.pointer_action.move_to_location(*self.place(x, y))
+            actions.pointer_action.move_to_location(*self.place(x, y, plot))
             if what == "click":
                 actions.pointer_action.pause(_TWO_CLICKS)
                 actions.pointer_action.click()

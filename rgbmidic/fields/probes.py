@@ -261,7 +261,7 @@ def make_probe(
     settings: ProbeSettings | None = None,
     rectified: Rectification | None = None,
 ) -> Probe:
-    """Make a probe, named by its kind and number.
+    """Make a probe, named by its kind and number, or as the settings do.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ def make_probe(
     place
         The numbers of `PROBES`, px of the image.
     settings
-        Strain measure of a strain gauge; material and fit of a crack's tip. None: the defaults.
+        Strain measure of a strain gauge; material and fit of a crack's tip; names. None: the defaults.
     rectified
         Change from px of the image, and the scale, which a crack's tip needs; None: places are in px of the mesh.
 
@@ -284,7 +284,7 @@ def make_probe(
         The place is outside the region, or no place for it.
     """
     (points, lengths, make), settings = PROBES[kind], settings or ProbeSettings()
-    name = f"{kind}_{number}"
+    name = dict(settings.names).get(f"{kind}_{number}", f"{kind}_{number}")
     if len(place) != 2 * points + lengths:
         raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(place)}")
     more: dict[str, Any] = {"measure": settings.measure} if kind == "strain_gauge" else {}

@@ -34,13 +34,21 @@ from rgbmidic.fields import (
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.maps import MapField, Maps
-from rgbmidic.results.physical import Channels, exposure, frame_times, rectification_of, reference_frames, shared_part
+from rgbmidic.results.physical import (
+    Channels,
+    exposure,
+    frame_times,
+    rectification_of,
+    reference_frames,
+    shared_part,
+    units_of,
+)
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
 __all__ = ["Histories", "HistoryColumn", "Profile", "Wave", "history_csv", "history_rows"]
-__all__ += ["read_histories", "read_profile", "write_histories", "write_profile"]
+__all__ += ["frames_alone", "read_histories", "read_profile", "with_channels", "write_histories", "write_profile"]
 
 
 _BLURRED = 1.0
@@ -71,6 +79,8 @@ class Histories:
         Of lengths and time.
     remarks
         What a reader should know, a line each.
+    channels
+        Recorded beside the test, by the clock of the frames; None: there are none.
     """
 
     frames: npt.NDArray[np.int64]
@@ -81,6 +91,7 @@ class Histories:
     stress_strain: tuple[str, str] | None
     units: Units
     remarks: tuple[str, ...]
+    channels: Channels | None = None
 
     def __getitem__(self, name: str) -> HistoryColumn:
         """Return the quantity of a name, or of a column name with unit."""
@@ -206,20 +217,31 @@ def read_histories(
         for history in read
         for quantity in _in_units(history, units, clock, probes.window, shared_part(result), references)
     ]
-    beside, stress, clocks = _beside(channels or ChannelSettings(), times, quantities)
-    strain = next((each.name for each in quantities if each.name.endswith(("_strain", "_e1"))), None)
-    return Histories(
+    read_off = Histories(
         frames=there,
         numbers=result.number[there],
         status=result.status[there],
         times=times,
-        quantities=(*quantities, *beside, *stress),
-        stress_strain=(strain, stress[0].name) if stress and strain else None,
+        quantities=tuple(quantities),
+        stress_strain=None,
         units=units,
-        remarks=(
-            *_remarks(rectified, speed, exposure(result), there, by_probe, beside),
-            *clocks,
-        ),
+        remarks=(*_remarks(rectified, speed, exposure(result), there, by_probe),),
+    )
+    return with_channels(read_off, channels or ChannelSettings())
+
+
+def frames_alone(result: Result) -> Histories:
+    """Return histories of no probe: the measured frames and their times, for channels."""
+    there, times = np.flatnonzero(result.finished), frame_times(result)
+    return Histories(
+        frames=there,
+        numbers=result.number[there],
+        status=result.status[there],
+        times=None if times is None else times[there],
+        quantities=(),
+        stress_strain=None,
+        units=units_of(result),
+        remarks=(),
     )
 
 
@@ -286,12 +308,24 @@ def _in_units(
                 yield entry(title, units.per_time(unit, power), values, std)
 
 
-def _beside(
-    stated: ChannelSettings, times: FloatArray | None, histories: list[HistoryColumn]
-) -> tuple[list[HistoryColumn], list[HistoryColumn], list[str]]:
-    """Return the channels at the times of the frames, the stress where a cross-section is known, and remarks."""
+def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
+    """Add channels at the times of the frames to what probes measure, and the stress where a cross-section is known.
+
+    Parameters
+    ----------
+    histories
+        Of probes, or of none: its frames count.
+    stated
+        File, clock, and what a stress needs.
+
+    Raises
+    ------
+    InputError
+        As `read_histories`, for the channels.
+    """
     if stated.file is None:
-        return [], [], []
+        return histories
+    times = histories.times
     if times is None:
         raise InputError(
             f"the channels {stated.file} cannot be brought to the frames, whose times are not known: state "
@@ -300,10 +334,10 @@ def _beside(
     channels, remarks = Channels.read(stated.file, stated.offset, stated.trigger), []
     if stated.align is not None:
         name, wanted = stated.align
-        column = next((one for one in histories if wanted in (one.name, one.column)), None)
+        column = next((one for one in histories.quantities if wanted in (one.name, one.column)), None)
         if column is None:
-            known = ", ".join(one.name for one in histories)
-            raise InputError(f'channels.align names the history "{wanted}", which is not one of {known}')
+            known = ", ".join(one.name for one in histories.quantities)
+            raise InputError(f'channels.align names the history "{wanted}", which is not one of {known or "none"}')
         channels, std, coefficient = channels.aligned(name, times, column.values)
         remarks.append(
             f"the times of the channels were shifted by {channels.offset:.6g} s ({std:.2g} s standard uncertainty), "
@@ -315,11 +349,22 @@ def _beside(
         )
     read = channels.at(times)
     beside = [HistoryColumn(name=name, unit="", values=values, std=None) for name, values in read.items()]
-    if stated.area is None:
-        return beside, [], remarks
-    name, newtons = channels.force(stated.force)
-    stress = HistoryColumn(name="stress", unit="MPa", values=read[name] * newtons / stated.area, std=None)
-    return beside, [stress], remarks
+    for name, values in read.items():
+        if missing := int(np.isnan(values).sum()):
+            remarks.append(f"the channel {name} has no value in {missing} of {len(histories.frames)} frames")
+    pair = None
+    if stated.area is not None:
+        name, newtons = channels.force(stated.force)
+        beside.append(HistoryColumn(name="stress", unit="MPa", values=read[name] * newtons / stated.area, std=None))
+        strain = next((one.name for one in histories.quantities if one.name.endswith(("_strain", "_e1"))), None)
+        pair = (strain, "stress") if strain else None
+    return replace(
+        histories,
+        quantities=(*histories.quantities, *beside),
+        stress_strain=pair,
+        remarks=(*histories.remarks, *remarks),
+        channels=channels,
+    )
 
 
 def _remarks(
@@ -328,7 +373,6 @@ def _remarks(
     exposed: float | None,
     frames: npt.NDArray[np.int64],
     read: Mapping[str, list[History]],
-    beside: list[HistoryColumn],
 ) -> Iterator[str]:
     camera, units = rectified.camera, rectified.units
     if camera is not None:
@@ -350,9 +394,6 @@ def _remarks(
     for name, part in read.items():
         if missing := int(np.isnan(part[0].values).sum()):
             yield f"{name} is not measured in {missing} of {len(frames)} frames"
-    for channel in beside:
-        if missing := int(np.isnan(channel.values).sum()):
-            yield f"the channel {channel.name} has no value in {missing} of {len(frames)} frames"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

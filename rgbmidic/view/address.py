@@ -6,19 +6,31 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlencode
 
-from rgbmidic.fields import MEASURES
+from rgbmidic.fields import MEASURES, Units
+from rgbmidic.settings import PROBE_NAME, ChannelSettings, ScaleSettings
 
-__all__ = ["BESIDE", "KINDS", "OVER", "PALETTES", "UNCERTAINTY", "Mark", "ViewState", "probe_marks", "probe_place"]
+__all__ = ["BESIDE", "CLOCKS", "KINDS", "MARKS", "OVER", "PALETTES", "SCALE", "UNCERTAINTY", "Mark", "Steps"]
+__all__ += ["ViewState", "probe_marks", "probe_place"]
 
 KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "circle": 2}
 """Probes that can be set with the pointer, and how many places each takes."""
+SCALE = "scale"
+MARKS = (*KINDS, SCALE)
+"""Kinds of marks: those of probes, and two points of a known distance."""
+CLOCKS = ("offset", "trigger", "correlation")
+"""Ways to relate the time of channels to that of the frames."""
 OVER = ("reference", "deformed")
 _LEAST, _LARGEST = {"levels": 2, "rate_window": 0}, 10**9
+_LONGEST = 1000
+"""Letters of a text in an address: a path on a disk has seldom more."""
 _MOST_MARKS = 200
 """Marks that an address may set: it has 8 kB at most, of some 25 a mark."""
+_KEPT = 100
+"""Steps that can be undone: more than a hand takes back one by one, at some hundred bytes each."""
 BESIDE = ("second", "third", "fourth")
 """Entries of the view that name fields beside the first."""
 UNCERTAINTY = "uncertainty"
@@ -27,7 +39,7 @@ PALETTES = ("viridis", "cividis", "plasma", "inferno", "RdBu_r", "PuOr_r", "twil
 """Colours that can be chosen, safe for the colour-blind: perceptually uniform ones, diverging ones, a cyclic one."""
 _CHOICES = {
     "over": OVER, "range": ("frame", "test", "hand"), "theme": ("light", "dark"), "palette": PALETTES,
-    "measure": MEASURES,
+    "measure": MEASURES, "clock": CLOCKS,
 }  # fmt: skip
 
 
@@ -38,22 +50,63 @@ class Mark:
     Attributes
     ----------
     kind
-        One of `KINDS`; those that take two places take marks of their kind in pairs.
+        One of `MARKS`; those that take two places take marks of their kind in pairs.
     x, y
         Place in px on the reference.
+    name
+        Name of the probe of which it is the first mark; empty: its kind and number.
     """
 
     kind: str
     x: float
     y: float
+    name: str = ""
+
+
+class Steps:
+    """Marks, which can be undone and done again; the moves of a mark that is dragged are one step.
+
+    Parameters
+    ----------
+    now
+        Marks at first.
+
+    Attributes
+    ----------
+    now
+        The marks.
+    """
+
+    def __init__(self, now: tuple[Mark, ...]) -> None:
+        self.now, self._past, self._future, self._moved = now, list[Any](), list[Any](), -1
+
+    def keep(self, marks: tuple[Mark, ...]) -> None:
+        """Take marks as a step."""
+        other = [at for at, pair in enumerate(zip(self.now, marks, strict=False)) if pair[0] != pair[1]]
+        one = len(marks) == len(self.now) and len(other) == 1
+        moved = other[0] if one and replace(marks[other[0]], x=0, y=0) == replace(self.now[other[0]], x=0, y=0) else -1
+        if moved < 0 or moved != self._moved:
+            self._past = [*self._past[-_KEPT:], self.now]
+        self.now, self._future, self._moved = marks, [], moved
+
+    def go(self, *, back: bool) -> tuple[Mark, ...]:
+        """Return to the marks before the last step, or do again the one that was undone last."""
+        source, target = (self._past, self._future) if back else (self._future, self._past)
+        if source:
+            target.append(self.now)
+            self.now, self._moved = source.pop(), -1
+        return self.now
 
 
 def probe_marks(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
-    """Return the marks of each complete probe by its name, such as ``point_1``: those of a kind in the order set."""
+    """Return the marks of each complete probe by its name, else kind and number: those of a kind in the order set."""
     found: dict[str, list[Mark]] = {}
     for kind, count in KINDS.items():
         of_kind = [mark for mark in marks if mark.kind == kind]
-        found |= {f"{kind}_{n + 1}": of_kind[n * count : (n + 1) * count] for n in range(len(of_kind) // count)}
+        for n in range(len(of_kind) // count):
+            name = of_kind[n * count].name
+            usual = not name or name in found
+            found[f"{kind}_{n + 1}" if usual else name] = of_kind[n * count : (n + 1) * count]
     return found
 
 
@@ -104,10 +157,19 @@ class ViewState:
         Length of the virtual strain gauges in px, 0: the shortest; and the strain measure.
     since, rigid, rate_window
         As `Maps` has them; -1: the test's reference, 0: the usual window.
-    curve
-        Quantity of the probes whose curve is shown; empty: the first.
+    curve, along
+        Quantity of the probes whose curve is shown, empty: the first; and the one along x, empty: the time.
     line
         Line along which the field is shown in place of the curves; empty: none.
+    channels, clock, offset, trigger, align, align_to, area, force
+        CSV file beside the test, and what ``[channels]`` states of it; `clock`: which of offset (s), trigger and
+        correlation of the channel `align` with the curve `align_to` counts. The area (mm²) 0: not stated.
+    beside
+        Channel that is drawn beside the curves; empty: none.
+    distance, distance_std
+        Distance of the two scale marks in mm and its standard uncertainty; 0: not stated.
+    camera
+        File with lens and plane in place of that; empty: none.
     theme
         ``"light"``, ``"dark"``, or empty: as the browser likes it.
     window
@@ -142,6 +204,19 @@ class ViewState:
     rigid: bool = False
     rate_window: int = 0
     curve: str = ""
+    along: str = ""
+    channels: str = ""
+    clock: str = CLOCKS[0]
+    offset: float = 0.0
+    trigger: str = ""
+    align: str = ""
+    align_to: str = ""
+    area: float = 0.0
+    force: str = ""
+    beside: str = ""
+    distance: float = 0.0
+    distance_std: float = 0.0
+    camera: str = ""
     line: str = ""
     theme: str = ""
     window: tuple[float, ...] = ()
@@ -174,6 +249,46 @@ class ViewState:
         view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1), since=min(view.since, frames - 1)), cls()
         return view if view.low < view.high else replace(view, low=plain.low, high=plain.high, range="frame")
 
+    def with_channels(self, stated: ChannelSettings) -> Self:
+        """Return the view with what ``[channels]`` states, unless its address names a file."""
+        if self.channels or stated.file is None:
+            return self
+        align, align_to = stated.align or ("", "")
+        clock = CLOCKS[1] if stated.trigger else CLOCKS[2] if stated.align else CLOCKS[0]
+        keys: dict[str, Any] = {"clock": clock, "offset": stated.offset, "area": stated.area or 0.0}
+        keys |= {"trigger": stated.trigger or "", "align": align, "align_to": align_to, "force": stated.force or ""}
+        return replace(self, channels=str(stated.file), **keys)
+
+    def channel_settings(self, base: Path) -> ChannelSettings:
+        """Return ``[channels]`` as it is in view, its file relative to a folder; what is not chosen yet is left out."""
+        if not self.channels:
+            return ChannelSettings()
+        clocks: dict[str, Any] = {
+            "offset": {"offset": self.offset},
+            "trigger": {"trigger": self.trigger or None},
+            "correlation": {"align": (self.align, self.align_to) if self.align and self.align_to else None},
+        }
+        return ChannelSettings(
+            file=base / self.channels, area=max(self.area, 0) or None, force=self.force or None, **clocks[self.clock]
+        )
+
+    def scale_settings(self, base: Path, kept: ScaleSettings) -> ScaleSettings | None:
+        """Return ``[scale]`` as it is in view, its file relative to a folder, with the frame rate kept; None: none.
+
+        Raises
+        ------
+        InputError
+            Two scale marks and their distance make no scale.
+        """
+        if self.camera:
+            return ScaleSettings(camera=base / self.camera, frame_rate=kept.frame_rate)
+        ends = [(mark.x, mark.y) for mark in self.marks if mark.kind == SCALE]
+        if len(ends) < 2 or not self.distance:
+            return None
+        units = Units.from_points(ends, self.distance, length_std=self.distance_std)
+        std = units.mm_per_pixel_std
+        return ScaleSettings(mm_per_pixel=units.mm_per_pixel, mm_per_pixel_std=std, frame_rate=kept.frame_rate)
+
     def query(self) -> str:
         """Return the address without the frame: all that differs from the defaults."""
         plain = type(self)()
@@ -185,9 +300,11 @@ class ViewState:
 def _text(value: object) -> str:
     if isinstance(value, tuple):
         if value and isinstance(value[0], Mark):
-            return ";".join(f"{mark.kind}:{mark.x:.6g},{mark.y:.6g}" for mark in value)
+            return ";".join(f"{mark.kind}:{mark.x:.6g},{mark.y:.6g}{mark.name and f',{mark.name}'}" for mark in value)
         return ",".join(f"{number:.6g}" for number in value)
-    return f"{value:.6g}" if isinstance(value, float) else str(int(value) if isinstance(value, bool) else value)
+    if isinstance(value, float):  # the offset of a clock may have more digits
+        return text if float(text := f"{value:.6g}") == value else repr(value)
+    return str(int(value) if isinstance(value, bool) else value)
 
 
 def _value(name: str, text: str, names: Sequence[str]) -> object:
@@ -206,19 +323,21 @@ def _value(name: str, text: str, names: Sequence[str]) -> object:
             return (left, top, right, bottom) if left < right and top < bottom else None
         if name == "marks":
             places = [re.split("[:,]", mark) for mark in text.split(";")[:_MOST_MARKS]]
-            marks = tuple(Mark(kind, _number(x), _number(y)) for kind, x, y in places)
-            return marks if all(mark.kind in KINDS for mark in marks) else None
-    except ValueError:
+            marks = tuple(Mark(kind, _number(x), _number(y), *name) for kind, x, y, *name in places)
+            named = [mark.name for mark in marks if mark.name]
+            known = all(mark.kind in MARKS for mark in marks) and all(map(PROBE_NAME.fullmatch, named))
+            return marks if known and len(set(named)) == len(named) else None
+    except (TypeError, ValueError):
         return None
     if name in ("field", *BESIDE):
         return text if text in names or (text == UNCERTAINTY and name in BESIDE) else None
     if name in _CHOICES:
         return text if text in _CHOICES[name] else None
-    return text[:100]
+    return text[:_LONGEST]
 
 
 def _number(text: str) -> float:
     number = float(text)
-    if not math.isfinite(number) or abs(number) > 1e9:
+    if not math.isfinite(number) or abs(number) > 1e10:  # seconds since 1970 are 2e9
         raise ValueError(text)
     return number

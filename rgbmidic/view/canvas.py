@@ -100,12 +100,12 @@ class Canvas:
         )
         self.bar = bk.ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
         self.plot.add_layout(self.bar, "right")
-        self.marks = bk.ColumnDataSource(columns("x y kind"), name="marks" if like is None else None)
+        self.marks = bk.ColumnDataSource(columns("x y kind name"), name="marks" if like is None else None)
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
         dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
         pan, wheel = bk.PanTool(), bk.WheelZoomTool(zoom_on_axis=False)
         hidden = {"renderers": [dots], "visible": False}
-        draw = [bk.PointDrawTool(default_overrides={"kind": kind}, **hidden) for kind in kinds]
+        draw = [bk.PointDrawTool(default_overrides={"kind": kind, "name": ""}, **hidden) for kind in kinds]
         self.tools = (pan, *draw)
         box, reset, save = bk.BoxZoomTool(match_aspect=True), bk.ResetTool(), bk.SaveTool(filename="field")
         self.plot.add_tools(pan, wheel, box, reset, save, *draw)
@@ -145,13 +145,13 @@ class Canvas:
     @property
     def set(self) -> list[Mark]:
         """The marks as they are on the plot."""
-        data = self.marks.data
-        return [Mark(str(k), float(x), float(y)) for x, y, k in zip(data["x"], data["y"], data["kind"], strict=True)]
+        rows = zip(*(self.marks.data[key] for key in ("kind", "x", "y", "name")), strict=True)
+        return [Mark(str(kind), float(x), float(y), str(name)) for kind, x, y, name in rows]
 
     def place(self, marks: Sequence[Mark]) -> None:
         """Place marks on the plot, unless they are there."""
         if list(marks) != self.set:
-            self.marks.data = columns("x y kind", [(mark.x, mark.y, mark.kind) for mark in marks])
+            self.marks.data = columns("x y kind name", [(mark.x, mark.y, mark.kind, mark.name) for mark in marks])
 
     def resize(self) -> None:
         """Take the size that the browser reports."""

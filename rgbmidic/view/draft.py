@@ -4,27 +4,38 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+import cv2
 import numpy as np
 import tomlkit
-from bokeh.document import Document
-from bokeh.models import ColumnDataSource
 from tomlkit.exceptions import TOMLKitError
 
 from rgbmidic.errors import ConfigurationError
+from rgbmidic.mesh import Region
+from rgbmidic.results import Result
 from rgbmidic.results.files import write_complete
-from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_section, read_toml
-from rgbmidic.view.address import Mark
-from rgbmidic.view.canvas import Canvas, columns
+from rgbmidic.settings import (
+    ChannelSettings,
+    FrameSettings,
+    ProbeSettings,
+    RegionSettings,
+    ScaleSettings,
+    TestSettings,
+    plain,
+    read_section,
+    read_toml,
+)
+from rgbmidic.view.address import KINDS, Mark
 
-__all__ = ["HOLES", "OUTLINES", "Draft", "RegionDrawing", "arranged", "marks_of", "region_of", "rings"]
+__all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "arranged", "channel_section"]
+__all__ += ["marks_of", "mask_images", "masks_of", "probe_section", "region_of", "rings", "scale_section"]
 
 _FILES = (
-    *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera"),
+    *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera", "channels.file"),
     *("weights.geometry", "weights.height_map", "weights.images"),
 )
 """Keys that name files."""
@@ -74,6 +85,44 @@ class Draft:
             return draft
         file = Path.cwd() / "TEST.toml"
         return cls(file=file, text="").changed({"frames": {"path": str(path.resolve())}})
+
+    @classmethod
+    def of_result(cls, result: Result, file: Path) -> Self:
+        """Read a TEST.toml beside a result, or begin one with the settings that the result was measured with.
+
+        Parameters
+        ----------
+        result
+            The result.
+        file
+            The TEST.toml, relative to the folder of that of the result.
+
+        Returns
+        -------
+        Draft
+            The draft.
+
+        Raises
+        ------
+        ConfigurationError
+            As `of`; or the file lies neither beside the result nor in the folder of its test.
+        """
+        base = Path(result.provenance.get("base", result.path.parent))
+        folders, file = {base.resolve(), result.path.resolve().parent}, (base / file).resolve()
+        if file.suffix.lower() != ".toml" or file.parent not in folders:
+            raise ConfigurationError(f"{file} must end in .toml and be in {' or '.join(sorted(map(str, folders)))}")
+        if file.exists():
+            return cls.of(file)
+        stated = result.provenance.get("settings", {})
+        settings = {name: dict(section) for name, section in stated.items() if section}
+        frames = settings.setdefault("frames", {})
+        frames["path"] = [str(base / path) for path in frames.get("path", ())]
+        return cls(file=file, text="").changed(settings)
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the file has this content."""
+        return self.file.exists() and self.file.read_text(encoding="utf-8-sig") == self.text
 
     @property
     def document(self) -> dict[str, Any]:
@@ -161,6 +210,10 @@ class Draft:
             )
         return replace(self, file=file)
 
+    def check(self) -> None:
+        """Check that the draft is a complete test; errors as `write`."""
+        TestSettings.from_mapping(self.document, self.file.parent)
+
     def write(self) -> None:
         """Write the TEST.toml.
 
@@ -171,14 +224,75 @@ class Draft:
         ResultError
             The file cannot be written.
         """
-        TestSettings.from_mapping(self.document, self.file.parent)
+        self.check()
         write_complete(self.file, lambda file: file.write(self.text.encode("utf-8")))
+
+
+def probe_section(draft: Draft, made: ProbeSettings) -> dict[str, Any]:
+    """Return the keys of ``[probes]`` for probes set with the pointer, to a thousandth of a pixel; others stay."""
+    kept = read_section(ProbeSettings, "probes", draft.section("probes"))
+    keys = {f"{kind}s": [[round(value, 3) for value in place] for place in getattr(made, f"{kind}s")] for kind in KINDS}
+    names = [list(pair) for pair in kept.names if pair[0].rpartition("_")[0] not in KINDS]
+    names += [list(pair) for pair in made.names]
+    measure = {"measure": made.measure} if made.measure != kept.measure else {}
+    return {**{key: value or None for key, value in keys.items()}, "names": names or None, **measure}
+
+
+def channel_section(draft: Draft, stated: ChannelSettings) -> dict[str, Any]:
+    """Return the keys of ``[channels]``, the file relative to the TEST.toml where it is beside it.
+
+    Raises
+    ------
+    ConfigurationError
+        No file is stated.
+    """
+    if stated.file is None:
+        raise ConfigurationError("state the channels' file first (channels.file)")
+    beside = stated.file.resolve().parent == draft.file.parent
+    keys = {**plain(stated), "file": stated.file.name if beside else str(stated.file.resolve())}
+    return {key: value or None for key, value in keys.items()}
+
+
+def scale_section(draft: Draft, stated: ScaleSettings | None) -> dict[str, Any]:
+    """Return the keys of ``[scale]``, the scale rounded as `rgbmidic scale` prints it.
+
+    Raises
+    ------
+    ConfigurationError
+        No scale is stated.
+    """
+    if stated is None:
+        raise ConfigurationError("set two points and state their distance in mm, or name the camera file")
+    keys: dict[str, Any] = dict.fromkeys(("mm_per_pixel", "mm_per_pixel_std", "camera"))
+    if (camera := stated.camera) is not None:
+        return {
+            **keys,
+            "camera": camera.name if camera.resolve().parent == draft.file.parent else str(camera.resolve()),
+        }
+    rounded = {"mm_per_pixel": float(f"{stated.mm_per_pixel:.6g}")}
+    return {**keys, **rounded, "mm_per_pixel_std": float(f"{stated.mm_per_pixel_std:.2g}")}
+
+
+class Confirmation:
+    """Second press of a button, which lets files that exist be replaced."""
+
+    def __init__(self) -> None:
+        self._asked: object = None
+
+    def question(self, files: Sequence[Path], what: str) -> str:
+        """Return what to confirm; empty where no file exists, or where the same was asked just before."""
+        there = [str(file) for file in files if file.exists()]
+        asked = (there, what) if there and self._asked != (there, what) else None
+        self._asked = asked
+        return f"{', '.join(there)} exists: press again to replace {what}." if asked else ""
 
 
 OUTLINES = {"rectangle": 2, "polygon": 3, "circle": 2}
 """Kinds of an outline and the marks that it takes at least: opposite corners; corners; the centre and a place on it."""
 HOLES = {"hole": 3, "round hole": 2}
 """Kinds of a hole and the marks that it takes at least."""
+MASK = "mask"
+"""Kind of a polygon in which a light does not count."""
 _ROUND = 48
 """Corners of the polygon that stands for a circle: within 1 - cos(pi / 48) = 0.2 % of its radius."""
 
@@ -232,9 +346,33 @@ def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
 
 def _holes(marks: Sequence[Mark]) -> list[Ring]:
     """Return the corners of the complete holes."""
-    names = [mark.kind for mark in marks if mark.kind not in OUTLINES]
+    names = [mark.kind for mark in marks if mark.kind not in OUTLINES and not mark.kind.startswith(MASK)]
     complete = [name for name in dict.fromkeys(names) if names.count(name) >= HOLES[name.rpartition(" ")[0]]]
     return [_corners(name, marks) for name in complete]
+
+
+def masks_of(marks: Sequence[Mark]) -> dict[str, list[Ring]]:
+    """Return the corners of the complete masks of each light that has some."""
+    names, found = [mark.kind for mark in marks if mark.kind.startswith(MASK)], dict[str, list[Ring]]()
+    for name in dict.fromkeys(names):
+        if names.count(name) >= HOLES["hole"]:
+            found.setdefault(name.split(" ", 2)[2], []).append(_corners(name, marks))
+    return found
+
+
+def mask_images(masks: Mapping[str, Sequence[Ring]], lights: Sequence[str], shape: tuple[int, int]) -> list[bytes]:
+    """Return a picture (PNG) for each light: 0 within its masks, 255 elsewhere.
+
+    Raises
+    ------
+    ConfigurationError
+        A mask is of none of the lights.
+    """
+    if other := [light for light in masks if light not in lights]:
+        raise ConfigurationError(f"there is a mask of {', '.join(other)}, but the lights are {', '.join(lights)}")
+    whole = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape)
+    kept = [whole.without(masks.get(light, ())).mask for light in lights]
+    return [cv2.imencode(".png", np.uint8(255) * mask.astype(np.uint8))[1].tobytes() for mask in kept]
 
 
 def _corners(name: str, marks: Sequence[Mark]) -> Ring:
@@ -245,90 +383,3 @@ def _corners(name: str, marks: Sequence[Mark]) -> Ring:
         radius, angles = math.dist((x, y), on), np.arange(_ROUND) * 2 * np.pi / _ROUND
         places = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
     return [[round(float(x), 1), round(float(y), 1)] for x, y in places]
-
-
-_SOON = 60
-"""Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
-_KEPT = 100
-"""Steps that can be undone: more than a hand takes back one by one, at some hundred bytes each."""
-
-
-class RegionDrawing:
-    """Marks of the region on a canvas, which can be undone, and the lines that they make.
-
-    Parameters
-    ----------
-    document
-        Document of the page.
-    canvas
-        Plot on which they are set and drawn.
-    marks
-        Marks at first.
-    changed
-        Called when they have changed.
-    """
-
-    def __init__(
-        self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], changed: Callable[[], None]
-    ) -> None:
-        self._document, self._canvas, self._changed = document, canvas, changed
-        self._history, self._hole, self._moved, self._coming = [marks], 1, False, False
-        self._rings = ColumnDataSource(columns("xs ys colour"), name="rings")
-        canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
-        canvas.marks.on_change("data", lambda attr, old, new: self._marked())
-
-    @property
-    def region(self) -> dict[str, Any] | None:
-        """Keys of ``[region]``; None where no outline is complete."""
-        return region_of(self._history[-1])
-
-    def undo(self) -> None:
-        """Return to the marks before the last step."""
-        if len(self._history) > 1:
-            self._history.pop()
-        self.draw()
-
-    def clear(self) -> None:
-        """Remove all marks."""
-        self._keep(())
-
-    def next_hole(self) -> None:
-        """Let the marks of a hole that are set from now on belong to another one."""
-        holes = [mark.kind for mark in self._history[-1] if mark.kind.startswith("hole ")]
-        self._hole = max((int(kind.rpartition(" ")[2]) for kind in holes), default=0) + 1
-
-    def draw(self) -> None:
-        """Draw the marks and the lines."""
-        self._coming = False
-        self._canvas.place(self._history[-1])
-        outline, holes = rings(self._history[-1])
-        closed = [[*ring, *ring[:1]] for ring in (outline, *holes)]
-        self._rings.data = {
-            "xs": [[x for x, _ in ring] for ring in closed],
-            "ys": [[y for _, y in ring] for ring in closed],
-            "colour": ["#56b4e9", *["#e69f00"] * len(holes)],
-        }
-        self._changed()
-
-    def _marked(self) -> None:
-        """Take the marks as they are on the plot; a new mark of a hole gets the number of its hole.
-
-        A polygon's number is that of the present hole; a round hole is complete with two marks.
-        """
-        before, now = self._history[-1], list[Mark]()
-        for mark in self._canvas.set:
-            number = self._hole
-            if mark.kind == "round hole":
-                number = 1 + sum(other.kind.startswith("round hole ") for other in now) // HOLES["round hole"]
-            now.append(Mark(f"{mark.kind} {number}", mark.x, mark.y) if mark.kind in HOLES else mark)
-        if tuple(self._canvas.set) != before:
-            new = next((mark.kind for mark in self._canvas.set if mark not in before), "")
-            self._keep(arranged(now, new), moved=len(now) == len(before))
-
-    def _keep(self, marks: tuple[Mark, ...], *, moved: bool = False) -> None:
-        """Set the marks; the moves of a mark that is dragged are one step."""
-        before = self._history[:-1] if moved and self._moved else self._history
-        self._history, self._moved = [*before[-_KEPT:], marks], moved
-        if not self._coming:
-            self._coming = True
-            self._document.add_timeout_callback(self.draw, _SOON)

@@ -113,7 +113,7 @@ def warning(text: str) -> str:
     return f'<b style="color:var(--warn)">{html.escape(text)}</b>'
 
 
-def guarded(act: Callable[[], None], complain: Callable[[str], None]) -> None:
+def guarded(act: Callable[[], object], complain: Callable[[str], None]) -> None:
     """Call `act`; an error is reported in one line by `complain`, and the page goes on."""
     try:
         act()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.resources import files
 from typing import Any
 
@@ -16,11 +17,11 @@ from bokeh.model import DataModel
 from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import PALETTES, Mark, probe_marks
+from rgbmidic.view.address import PALETTES, SCALE, Mark, probe_marks
 from rgbmidic.view.canvas import LETTERS, Canvas, columns
 from rgbmidic.view.picture import element_at
 
-__all__ = ["CONTROLS", "Controls", "MarkLayer", "ResultControls", "SharedState", "page_file", "script"]
+__all__ = ["CONTROLS", "WRITTEN", "Controls", "MarkLayer", "ResultControls", "SharedState", "page_file", "script"]
 
 _SHORT = 150
 """Smallest number of ms between two frames that are played: 6 to 7 a second, which the eye can follow."""
@@ -91,11 +92,14 @@ class Controls:
         state.js_on_change("shown", asks)
 
 
-SECTIONS = ("Field", "Colours", "Layers", "Derived", "Probes")
+SECTIONS = ("Field", "Colours", "Layers", "Derived", "Probes", "Channels", "File")
 """Headings of the controls of a result: one section is shown at a time, and fits a screen of 720 rows."""
+WRITTEN = ("probes", "channels", "scale")
+"""Sections of a TEST.toml that the page can write."""
 MODES = ("Move", "Point", "Gauge", "Line", "Strain", "Box", "Circle")
 _ENDS = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
 _NUMBER = {"mode": "float"}
+_CLOCKS = [("offset", "an offset"), ("trigger", "a trigger"), ("correlation", "correlation")]
 CONTROLS: tuple[tuple[str, str, type[bk.Widget], str, dict[str, Any]], ...] = (
     ("field", "Field", bk.Select, "Field", {}),
     ("second", "Field", bk.Select, "Second field", {}),
@@ -120,6 +124,19 @@ CONTROLS: tuple[tuple[str, str, type[bk.Widget], str, dict[str, Any]], ...] = (
     ("since", "Derived", bk.Spinner, "Since frame (-1: the reference)", {"low": -1}),
     ("rigid", "Derived", bk.Checkbox, "rigid motion removed", {}),
     ("rate_window", "Derived", bk.Spinner, "Rates over frames (0: as stated, or 9)", {"low": 0}),
+    ("along", "Probes", bk.Select, "Along x", {}),
+    ("channels", "Channels", bk.TextInput, "CSV file beside the test", {}),
+    ("beside", "Channels", bk.Select, "Beside the curves", {}),
+    ("clock", "Channels", bk.Select, "Its time by", {"options": _CLOCKS}),
+    ("offset", "Channels", bk.NumericInput, "Offset, s", _NUMBER),
+    ("trigger", "Channels", bk.Select, "Trigger channel", {}),
+    ("align", "Channels", bk.Select, "Channel", {}),
+    ("align_to", "Channels", bk.Select, "alike to", {}),
+    ("force", "Channels", bk.Select, "Force", {}),
+    ("area", "Channels", bk.NumericInput, "Section, mm²", {**_NUMBER, "low": 0}),
+    ("distance", "File", bk.NumericInput, "Length, mm", {**_NUMBER, "low": 0}),
+    ("distance_std", "File", bk.NumericInput, "± mm", {**_NUMBER, "low": 0}),
+    ("camera", "File", bk.TextInput, "or camera", {}),
 )
 """Every control that sets an entry of the view: entry, section, kind, text and options."""
 
@@ -144,17 +161,27 @@ class ResultControls(Controls):
         self.under = bk.Div(name="under", **wide)
         self.section = bk.RadioButtonGroup(labels=list(SECTIONS), active=0, name="section", **wide)
         self.mode = bk.RadioButtonGroup(labels=list(MODES), active=0, name="mode", **wide)
-        for group, says in ((self.over, "image"), (self.section, "controls shown"), (self.mode, "what a click sets")):
-            group.html_attributes = {"role": "group", "aria-label": says}
         self.curve = bk.Select(title="Curve", name="curve", **wide)
         self.movie = bk.Toggle(label="Movie", name="movie", width=90, **self.small)
         folded = {"max-height": "48px", "overflow": "auto", "overflow-wrap": "anywhere"}
         self.said = bk.Div(name="said", width=300, visible=False, styles=folded, **self.small)
         self.said.html_attributes = {"aria-live": "polite"}
         self.player = row(self.play, self.step, self.frame, self.movie, self.said, sizing_mode="stretch_width")
-        self.lock, self.clear, self.csv, self.png = (
-            bk.Button(label=name, **wide) for name in ("Lock the range", "Clear", "Save CSV", "Save PNG")
+        labels = ("Lock the range", "Undo", "Redo", "Clear", "Save CSV", "Save PNG", "Write", "Take its probes")
+        self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.take = (
+            bk.Button(label=name, name=name.lower(), **wide) for name in labels
         )
+        self.probe = bk.Select(title="Probe", name="probe", **wide)
+        self.name = bk.TextInput(title="its name", name="name", **wide)
+        self.drag = bk.Toggle(label="Drag the channel along the time", name="drag", **wide)
+        self.scale = bk.RadioButtonGroup(labels=["Move", "Two points of a distance"], name="scale", **wide)
+        self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", **wide)
+        self.what = bk.CheckboxButtonGroup(labels=list(WRITTEN), active=[0], name="what", **wide)
+        self.told, self.written, self.scaled = (bk.Div(name=name, **wide) for name in ("told", "written", "scaled"))
+        groups: dict[Any, str] = {self.over: "image", self.section: "controls shown", self.mode: "what a click sets"}
+        groups |= {self.scale: "points of the scale", self.what: "sections that are written"}
+        for group, says in groups.items():
+            group.html_attributes = {"role": "group", "aria-label": says}
 
     @property
     def side(self) -> Any:
@@ -166,7 +193,16 @@ class ResultControls(Controls):
         parts["Field"].insert(4, self.over)
         low, high = (parts["Colours"].pop(1) for _ in "lh")
         parts["Colours"][1:1] = [row(low, high, **flat), self.lock]
-        parts["Probes"] = [self.mode, self.curve, row(self.clear, self.csv, self.png, **flat), self.message]
+        lines = row(self.curve, self.of["along"], **flat), row(self.probe, self.name, **flat)
+        buttons = row(self.undo, self.redo, self.clear, **flat), row(self.csv, self.png, **flat)
+        parts["Probes"] = [self.mode, *lines, *buttons, self.message]
+        file, beside, clock, offset, trigger, align, align_to, force, area = parts["Channels"]
+        pairs = row(align, align_to, **flat), row(force, area, **flat)
+        clocks = row(beside, clock, **flat), trigger, pairs[0], offset, self.drag
+        parts["Channels"] = [file, *clocks, pairs[1], self.told]
+        known = row(*parts["File"], **flat)
+        writes = self.file, self.what, row(self.write, self.take, **flat), self.written
+        parts["File"] = [self.scale, known, self.scaled, *writes]
         shown = [column(*parts[name], visible=not place, **flat) for place, name in enumerate(SECTIONS)]
         self.section.js_on_change("active", script("turnTo", group=self.section, sections=shown))
         return column(self.description, self.section, *shown, self.theme, **flat)
@@ -178,7 +214,9 @@ class ResultControls(Controls):
             state.js_on_change(name, script("shown", state=state, now=now))
         state.js_on_change("csv", script("keepCsv", state=state))
         self.png.js_on_click(script("keepPng", plot=curves))
-        self.mode.js_on_change("active", script("choose", group=self.mode, tools=list(tools), other=None))
+        groups = (self.mode, tools[:-1], self.scale), (self.scale, [tools[0], tools[-1]], self.mode)
+        for group, own, other in groups:
+            group.js_on_change("active", script("choose", group=group, tools=list(own), other=other))
 
 
 _COLOURS = tuple(OKABE_ITO.values())
@@ -241,7 +279,8 @@ class MarkLayer:
             return
         self._shown, self._drawn = shown, drawn
         self._canvas.place(at)
-        probes = probe_marks(at)
+        ends = [mark for mark in at if mark.kind == SCALE]
+        probes = {**probe_marks(at), **({SCALE: ends} if len(ends) > 1 else {})}
         self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
         lines = [_outline(ends, gauge) for ends in probes.values()]
         texts = [
@@ -263,4 +302,4 @@ class MarkLayer:
         if found is None:
             return mark
         x, y = found[1] @ after[found[0]]
-        return Mark(mark.kind, float(x), float(y)) if np.isfinite(x + y) else mark
+        return replace(mark, x=float(x), y=float(y)) if np.isfinite(x + y) else mark

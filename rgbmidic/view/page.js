@@ -34,6 +34,11 @@ const rgbmidic = {
     sections.forEach((one, place) => { one.visible = place === group.active; });
   },
 
+  // While a curve can be dragged the plot itself stays where it is.
+  hold({toggle, pan}) {
+    pan.active = !toggle.active;
+  },
+
   turn({theme}) {
     const address = new URL(location.href);
     address.searchParams.set("theme", theme);
@@ -65,6 +70,12 @@ document.addEventListener("keydown", (event) => {
   const target = event.composedPath()[0];
   const writing = target.tagName === "SELECT" || (target.tagName === "INPUT" && target.type !== "range");
   const page = Bokeh.documents[0];
+  const back = !event.shiftKey && event.key === "z", again = event.key === "y" || (event.shiftKey && event.key === "Z");
+  if (page && !writing && (event.ctrlKey || event.metaKey) && (back || again)) {
+    const button = page.get_model_by_name(back ? "undo" : "redo");
+    if (button) Bokeh.index.get_one(button).el.shadowRoot.querySelector("button").click();
+    event.preventDefault();
+  }
   if (writing || event.ctrlKey || event.altKey || event.metaKey || !page) return;
   const slider = page.get_model_by_name("frame"), play = page.get_model_by_name("play");
   const step = page.get_model_by_name("step").value || 1;

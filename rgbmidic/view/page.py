@@ -3,22 +3,39 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
 import bokeh.models as bk
 import numpy as np
 from bokeh.document import Document
-from bokeh.events import DocumentReady, MouseMove, Tap
+from bokeh.events import DocumentReady, MouseMove, Pan, PanEnd, PanStart, Tap
 
+from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.fields import MEASURES
 from rgbmidic.fields.strain import shortest_gauge
-from rgbmidic.results import MapField, Maps, MapValues, Result
+from rgbmidic.results import MapField, Maps, MapValues, Result, channels_of, probes_of
+from rgbmidic.results.physical import scale_of
+from rgbmidic.settings import PROBE_NAME, ProbeSettings, ScaleSettings, read_section
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import BESIDE, KINDS, OVER, UNCERTAINTY, ViewState, probe_marks, probe_place
+from rgbmidic.view.address import (
+    BESIDE,
+    MARKS,
+    OVER,
+    SCALE,
+    UNCERTAINTY,
+    Mark,
+    Steps,
+    ViewState,
+    probe_marks,
+    probe_place,
+)
 from rgbmidic.view.canvas import Canvas, LabelLayer, LineLayer, arrow_lines, contour_lines, direction_lines
-from rgbmidic.view.curves import CurvePanel, LinePanel, Progress, TimeLine, as_csv, places
+from rgbmidic.view.curves import CurvePanel, LinePanel, Progress, TimeLine, as_csv, marks_of, places, probes
+from rgbmidic.view.draft import Confirmation, Draft, channel_section, probe_section, scale_section
 from rgbmidic.view.fields import (
     Pictures,
     every,
@@ -31,7 +48,7 @@ from rgbmidic.view.fields import (
     robust_range,
     warning,
 )
-from rgbmidic.view.models import CONTROLS, MarkLayer, ResultControls, SharedState
+from rgbmidic.view.models import CONTROLS, WRITTEN, MarkLayer, ResultControls, SharedState, script
 from rgbmidic.view.picture import AROUND, Overlay, Picture, paint, palette, palette_name
 from rgbmidic.view.setup_panel import Movie
 
@@ -41,10 +58,11 @@ _TICK, _IDLE = 200, 1000
 """Ms between two parts of the time line; between two checks whether a result has grown, and pictures of that."""
 _CONTOURS = 10
 """Steps between contour lines at most. Chosen; more cover the field."""
+_CURVES = {entry for entry, section, *_ in CONTROLS if section == "Channels"} | {"along"}
+"""Entries of the view that the curves alone depend on."""
 _HELP = (
-    "Choose a probe, then click on the field (Gauge, Line, Box and Circle: twice): its curve appears beside it, the "
-    "value, or mean, at it. Drag a mark to move it; Backspace removes a chosen one. Keys: ← → a frame, space plays, "
-    "1 to 5 the sections above."
+    "Choose a probe, click on the field (Gauge, Line, Box, Circle: twice). Drag marks; Backspace removes one. "
+    "Keys: ← → a frame, space plays, 1 to 7 sections, Ctrl-Z undoes, Ctrl-Y redoes."
 )
 
 
@@ -71,10 +89,15 @@ class ResultPage:
         self._read = lru_cache(4)(lambda name, frame, changes, chosen: self.fields.read(name, frame))
         self._test_range = lru_cache(8)(lambda name, changes, chosen: range_of_test(self.fields, name))
         self._changes = self._size = 0
+        self._scale_read: ScaleSettings | None = None
         self._chosen: tuple[Any, ...] = ()
         self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
+        self._base = Path(result.provenance.get("base", result.path.parent))
+        self.view = view = view.with_channels(channels_of(result))
+        self._scale: ScaleSettings | None = None
+        self.steps, self.confirmation = Steps(view.marks), Confirmation()
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=self.dark)
-        self.canvas = Canvas(document, list(KINDS), view.window or Canvas.around(result.nodes), self._redraw)
+        self.canvas = Canvas(document, MARKS, view.window or Canvas.around(result.nodes), self._redraw)
         self.beside: list[Canvas] = []
         self.directions, self.contours = (
             LineLayer(self.canvas, "direction lines"),
@@ -86,7 +109,8 @@ class ResultPage:
             LabelLayer(self.canvas, "extreme nodes", size=9),
         )
         self.timeline = TimeLine(len(result), view.frame)
-        self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, message=p.message, hint=_HELP)
+        texts: dict[str, Any] = {"message": p.message, "told": p.told, "hint": _HELP}
+        self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, **texts)
         self.line = LinePanel(document, self.canvas.colours, p.wide)
         panels = [self.line.choice, self.curves.plot, *self.line.parts]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
@@ -106,12 +130,9 @@ class ResultPage:
     def _begin(self) -> None:
         """Set the controls to the view, and let them change it."""
         p, view = self.parts, self.view
-        groups: dict[str, list[tuple[str, str]]] = {}
-        for field in self.fields.all.values():
-            groups.setdefault(field.group, []).append((field.name, field.label))
-        p.of["field"].options = groups
-        for name in BESIDE:
-            p.of[name].options = {"": [("", "nothing"), (UNCERTAINTY, "its uncertainty")], **groups}
+        self._offer_fields()
+        self._offer()
+        p.file.value = "TEST.toml"
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
         p.message.text, p.head.text = _HELP, self._title()
@@ -125,6 +146,55 @@ class ResultPage:
             (p.curve, "value", lambda name: {"curve": name}),
         ):
             model.on_change(key, lambda attr, old, new, change=change: self.show(**change(new)))
+
+    def _offer_fields(self) -> None:
+        """Offer the fields, in the units that they have."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for field in self.fields.all.values():
+            groups.setdefault(field.group, []).append((field.name, field.label))
+        of = self.parts.of
+        of["field"].options = groups
+        for name in BESIDE:
+            of[name].options = {"": [("", "nothing"), (UNCERTAINTY, "its uncertainty")], **groups}
+
+    def _offer(self) -> None:
+        """Offer channels, curves and probes as they are now, and the controls of the chosen clock."""
+        p, view, curves = self.parts, self.view, self.curves
+        names = [] if curves.channels is None else list(curves.channels.values)
+        quantities = [] if curves.histories is None else [one.name for one in curves.histories.quantities]
+        read = [name for name in quantities if name not in names]
+        for entry, first, known in (
+            ("trigger", "choose", names), ("align", "choose", names), ("force", "the only one in N or kN", names),
+            ("beside", "none", names), ("align_to", "choose", read), ("along", "time", quantities),
+        ):  # fmt: skip
+            stated = getattr(view, entry)
+            p.of[entry].options = [("", first), *dict.fromkeys([*known, *([stated] if stated else [])])]
+        p.of["trigger"].visible = view.clock == "trigger"
+        p.of["align"].visible = p.of["align_to"].visible = view.clock == "correlation"
+        p.of["offset"].visible = view.clock == "offset"
+        p.probe.options = list(probe_marks(view.marks))
+        if p.probe.value not in p.probe.options:
+            p.probe.value = next(iter(p.probe.options), "")
+        self._show_name()
+
+    def _show_name(self) -> None:
+        marks = probe_marks(self.view.marks).get(self.parts.probe.value)
+        self.parts.name.value = marks[0].name if marks else ""
+
+    def _rename(self, name: str) -> None:
+        """Give the chosen probe a name; empty: its kind and number."""
+        p, (name, marks) = self.parts, (name.strip(), self.view.marks)
+        found = probe_marks(marks).get(p.probe.value)
+        if found is None or name == found[0].name:
+            return
+        if name and (not PROBE_NAME.fullmatch(name) or any(mark.name == name for mark in marks)):
+            p.message.text = warning(
+                f'a name has letters, digits, spaces, "." and "-", and no other probe has it; not "{name}"'
+            )
+            self._show_name()
+            return
+        self._take_marks(tuple(replace(mark, name=name) if mark is found[0] else mark for mark in marks))
+        p.probe.value = name or next(key for key, own in probe_marks(self.view.marks).items() if own[1:] == found[1:])
 
     def _set(self, entry: str, attribute: str, old: Any, new: Any) -> None:
         """Take the value of a control into the view; a range by hand starts from that in view."""
@@ -142,14 +212,25 @@ class ResultPage:
             self._set("low", "value", None, 0)
         else:
             self.show(**{entry: new})
-            if entry in ("gauge", "measure") and self.view.marks:
+            if entry in ("gauge", "measure", "distance", "distance_std", "camera") and self.view.marks:
                 self._read_curves()
+            if entry in _CURVES:
+                self._state()
 
     def _listen(self) -> None:
         p = self.parts
         self.canvas.marks.on_change("data", lambda attr, old, new: self._marked())
         p.lock.on_click(lambda: p.of["range"].update(value="hand"))
-        p.clear.on_click(lambda: self.canvas.place([]))
+        p.clear.on_click(lambda: self._take_marks(()))
+        for button, back in ((p.undo, True), (p.redo, False)):
+            button.on_click(partial(self._undo, back=back))
+        p.probe.on_change("value", lambda attr, old, new: self._show_name())
+        p.name.on_change("value", lambda attr, old, new: self._rename(new))
+        for button, act in ((p.write, self._write), (p.take, self._take_probes)):
+            button.on_click(partial(guarded, act, lambda text: p.written.update(text=warning(text))))
+        p.drag.js_on_change("active", script("hold", toggle=p.drag, pan=self.curves.pan))
+        for event in (PanStart, Pan, PanEnd):
+            self.curves.plot.on_event(event, self._drag)
         p.csv.on_click(self._save)
         self.canvas.plot.on_event(MouseMove, self._hover)
         self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(new))
@@ -161,7 +242,7 @@ class ResultPage:
     def _ready(self) -> None:
         self.canvas.resize()
         self.show()
-        if self.view.marks:
+        if self.view.marks or self.view.channels:
             self._read_curves()
         every(_TICK, self.document, lambda: self.progress.advance(self.result), self.complain)
         for act in (self._grow, self._draw_progress, self._tell_film):
@@ -221,7 +302,16 @@ class ResultPage:
     def _choose(self) -> None:
         """Derive fields as the view has it."""
         view = self.view
-        chosen = (view.gauge, view.measure, view.since, view.rigid, view.rate_window)
+        try:
+            scale = view.scale_settings(self._base, scale_of(self.result))
+            if scale != self._scale:
+                self.fields, self._scale = Maps.of(self.result, scale), scale
+                self._offer_fields()
+            told = f"{scale.mm_per_pixel:.6g} ± {scale.mm_per_pixel_std:.2g} mm/px" if scale and not view.camera else ""
+            self.parts.scaled.text = told
+        except RgbmidicError as error:
+            self.parts.scaled.text = warning(str(error))
+        chosen = (view.gauge, view.measure, view.since, view.rigid, view.rate_window, self._scale)
         if chosen != self._chosen:
             self.fields = self.fields.chosen(
                 gauge=view.gauge or None,
@@ -317,6 +407,7 @@ class ResultPage:
             name: probe_text(self.fields, field, values, marks[0].kind, probe_place(marks, gauge))
             for name, marks in probes
         }
+        texts[SCALE] = f": {view.distance:g} mm" if view.distance else ""
         self.marks.place(view.marks, self.result.nodes, nodes, texts, gauge)
 
     @property
@@ -369,14 +460,101 @@ class ResultPage:
             return
         marks = self.marks.taken(self._nodes(self.values), self.result.nodes)
         if marks is not None:
-            self.show(marks=marks)
+            ends = [mark for mark in marks if mark.kind == SCALE]  # a third place begins another one
+            dropped = ends[:2] if len(ends) > 2 else []
+            self._take_marks(tuple(mark for mark in marks if mark not in dropped))
+
+    def _take_marks(self, marks: tuple[Mark, ...]) -> None:
+        """Take marks as a step that can be undone."""
+        self.steps.keep(marks)
+        self._show_marks()
+
+    def _undo(self, *, back: bool) -> None:
+        self.steps.go(back=back)
+        self._show_marks()
+
+    def _show_marks(self) -> None:
+        before, marks = self.view.marks, self.steps.now
+        self.show(marks=marks)
+        if probe_marks(before) != probe_marks(marks) or self._scale != self._scale_read:
             self._read_curves()
+        self._offer()
 
     def _read_curves(self) -> None:
-        self.curves.colours = self.marks.colours
-        view = self.view
+        view, curves = self.view, self.curves
+        curves.colours, self._scale_read = self.marks.colours, self._scale
+        curves.along, curves.beside, curves.stated = view.along, view.beside, view.channel_settings(self._base)
         measure = view.measure if view.measure != MEASURES[0] else None
-        self.curves.read(self.result, view.marks, self._gauge, measure, lambda: self.curves.point(self.view.frame))
+
+        def shown() -> None:
+            self._offer()
+            curves.point(self.view.frame)
+
+        curves.read(self.result, view.marks, self._gauge, shown, measure=measure, scale=self._scale)
+
+    def _state(self) -> None:
+        """Take what is stated of the channels, and what is drawn of them."""
+        view, curves = self.view, self.curves
+        if (curves.histories is None) == bool(view.channels):
+            self._read_curves()
+            return
+        stated = view.channel_settings(self._base)
+        curves.along, curves.beside = view.along, view.beside
+        if stated != curves.stated:
+            curves.stated = stated
+            curves.combine()
+        self._offer()
+        curves.draw()
+        curves.point(view.frame)
+
+    def _drag(self, event: Any) -> None:
+        """Move the channels along the time with the pointer; their offset is stated where it lets go."""
+        if not self.parts.drag.active or event.x is None:
+            return
+        if isinstance(event, PanStart):
+            self.curves.grab(event.x)
+        offset = self.curves.drag(event.x)
+        if offset is None:
+            return
+        self.parts.drag.label = f"Offset {offset:.6g} s"
+        if isinstance(event, PanEnd):
+            self.parts.of["clock"].value, self.parts.of["offset"].value = "offset", float(f"{offset:.9g}")
+
+    def _write(self) -> None:
+        """Write the chosen sections into a TEST.toml, which must be confirmed where it exists."""
+        p, view = self.parts, self.view
+        draft = Draft.of_result(self.result, Path(p.file.value))
+        measure = view.measure if view.measure != MEASURES[0] else None
+        made = probes(view.marks, self._gauge, probes_of(self.result), measure)
+        ready: dict[str, Callable[[], dict[str, Any]]] = {
+            "probes": lambda: probe_section(draft, made),
+            "channels": lambda: channel_section(draft, view.channel_settings(self._base)),
+            "scale": lambda: scale_section(draft, self._scale),
+        }
+        names = [WRITTEN[at] for at in sorted(p.what.active)]
+        if not names:
+            raise InputError(f"choose what is written: {', '.join(WRITTEN)}")
+        draft = draft.changed({name: ready[name]() for name in names})
+        draft.check()
+        sections = " and ".join(f"[{name}]" for name in names)
+        if asked := self.confirmation.question([draft.file], f"{sections} in it"):
+            p.written.text = warning(asked)
+            return
+        draft.write()
+        p.written.text = html.escape(f"{sections} of {draft.file} {'is' if len(names) == 1 else 'are'} written.")
+
+    def _take_probes(self) -> None:
+        """Set the marks of the probes that a TEST.toml states."""
+        draft = Draft.of_result(self.result, Path(self.parts.file.value))
+        stated = read_section(ProbeSettings, "probes", draft.section("probes"))
+        lengths = {length for *_, length in stated.strain_gauges}
+        if len(lengths) > 1:
+            raise InputError(f"the strain gauges of {draft.file} have different lengths; the page has one for all")
+        if lengths:
+            self.parts.of["gauge"].value = lengths.pop()
+        scale = [mark for mark in self.view.marks if mark.kind == SCALE]
+        self._take_marks((*marks_of(stated), *scale))
+        self.parts.written.text = f"{len(stated.places)} probes are read from {html.escape(str(draft.file))}."
 
     @property
     def _lines(self) -> dict[str, tuple[float, ...]]:
@@ -434,13 +612,15 @@ class ResultPage:
     def _save(self) -> None:
         if self.curves.reading:
             self.parts.message.text = "The curves are still being read: save them once they are drawn."
-        elif self.curves.histories is None:
+        elif self.curves.histories is None or not self.curves.histories.quantities:
             self.parts.message.text = "There is no curve yet: set a mark on the field first."
         else:
             self.state.csv = as_csv(self.curves.histories)
 
     def _jump(self, event: Any) -> None:
         """Go to the frame that was clicked in the time line or among the curves."""
+        if event.x is None:
+            return
         clocks = {self.curves.plot: self.curves.frame, self.line.wave: self.line.frame}
         frame = clocks[event.model](event.x) if event.model in clocks else event.x
         self.parts.frame.value = min(max(round(float(frame)), 0), len(self.result) - 1)

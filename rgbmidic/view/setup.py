@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Callable
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +20,24 @@ from rgbmidic.lab.inspection import Inspection
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.report.style import colour_range
+from rgbmidic.results.files import write_complete
 from rgbmidic.settings import RegionSettings, TestSettings, read_section
 from rgbmidic.view.canvas import Canvas, Tiles
-from rgbmidic.view.draft import HOLES, OUTLINES, Draft, RegionDrawing, marks_of
+from rgbmidic.view.draft import (
+    HOLES,
+    MASK,
+    OUTLINES,
+    Confirmation,
+    Draft,
+    marks_of,
+    mask_images,
+    masks_of,
+    region_of,
+)
 from rgbmidic.view.fields import Background, every, guarded, warning
 from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, Overlay, paint, palette
-from rgbmidic.view.setup_panel import RAW, DraftFrames, Run, SetupControls, pictures, side_by_side
+from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, pictures, side_by_side
 
 __all__ = ["SetupPage"]
 
@@ -36,8 +49,9 @@ _EXPECTED = "expected uncertainty"
 _GLARE = np.uint32(0xFF2030FF)
 _HELP = (
     "1. Choose a shape and click on the frame: Rectangle (two opposite corners), Polygon, Circle (centre, then "
-    "a place on it); holes likewise. Marks can be dragged; Backspace removes a chosen one.<br>2. Choose the element "
-    "size.<br>3. <b>Inspect</b> shows what uncertainty to expect.<br>4. Write the file, and run it."
+    "a place on it); holes and lamp masks (polygons where a light does not count) likewise, Next begins another. Marks "
+    "can be dragged; Backspace removes a chosen one; Ctrl-Z undoes.<br>2. Choose the element size.<br>"
+    "3. <b>Inspect</b> shows what uncertainty to expect.<br>4. Write the file, and run it."
 )
 
 
@@ -61,17 +75,20 @@ class SetupPage:
         self.source = DraftFrames.of(draft)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
-        self._inspected = 0
+        self._inspected, self._opened = 0, draft.file if draft.is_file else None
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.state = SharedState(name="state", asked=reference, shown=reference)
         self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
         self.tiles, self._reader = Tiles(), Background(document)
         rows, columns = self.source.shape
-        self.canvas = Canvas(document, (*OUTLINES, *HOLES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
+        kinds = (*OUTLINES, *HOLES, MASK)
+        self.canvas = Canvas(document, kinds, (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
         self._edges, thin = ColumnDataSource({"xs": [], "ys": []}), {"line_width": 0.7, "line_alpha": 0.7}
         self.canvas.plot.multi_line("xs", "ys", source=self._edges, line_color="#ffd166", **thin)
         marks = () if draft.region is None else marks_of(draft.region)
         self.drawing = RegionDrawing(document, self.canvas, marks, self._remesh)
+        self.confirmation = Confirmation()
+        self._offer_lights()
         self._listen()
 
     @property
@@ -86,9 +103,11 @@ class SetupPage:
         for model, key in ((self.state, "asked"), (p.picture, "value"), (p.glare, "active")):
             model.on_change(key, lambda attr, old, new: self.show())
         p.size.on_change("value", lambda attr, old, new: self._remesh())
+        p.light.on_change("value", lambda attr, old, new: self._choose_light())
         p.calibration.on_change("value", lambda attr, old, new: self._guarded(self._reopen))
         for button, act in (
-            (p.undo, self.drawing.undo), (p.next, self.drawing.next_hole), (p.clear, self.drawing.clear),
+            (p.undo, partial(self.drawing.go, back=True)), (p.redo, partial(self.drawing.go, back=False)),
+            (p.next, self.drawing.next_hole), (p.clear, self.drawing.clear),
             (p.inspect, self._inspect), (p.write, self._write), (p.go, self._run),
         ):  # fmt: skip
             button.on_click(partial(self._guarded, act))
@@ -106,7 +125,7 @@ class SetupPage:
     def _complain(self, text: str) -> None:
         self.parts.message.text = warning(text)
 
-    def _guarded(self, act: Callable[[], None]) -> None:
+    def _guarded(self, act: Callable[[], object]) -> None:
         guarded(act, self._complain)
 
     def show(self) -> None:
@@ -152,7 +171,7 @@ class SetupPage:
         self._guarded(self._make_mesh)
 
     def _make_mesh(self) -> None:
-        content = self.drawing.region
+        content = region_of(self.drawing.marks)
         if self.draft.section("mesh").get("file"):
             mesh = self._of_file()[0]
         elif content is None or not self.parts.size.value:
@@ -167,7 +186,7 @@ class SetupPage:
 
     def _of_file(self) -> tuple[Tri3Mesh, Region]:
         """Place the mesh of ``mesh.file`` by its points; what is drawn restricts it."""
-        document = {**self.draft.document, "region": self.drawing.region or self.draft.section("region")}
+        document = {**self.draft.document, "region": region_of(self.drawing.marks) or self.draft.section("region")}
         settings = TestSettings.from_mapping(document, self.draft.file.parent)
         _, _, mesh, region = finite_elements_of(settings, self.source.shape)
         return mesh, region
@@ -177,7 +196,7 @@ class SetupPage:
 
     def _inspect(self) -> None:
         """Inspect the frame in view as `rgbmidic inspect` does, in another thread."""
-        content, size = self.drawing.region, float(self.parts.size.value)
+        content, size = region_of(self.drawing.marks), float(self.parts.size.value)
         if self.draft.section("mesh").get("file"):
             mesh, region = self._of_file()
             size = mesh.size
@@ -208,7 +227,7 @@ class SetupPage:
 
     def _changed(self) -> Draft:
         """Return the draft with the values of all controls."""
-        p, content, end = self.parts, self.drawing.region, len(self.source.series) - 1
+        p, content, end = self.parts, region_of(self.drawing.marks), len(self.source.series) - 1
         frames: dict[str, Any] = {"first": int(p.first.value) or None}
         frames["last"] = None if int(p.last.value) == end else int(p.last.value)
         if int(p.reference.value) != self.draft.frames.reference[0]:
@@ -228,20 +247,50 @@ class SetupPage:
         other = draft.section("calibration") != self.draft.section("calibration")
         self.draft, self.source = draft, DraftFrames.of(draft)
         if other:
+            self._offer_lights()
             self._remesh()
         self.show()
 
-    def _write(self) -> None:
+    def _offer_lights(self) -> None:
+        """Offer the lights for masks."""
+        self.parts.light.options = list(self.source.lights)
+        self.parts.light.value = next(iter(self.source.lights), "")
+        self._choose_light()
+
+    def _choose_light(self) -> None:
+        """Let masks that are drawn from now on be of the light chosen, each of its own."""
+        self.drawing.light = self.parts.light.value
+        self.drawing.next_hole()
+
+    def _write(self) -> bool:
+        """Write TEST.toml and the masks of the lights, unless other files than the one opened must be confirmed."""
         self._reopen()
-        self.draft = self.draft.at(Path(self.parts.file.value))
-        self.draft.write()
-        self.parts.message.text = f"{html.escape(str(self.draft.file))} is written."
+        draft, pictures = self.draft.at(Path(self.parts.file.value)), dict[Path, bytes]()
+        if masks := masks_of(self.drawing.marks):
+            lights, stem = self.source.lights, draft.file.stem
+            names = [f"{stem}_mask_{re.sub(r'[^A-Za-z0-9]+', '_', light)}.png" for light in lights]
+            images = mask_images(masks, lights, self.source.shape)
+            pictures = {draft.file.parent / name: image for name, image in zip(names, images, strict=True)}
+            draft = draft.changed({"weights": {"method": "images", "images": names}})
+        draft.check()
+        files = [*pictures, *([draft.file] if draft.file != self._opened else [])]
+        if asked := self.confirmation.question(files, "it" if len(files) == 1 else "them"):
+            self.parts.message.text = warning(asked)
+            return False
+        for file, content in pictures.items():
+            write_complete(file, methodcaller("write", content))
+        draft.write()
+        self.draft, self._opened = draft, draft.file
+        written = html.escape(", ".join(map(str, (draft.file, *pictures))))
+        self.parts.message.text = f"{written} {'are' if pictures else 'is'} written."
+        return True
 
     def _run(self) -> None:
         if self.runs and self.runs[-1].going:
             self.parts.message.text = "The run still goes on."
             return
-        self._write()
+        if not self._write():
+            return
         self.runs.append(Run.start(self.draft.file, Path(self.parts.out.value)))
 
     def _tick(self) -> None:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -19,7 +19,9 @@ from typing import IO, Any, Self
 import bokeh.models as bk
 import numpy as np
 import numpy.typing as npt
+from bokeh.document import Document
 from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource
 
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.frames.series import FrameSeries, open_series
@@ -27,13 +29,16 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.inspection import Inspection, inspect_frame
 from rgbmidic.mesh import Region
 from rgbmidic.report import write_movie
+from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Maps, Result
 from rgbmidic.settings import ELEMENT_SIZE
-from rgbmidic.view.draft import Draft
+from rgbmidic.view.address import Mark, Steps
+from rgbmidic.view.canvas import Canvas, columns
+from rgbmidic.view.draft import HOLES, MASK, Draft, arranged, masks_of, rings
 from rgbmidic.view.models import Controls
 from rgbmidic.view.picture import Picture, RawPictures, grey_picture, stretched
 
-__all__ = ["RAW", "DraftFrames", "Movie", "Run", "SetupControls", "pictures", "side_by_side"]
+__all__ = ["RAW", "DraftFrames", "Movie", "RegionDrawing", "Run", "SetupControls", "pictures", "side_by_side"]
 
 RAW = "raw frame"
 
@@ -84,6 +89,16 @@ class DraftFrames:
             calibration = calibration.cropped(draft.frames.crop_origin, shape)
         return cls(series=series, calibration=calibration, shape=shape)
 
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the lights as the calibration has them, else as the run names those of monochrome frames."""
+        known = self.calibration or Calibration()
+        for part in (known.crosstalk, known.registration):
+            if part is not None:
+                return tuple(part.lights)
+        count = max(self.series.turn, len(self.series.lights))
+        return ("light",) if count == 1 else tuple(f"light {number + 1}" for number in range(count))
+
     def raw(self, index: int) -> tuple[Picture, npt.NDArray[np.bool_]]:
         """Read a raw frame as a picture (H, W), and where a channel is saturated (H, W)."""
         frame = self.series.read(index)[0]
@@ -114,6 +129,98 @@ def side_by_side(inspection: Inspection, named: dict[str, Picture], raw: Picture
     lights = len(inspection.images.names)
     pairs = [(RAW, raw), *((name.replace("reflection index", "index"), picture) for name, picture in named.items())]
     return [dict(row) for row in (pairs[: lights + 1], pairs[lights + 1 :]) if row]
+
+
+_SOON = 60
+"""Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
+_COLOURS = list(OKABE_ITO.values())
+"""Of the masks; the first two are those of holes and outline."""
+
+
+class RegionDrawing:
+    """Marks of the region on a canvas, which can be undone, and the lines that they make.
+
+    Parameters
+    ----------
+    document
+        Document of the page.
+    canvas
+        Plot on which they are set and drawn.
+    marks
+        Marks at first.
+    changed
+        Called when they have changed.
+
+    Attributes
+    ----------
+    light
+        Name of the light of which masks are drawn from now on.
+    """
+
+    def __init__(
+        self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], changed: Callable[[], None]
+    ) -> None:
+        self._document, self._canvas, self._changed = document, canvas, changed
+        self.light = ""
+        self._steps, self._hole, self._coming = Steps(marks), 1, False
+        self._rings = ColumnDataSource(columns("xs ys colour"), name="rings")
+        canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
+        canvas.marks.on_change("data", lambda attr, old, new: self._marked())
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The marks."""
+        return self._steps.now
+
+    def go(self, *, back: bool) -> None:
+        """Return to the marks before the last step, or do it again."""
+        self._steps.go(back=back)
+        self.draw()
+
+    def clear(self) -> None:
+        """Remove all marks."""
+        self._keep(())
+
+    def next_hole(self) -> None:
+        """Let the marks of a hole or a mask that are set from now on belong to another one."""
+        numbers = [mark.kind.split(" ")[1] for mark in self.marks if mark.kind.startswith(("hole ", MASK))]
+        self._hole = max(map(int, numbers), default=0) + 1
+
+    def draw(self) -> None:
+        """Draw the marks and the lines."""
+        self._coming = False
+        self._canvas.place(self.marks)
+        outline, holes = rings(self.marks)
+        masks = [(ring, _COLOURS[(at + 2) % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
+        closed = [[*ring, *ring[:1]] for ring in (outline, *holes, *(ring for ring, _ in masks))]
+        self._rings.data = {
+            "xs": [[x for x, _ in ring] for ring in closed],
+            "ys": [[y for _, y in ring] for ring in closed],
+            "colour": ["#56b4e9", *["#e69f00"] * len(holes), *(colour for _, colour in masks)],
+        }
+        self._changed()
+
+    def _marked(self) -> None:
+        """Take the marks as they are on the plot; a new mark of a hole gets the number of its hole.
+
+        A polygon's number is that of the present hole; a round hole is complete with two marks.
+        """
+        before, now = self.marks, list[Mark]()
+        for mark in self._canvas.set:
+            kind, number = mark.kind, self._hole
+            if kind == "round hole":
+                number = 1 + sum(other.kind.startswith("round hole ") for other in now) // HOLES["round hole"]
+            kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
+            now.append(Mark(kind, mark.x, mark.y))
+        if tuple(self._canvas.set) != before:
+            new = next((mark.kind for mark in self._canvas.set if mark not in before), "")
+            self._keep(arranged(now, new))
+
+    def _keep(self, marks: tuple[Mark, ...]) -> None:
+        self._steps.keep(marks)
+        if not self._coming:
+            self._coming = True
+            self._document.add_timeout_callback(self.draw, _SOON)
 
 
 class SetupControls(Controls):
@@ -148,10 +255,12 @@ class SetupControls(Controls):
         self.glare = bk.Checkbox(label="mark saturated samples", active=True, **self.small)
         shapes = ["Move", "Rectangle", "Polygon", "Circle"]
         self.mode = bk.RadioButtonGroup(labels=shapes, active=0, name="mode", **wide)
-        self.hole = bk.RadioButtonGroup(labels=["Hole", "Round hole"], active=None, name="hole", **wide)
-        self.undo, self.next, self.clear, self.inspect, self.write = (
-            bk.Button(label=name, **wide) for name in ("Undo", "Next hole", "Clear", "Inspect", "Write TEST.toml")
+        self.hole = bk.RadioButtonGroup(labels=["Hole", "Round hole", "Lamp mask"], active=None, name="hole", **wide)
+        labels = ("Undo", "Redo", "Next", "Clear", "Inspect", "Write TEST.toml")
+        self.undo, self.redo, self.next, self.clear, self.inspect, self.write = (
+            bk.Button(label=name, name=name.lower(), **wide) for name in labels
         )
+        self.light = bk.Select(title="Masks are of", name="light", **wide)
         self.size = bk.Spinner(title="Element size (px)", name="size", low=4, value=size, step=1, **wide)
         self.reference = bk.Spinner(title="Reference", name="reference", value=reference, **number)
         self.first = bk.Spinner(title="First", name="first", value=frames.first, **number)
@@ -162,8 +271,9 @@ class SetupControls(Controls):
         self.go = bk.Button(label="Run", button_type="primary", **wide)
         self.ran = bk.Div(name="ran", **wide)
         line = partial(row, sizing_mode="stretch_width")
-        buttons, numbers = line(self.undo, self.next, self.clear), line(self.reference, self.first, self.last)
-        shown = (self.description, self.picture, self.glare, self.mode, self.hole, buttons, self.size, numbers)
+        buttons = line(self.undo, self.redo, self.next, self.clear)
+        sizes, numbers = line(self.light, self.size), line(self.reference, self.first, self.last)
+        shown = (self.description, self.picture, self.glare, self.mode, self.hole, buttons, sizes, numbers)
         self.side = column(*shown, self.calibration, self.inspect, self.theme, sizing_mode="stretch_width")
 
 

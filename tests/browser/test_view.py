@@ -141,12 +141,13 @@ CUT = """(() => {
 def test_no_control_is_cut_off(driver, address, size, theme):
     driver.set_window_size(*size)
     driver.set_window_size(size[0], 2 * size[1] - driver.execute_script("return innerHeight"))
-    page = Page(driver, f"{address}?theme={theme}&range=hand&low=-1&high=1&second=uncertainty&frame=3")
+    more = "range=hand&low=-1&high=1&second=uncertainty&frame=3&clock=correlation"
+    page = Page(driver, f"{address}?theme={theme}&{more}")
     page.until("model('low').visible && model('plot_2') !== null")
-    for name in ("step", "over", "section"):
+    for name in ("step", "over", "section", "scale", "what"):
         assert page.run(f"Bokeh.index.get_one(model('{name}')).el.getAttribute('aria-label')")
     assert driver.execute_script("return [innerWidth, innerHeight]") == list(size)
-    for section in range(5):
+    for section in range(7):
         page.keys(str(section + 1))
         page.until(f"model('section').active === {section}")
         time.sleep(0.3)

@@ -326,6 +326,7 @@ BUILT: dict[str, Any] = {
         measure="biot",
         window=7,
         rigid_motion="remove",
+        names=(("gauge_1", "left grip"),),
     ),
     "channels": ChannelSettings(file=Path("daq.csv"), offset=0.5, area=20, force="load_N"),
     "channels of a trigger": ChannelSettings(file=Path("daq.csv"), trigger="ttl"),

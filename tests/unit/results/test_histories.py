@@ -15,7 +15,7 @@ from results import MESH, NODES, make_origin
 
 from rgbmidic import cli
 from rgbmidic.command import execute
-from rgbmidic.errors import InputError
+from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import history_figure
 from rgbmidic.results import (
@@ -433,3 +433,27 @@ def history_csv_text(histories: Histories) -> str:
 def test_factors_without_millimetres_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"need the scale of the image: state mm_per_pixel or camera in \[scale\]"):
         read_histories(cracked(tmp_path / "a", None), ProbeSettings(tips=((100, 100, 30, 90),), **MATERIAL))
+
+
+def test_names_of_probes_are_those_of_columns_and_figures(result: Result, tmp_path: Path) -> None:
+    places: dict[str, Any] = {"points": (PLACE, (60, 40)), "gauges": ((30, 30, 90, 30),)}
+    named = ProbeSettings(**places, names=(("point_2", "left grip"), ("gauge_1", "span-2")))
+    plain, read = read_histories(result, ProbeSettings(**places)), read_histories(result, named)
+    names = [one.name.replace("left grip_", "point_2_").replace("span-2_", "gauge_1_") for one in read.quantities]
+    assert names == [one.name for one in plain.quantities]
+    np.testing.assert_array_equal(read["left grip_u"].values, plain["point_2_u"].values)
+    assert read["span-2_extension"].column == "span-2_extension_mm"
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        ([["point_3", "a"]], 'unknown probe "point_3" in probes.names'),
+        ([["point_1", "a_b"]], 'not "a_b"'),
+        ([["point_1", "a"], ["point_2", "a"]], "must be different"),
+        ([["point_1", ""]], "must be different"),
+    ],
+)
+def test_names_that_make_no_column_are_refused(names: list[list[str]], told: str) -> None:
+    with pytest.raises(ConfigurationError, match=told):
+        ProbeSettings(points=((1, 2), (3, 4)), names=names)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import parse_qs
 
@@ -16,13 +17,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record, smooth_record
 
+from rgbmidic import CameraCalibration
 from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import FrameRecord, Maps, MapValues, Result, ResultStore
 from rgbmidic.results.histories import read_histories, write_histories
-from rgbmidic.settings import ProbeSettings, TestSettings
+from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.view import curves
-from rgbmidic.view.address import KINDS, PALETTES, UNCERTAINTY, Mark, ViewState
+from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
 from rgbmidic.view.canvas import arrow_lines, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.fields import frame_text, pointer_text, probe_text, range_of_test, robust_range, watched
@@ -30,8 +32,16 @@ from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, palette_name
 
 NAMES = ("u", "v", "e1")
+
+
+def replace_name(mark, name):
+    return replace(mark, name=name if len(name) % 2 else "")
+
+
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
-marks = st.lists(st.builds(Mark, st.sampled_from(list(KINDS)), numbers, numbers), max_size=4).map(tuple)
+marks = st.lists(st.builds(Mark, st.sampled_from(MARKS), numbers, numbers), max_size=4).map(tuple)
+names = st.sets(st.from_regex(PROBE_NAME, fullmatch=True), min_size=4, max_size=4)
+named = st.builds(lambda marks, names: tuple(map(replace_name, marks, names)), marks, names)
 looks = st.builds(
     ViewState,
     frame=st.integers(0, 9),
@@ -50,7 +60,10 @@ looks = st.builds(
     rate_window=st.integers(0, 99),
     curve=st.text("abc ()/²", max_size=9),
     theme=st.sampled_from(["", "light", "dark"]),
-    marks=marks,
+    channels=st.text("abc /.ä", max_size=9),
+    clock=st.sampled_from(CLOCKS),
+    offset=st.floats(-1e9, 1e9),
+    marks=named,
 )
 
 
@@ -79,7 +92,83 @@ def test_an_address_of_nonsense_opens_something_that_can_be_shown(query):
     assert -1 <= view.since < 10
     assert view.levels >= 2
     assert view.rate_window >= 0
-    assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in KINDS for mark in view.marks)
+    assert all(np.isfinite([mark.x, mark.y]).all() and mark.kind in MARKS for mark in view.marks)
+
+
+@given(st.lists(marks, max_size=6))
+@settings(max_examples=30)
+def test_every_step_is_undone_and_done_again(states):
+    steps = Steps(())
+    for state in states:
+        steps.keep(state)
+    back = [steps.now]
+    while (state := steps.go(back=True)) != back[-1] or len(back) <= len(states):
+        back.append(state)
+        if len(back) > len(states) + 1:
+            break
+    assert steps.now == ()
+    for _ in back:
+        steps.go(back=False)
+    assert steps.now == (states[-1] if states else ())
+
+
+def test_the_moves_of_a_drag_are_one_step_and_those_of_another_mark_another():
+    one, two = Mark("point", 1, 1), Mark("point", 9, 9)
+    steps = Steps((one, two))
+    for x in (2, 3, 4):
+        steps.keep((replace(one, x=x), two))
+    steps.keep((replace(one, x=4), replace(two, y=5)))
+    assert steps.go(back=True) == (replace(one, x=4), two)
+    assert steps.go(back=True) == (one, two)
+    steps.keep((one,))
+    assert steps.go(back=False) == (one,)
+
+
+@given(named, st.floats(1, 99))
+@settings(max_examples=20)
+def test_marks_of_the_probes_that_marks_make_make_the_same(set_, gauge):
+    made = curves.probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
+    assert curves.probes(curves.marks_of(made), gauge, ProbeSettings()) == made
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"offset": -1.23456789012e-3, "area": 20.0},
+        {"trigger": "ttl_V", "force": "a_N"},
+        {"align": ("a", "gauge_1_strain")},
+        {},
+    ],
+)
+def test_channels_that_are_stated_are_those_of_the_address(stated):
+    channels = ChannelSettings(file=Path("/x/daq.csv"), **stated)
+    view = ViewState().with_channels(channels)
+    assert opened(view.query()).channel_settings(Path("/y")) == channels
+    assert ViewState(channels="b.csv").with_channels(channels).channels == "b.csv"
+    assert ViewState(channels="b.csv", area=-1.0).channel_settings(Path("/y")).area is None
+
+
+def test_a_thinned_curve_keeps_its_peaks():
+    x, y = np.arange(100_000.0), np.zeros(100_000)
+    y[[777, 50_001]] = 5, -3
+    thin = curves._thinned(x, y)
+    assert len(thin[0]) <= 3000
+    assert (x[y.argmax()], x[y.argmin()]) == (thin[0][thin[1].argmax()], thin[0][thin[1].argmin()])
+
+
+def test_channels_off_the_frames_are_shown_where_they_are_and_told(tmp_path):
+    result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
+    (tmp_path / "daq.csv").write_text("time_s,a_N\n" + "".join(f"{5 + n},{n}\n" for n in range(9)), encoding="utf-8")
+    page = ResultPage(Document(), result, ViewState(channels="daq.csv", beside="a_N"), Progress(4))
+    page._read_curves()
+    assert "span 5 to 13 s" in page.parts.told.text
+    assert list(page.curves._recorded.data["ys"][0]) == list(range(9))
+    page.parts.of["offset"].value = -5.0
+    assert "has no value in" not in page.parts.told.text
+    page.parts.of["area"].value = 2.0
+    np.testing.assert_allclose(page.curves.histories["stress"].values, 0.5 * 2e-5 * np.arange(4), atol=1e-15)
+    page._save()
+    assert page.state.csv.splitlines()[0] == "frame,number,status,time_s,a_N,stress_MPa"
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +340,7 @@ def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(tmp_
     result = make_result(tmp_path / "result", frames=4, record=smooth_record)
     set_ = [Mark("point", 50, 40), Mark("gauge", 30, 30), Mark("gauge", 90, 30), Mark("point", 60, 40)]
     histories = curves.read(result, set_, 60.0)
-    groups = {name: [told.name for told in own] for name, own in curves.groups(histories).items()}
+    groups = {name: [told.name for told in own] for name, own in curves.groups(histories, probe_marks(set_)).items()}
     assert groups["u (px)"] == ["point_1_u", "point_2_u"]
     assert groups["extension (px)"] == ["gauge_1_extension"]
     write_histories(histories, tmp_path / "own.csv")
@@ -302,7 +391,7 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(5))
     for index in (0, 1, 4):
         store.write_frame(index, smooth_record(index))
-    panel = CurvePanel(Document(), chosen="", select=Select(), message=Div(), hint="")
+    panel = CurvePanel(Document(), chosen="", select=Select(), message=Div(), told=Div(), hint="")
     panel.histories = curves.read(Result.open(store.path, partial=True), [Mark("point", 50, 40)], 60.0)
     shown = []
     for frame in range(5):
@@ -464,6 +553,23 @@ def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
     assert summary.endswith("… more")
     assert summary.rpartition("<b")[2].count("this and that") < 5
     assert rest.count("this and that") > 15
+
+
+def test_a_camera_s_plane_is_that_of_the_page_and_a_wrong_file_changes_nothing(tmp_path):
+    made = make_result(tmp_path / "result", record=smooth_record)
+    CameraCalibration(shape=(80, 120), homography=np.diag([0.5, 0.5, 1])).write(tmp_path / "camera.json")
+    page = ResultPage(Document(), made, ViewState(frame=1), Progress(2))
+    page.show()
+    before = page.values.values
+    page.parts.of["camera"].value = "camera.json"
+    assert page.canvas.plot.title.text == "u (mm)"
+    assert ("u", "u (mm)") in [tuple(pair) for group in page.parts.of["field"].options.values() for pair in group]
+    np.testing.assert_allclose(page.values.values, 0.5 * before, atol=1e-9)
+    page.parts.of["camera"].value = "none.json"
+    assert "none.json" in page.parts.scaled.text
+    assert page.canvas.plot.title.text == "u (mm)"
+    page.parts.of["camera"].value = ""
+    assert page.canvas.plot.title.text == "u (px)"
 
 
 def test_a_page_whose_browser_has_gone_is_not_watched():

@@ -9,9 +9,19 @@ import pytest
 
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
-from rgbmidic.settings import RegionSettings, read_section, read_test
+from rgbmidic.settings import ProbeSettings, RegionSettings, ScaleSettings, read_section, read_test
 from rgbmidic.view.address import Mark
-from rgbmidic.view.draft import Draft, arranged, marks_of, region_of
+from rgbmidic.view.draft import (
+    Confirmation,
+    Draft,
+    arranged,
+    marks_of,
+    mask_images,
+    masks_of,
+    probe_section,
+    region_of,
+    scale_section,
+)
 
 TEXT = """# a test of the plate
 [frames]  # as recorded
@@ -105,3 +115,52 @@ def test_there_is_one_outline_of_the_kind_drawn_last():
     assert arranged(corners, "rectangle") == corners
     assert arranged((*corners, Mark("rectangle", 20, 20)), "rectangle") == (first[2], Mark("rectangle", 20, 20))
     assert region_of(first) is None
+
+
+def test_probes_written_leave_those_that_the_page_cannot_set(tmp_path):
+    file = tmp_path / "TEST.toml"
+    probes = (
+        '[probes]\nwindow = 9 # short\ncracks = [1, 2, 3, 4]\nnames = [["crack_1", "notch"]]\nlines = [1, 2, 3, 4]\n'
+    )
+    file.write_text(TEXT + probes, encoding="utf-8")
+    draft = Draft.of(file)
+    made = ProbeSettings(points=((1.23456, 2),), names=(("point_1", "tip"),))
+    draft.changed({"probes": probe_section(draft, made)}).write()
+    stated = read_test(file).probes
+    assert stated.points == ((1.235, 2),)
+    assert stated.lines == ()
+    assert stated.cracks == ((1, 2, 3, 4),)
+    assert stated.names == (("crack_1", "notch"), ("point_1", "tip"))
+    assert "window = 9 # short" in file.read_text(encoding="utf-8")
+
+
+def test_a_scale_or_camera_replaces_the_other_and_keeps_the_frame_rate(tmp_path):
+    file = tmp_path / "TEST.toml"
+    file.write_text(TEXT + '[scale]\ncamera = "camera.json"\nframe_rate = 1e4\n', encoding="utf-8")
+    draft = Draft.of(file)
+    scale = scale_section(draft, ScaleSettings(mm_per_pixel=0.12345678, mm_per_pixel_std=0.00123))
+    assert read_section(ScaleSettings, "scale", draft.changed({"scale": scale}).section("scale")) == ScaleSettings(
+        mm_per_pixel=0.123457, mm_per_pixel_std=0.0012, frame_rate=1e4
+    )
+    other = scale_section(draft, ScaleSettings(camera=tmp_path / "b.json"))
+    assert draft.changed({"scale": other}).section("scale") == {"camera": "b.json", "frame_rate": 1e4}
+    with pytest.raises(ConfigurationError, match="set two points"):
+        scale_section(draft, None)
+
+
+def test_what_exists_is_asked_for_again_when_it_changes(tmp_path):
+    file, confirmation = tmp_path / "a", Confirmation()
+    assert confirmation.question([file], "it") == ""
+    file.touch()
+    assert "press again to replace it" in confirmation.question([file], "it")
+    assert "press again to replace more" in confirmation.question([file], "more")
+    assert confirmation.question([file], "more") == ""
+    assert "press again" in confirmation.question([file], "more")
+
+
+def test_masks_of_a_light_that_there_is_not_are_refused():
+    marks = [Mark("mask 1 red", 2, 2), Mark("mask 1 red", 8, 2), Mark("mask 1 red", 8, 8), Mark("mask 2 blue", 1, 1)]
+    assert masks_of(marks) == {"red": [[[2, 2], [8, 2], [8, 8]]]}
+    assert region_of([Mark("rectangle", 0, 0), Mark("rectangle", 9, 9), *marks]) == {"rectangle": [0, 0, 9, 9]}
+    with pytest.raises(ConfigurationError, match="mask of red, but the lights are green, blue"):
+        mask_images(masks_of(marks), ("green", "blue"), (10, 10))
