@@ -268,7 +268,7 @@ class CurvePanel:
         wheel, hover = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False)
         self.pan = bk.PanTool()
         tools = [self.pan, wheel, bk.BoxZoomTool(), bk.ResetTool(), hover]
-        plot = plain_plot(tools=tools, title="Curves", toolbar_location="above")
+        plot = plain_plot(tools=tools, title="Curves", toolbar_location="above", name="curves_plot")
         plot.toolbar.logo, plot.toolbar.active_scroll, plot.toolbar.active_drag = None, wheel, self.pan
         plot.patches("xs", "ys", source=self._bands, fill_color="colour", fill_alpha=0.25, line_alpha=0)
         style = {"line_color": "colour", "line_width": 1.5, "legend_field": "name"}

@@ -14,7 +14,7 @@ from frames import noisy_mosaic
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames import write_dng, write_tiff
-from rgbmidic.frames.describe import describe, save_frame
+from rgbmidic.frames.series import describe, save_frame
 from rgbmidic.settings import FrameSettings
 
 KEYS = [
