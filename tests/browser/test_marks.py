@@ -146,7 +146,7 @@ def test_channels_are_dragged_triggered_correlated_and_make_stress_over_strain(d
         page.until("model('curves_plot').below[0].axis_label === 'time (ms)'")
         page.do("model('drag').active = true")
         page.until("model('curves_plot').inner_width > 50")
-        page.pointer(("press", 1.8, 0.6), ("move", 1.2, 0.6), ("release", 0.6, 0.6), plot="curves")
+        page.pointer(("press", 1.8, 0.6), ("move", 1.2, 0.6), ("release", 0.6, 0.6), plot="curves_plot")
         page.until("model('offset').value < -0.001")
         offset = page.run("model('offset').value")
         assert offset == pytest.approx(-1.2e-3, abs=2e-5)  # a pixel of the screen is 8 us
