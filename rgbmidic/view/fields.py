@@ -16,13 +16,11 @@ from bokeh.document import Document
 
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.fields import Mean, make_probe
-from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import spread
 from rgbmidic.report.style import colour_range, ordinary_values, time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Result
-from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.picture import Picture, element_at, grey_picture
+from rgbmidic.view.picture import Picture, RawPictures, element_at
 
 __all__ = [
     "Background",
@@ -99,13 +97,7 @@ class Pictures:
 
     @cached_property
     def _read(self) -> Callable[[int], Picture]:
-        return lru_cache(_KEPT)(lambda place: grey_picture(self._series.read(self._series.chosen[place])[0]))
-
-    @cached_property
-    def _series(self) -> FrameSeries:
-        provenance = self.result.provenance
-        settings = TestSettings.from_mapping(provenance["settings"], provenance["base"])
-        return open_series(settings.frames, settings.base)
+        return lru_cache(_KEPT)(RawPictures(result=self.result))
 
 
 def warning(text: str) -> str:
