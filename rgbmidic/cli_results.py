@@ -261,6 +261,9 @@ def history(
     result = Result.open(folder, partial=partial)
     settings = read_settings(test)
     kept = probes_of(result) if settings is None else settings.probes
+    asked = sorted(key for key in ("youngs_modulus", "poissons_ratio", "plane", "terms", "fit_tip") if key in probes)
+    if asked and not (probes.get("tips") or kept.tips):
+        raise InputError(f"--{asked[0].replace('_', '-')} is of a crack's tip, and none is stated: --tip X,Y:R0,R1")
     stated: dict[str, Any] = {
         key: (*getattr(kept, key), *value) if key in _PLACES else value for key, value in probes.items()
     }
@@ -297,7 +300,10 @@ def _chosen_frames(result: Result, text: str) -> list[int] | None:
 
     if not text:
         return None
-    chosen = [frame for frame in read_range(text, "--frames") if frame < len(result) and result.finished[frame]]
+    asked = read_range(text, "--frames")
+    if asked[-1] >= len(result):
+        raise InputError(f"--frames {text}: {result.path} has frames 0 to {len(result) - 1}")
+    chosen = [frame for frame in asked if result.finished[frame]]
     if not chosen:
         raise InputError(f"--frames {text}: none of them is measured; {result.path} has frames 0 to {len(result) - 1}")
     return chosen
@@ -447,6 +453,8 @@ def compare(
 
     if rigid not in ("tell", "remove"):
         raise InputError(f'--rigid is tell or remove, not "{rigid}"')
+    if mesh is not None and fe.suffix.lower() != ".csv":
+        raise InputError(f"--mesh is for a .csv with numbers of nodes; {fe} has a mesh of its own")
     form = "X_MM,Y_MM:X_PX,Y_PX"
     pairs = [command.read_place(text, "--points", form) for text in points or ()]
     chosen, settings, result = frame_indices(frames), read_settings(test), Result.open(folder, partial=partial)

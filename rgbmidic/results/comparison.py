@@ -131,7 +131,12 @@ class Simulation:
             not rise.
         """
         path = Path(path)
-        if path.suffix.lower() == ".csv":
+        table = path.suffix.lower() == ".csv"
+        if interval is not None and not path.is_dir():
+            raise InputError(f"--interval is the time between the files of a folder, and {path} is none")
+        if field is not None and table:
+            raise InputError(f"--field names a field of a mesh file; the columns of {path} have names of their own")
+        if table:
             if mesh is None:
                 raise InputError(f"{path} has numbers of nodes only: state the mesh that they belong to (--mesh FILE)")
             values, times = _read_table(path, mesh, unit)
@@ -145,6 +150,10 @@ class Simulation:
             times = None if None in clock else np.array(clock, dtype=np.float64)
         if times is not None and not (np.diff(times) > 0).all():
             raise InputError(f"the times of the simulation {path} must rise, not {times[:5].tolist()} ...")
+        if offset and (times is None or len(times) == 1):
+            raise InputError(
+                f"--offset shifts the times of several states; {path} is one, and is compared with every frame"
+            )
         return cls(mesh=mesh, displacement=values, times=None if times is None else times + offset, name=str(path))
 
     def at(self, time: float) -> FloatArray:

@@ -513,7 +513,7 @@ def test_movie_and_profile_write_what_is_asked_for_or_nothing(command: Run, tmp_
         (("movie", result, "--out", movie, "--over", "mask"), "--over is reference or frame"),
         (("movie", result, "--out", movie, "--column", "a"), "--column and --offset are of a --curve FILE"),
         (("movie", result, "--out", movie, "--offset", "1"), "--column and --offset are of a --curve FILE"),
-        (("movie", result, "--out", movie, "--frames", "7:9"), "none of them is measured"),
+        (("movie", result, "--out", movie, "--frames", "7:9"), "has frames 0 to 5"),
         (("movie", result, "--out", movie, "--field", "w"), 'there is no field "w"'),
         (("profile", result, "--out", table, "--line", "1,2"), "--line is X0,Y0:X1,Y1"),
         (("profile", result, "--out", table, *line, "--field", "misfit"), "a field with an uncertainty"),

@@ -211,7 +211,8 @@ def states(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["simulated", "all.pvd", "table.csv"])
 def test_a_simulation_is_read_with_its_times_and_interpolated(states, name):
-    read = Simulation.read(states.parent / name, mesh=finite_elements(), interval=1e-3, offset=0.5)
+    interval = 1e-3 if name == "simulated" else None
+    read = Simulation.read(states.parent / name, mesh=finite_elements(), interval=interval, offset=0.5)
     assert read.times == pytest.approx([0.5, 0.504])
     assert read.at(0.501) == pytest.approx(stretch(), abs=1e-9)
     assert read.mesh.node_numbers.tolist() == finite_elements().node_numbers.tolist()
@@ -349,6 +350,10 @@ def option(*words: str) -> Callable[[list[str]], None]:
         (option("--fe", "{}/../table.csv"), "state the mesh that they belong to (--mesh FILE)"),
         (option("--offset", "7"), "state the --offset between both clocks"),
         (option("--unit", "yard"), "yard"),
+        (option("--interval", "1"), "--interval is the time between the files of a folder"),
+        (option("--fe", "{}/step_4.vtu", "--offset", "7"), "--offset shifts the times of several states"),
+        (option("--mesh", "{}/step_4.vtu"), "--mesh is for a .csv with numbers of nodes"),
+        (option("--fe", "{}/../table.csv", "--field", "U"), "--field names a field of a mesh file"),
     ],
 )
 def test_what_cannot_be_compared_is_refused_in_a_line_and_nothing_is_written(tmp_path, states, capsys, change, message):

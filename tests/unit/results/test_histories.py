@@ -292,6 +292,7 @@ def command(*arguments: object) -> int:
         (["--window", "3"], "probes.window must be 0 or at least 4 frames, not 3"),
         (["--window", "30"], "rates over a window of 30 frames need as many; 8 are measured"),
         (["--measure", "euler"], "probes.measure must be one of"),
+        (["--youngs-modulus", "2"], "--youngs-modulus is of a crack's tip, and none is stated"),
         (["--area", "20"], "channels.area is of channels, whose file (channels.file) is not stated"),
         (["--channels", "late.csv", "--trigger", "b"], '"b" is not one of the channels of late.csv: bridge'),
         (
