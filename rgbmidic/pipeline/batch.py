@@ -53,12 +53,14 @@ class BatchTest:
     ----------
     name
         Its name and that of its folder.
-    document, base
-        Sections of its settings, and the folder that relative paths start from.
+    document
+        Sections of its settings, or the TEST.toml that has them, which is read when the test's turn comes.
+    base
+        Folder that relative paths start from.
     """
 
     name: str
-    document: Mapping[str, Any]
+    document: Mapping[str, Any] | Path
     base: Path
 
 
@@ -104,11 +106,9 @@ def read_tests(paths: Sequence[Path]) -> list[BatchTest]:
     names = [
         stem if stems.count(stem) == 1 else path.resolve().parent.name for path, stem in zip(paths, stems, strict=True)
     ]
-    tests = []
-    for path, name in zip(paths, names, strict=True):
-        document: dict[str, Any] = {"path": str(path)}  # read when its turn comes: a damaged one does not stop the rest
-        tests.append(BatchTest(name=name, document=document, base=path.parent))
-    tests = _checked(tests)
+    tests = _checked(
+        [BatchTest(name=name, document=path, base=path.parent) for path, name in zip(paths, names, strict=True)]
+    )
     if missing := [str(path) for path in paths if not path.is_file()]:
         raise InputError(f"there is no settings file {', '.join(missing)}")
     return tests
@@ -231,9 +231,8 @@ def _outcome(
 ) -> Outcome:
     """Measure a test unless it is measured already, and read it."""
     document = test.document
-    if set(document) == {"path"}:
-        document = read_toml(Path(document["path"]), "settings file")
-    settings = TestSettings.from_mapping(document, test.base)
+    sections = read_toml(document, "settings file") if isinstance(document, Path) else document
+    settings = TestSettings.from_mapping(sections, test.base)
     moved = False
 
     def count(done: int, total: int, line: str) -> None:
