@@ -7,7 +7,7 @@ swapped, gains per channel, gamma, an 8-bit table, interpolated samples, another
 level. What is done to *stored* samples leaves gaps in their histogram, what is done *inside* the camera, before it
 stores them, does not. A count is of scenes with an error (and a warning) by `rgbmidic.illumination.frame_check`; with
 the whole calibration, and with its crosstalk alone. `--data` names a folder with the independent scenes and real raw
-frames. docs/inspect.md quotes the table.
+frames. docs/how-to/inspect.md quotes the table.
 """
 
 from __future__ import annotations

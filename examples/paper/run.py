@@ -2,7 +2,7 @@
 
     python examples/paper/run.py --out DIR [--angles 0.333,8] [--size 512] [--causes | --no-causes] [--overwrite]
 
-Tables, pictures and a page that sets the paper's statements beside the figures measured go to DIR (docs/study.md).
+Tables, pictures and a page that sets the paper's statements beside the figures measured go to DIR (docs: study).
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ LOWEST, HIGHEST = 2, 4
 the stated error in the worst frame, not 3.3), but states the acceleration of a swing 1.8 times too large, not 1.4."""
 _NOISE = 1.2
 """What the stated noise is multiplied by where pieces are chosen: errors are .9 to 1.2 times what is stated of them
-(docs/uncertainty.md). A piece that by chance begins a frame too early is doubtful then: without it what is false before
+(docs: uncertainty). A piece that by chance begins a frame too early is doubtful then: without it what is false before
 an onset was up to 8 times the stated in 400 draws, with it 5.6."""
 _PRICE, _PLACE = 3.5, 2
 """Price of a parameter in units of chi-square (Schwarz: the logarithm of the number of values, here 33), and parameters

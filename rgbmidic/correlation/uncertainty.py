@@ -213,7 +213,7 @@ def _blur(image: AnyArray, sigma: float) -> AnyArray:
 def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | None = None) -> FloatArray:
     """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
 
-    The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs/uncertainty.md), and what the
+    The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs: uncertainty), and what the
     rigid motions of the lights add. Displacement is stated at the textured nodes, strain where all nodes around are
     textured, too.
 
@@ -280,7 +280,7 @@ def standard_uncertainty(
     The latter holds the step, too, that the lights' channel-specific gradients would make from the solution: two
     gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978). Where a reflection
     does not follow the surface it pulls with them, and what it still pulls without is less than that
-    (docs/uncertainty.md).
+    (docs/explanation/uncertainty.md).
     """
     std = nodal_std(residual, equations, recovery)
     if precision is not None:

@@ -47,7 +47,7 @@ _NEAR = 0.5
 is moved, it is by as much."""
 _INNER = 2.0
 """Least inner radius of an annulus, in elements: from there on K of an image without noise is right to .3 % (measured,
-docs/results.md)."""
+docs/how-to/results.md)."""
 _STRAIGHT = 1.0
 """Distance (px) of a straight crack's nodes from its line: as near as a row of nodes follows a stated path."""
 _MOST_TERMS = 7

@@ -236,7 +236,7 @@ def rates(
     Next to a change of the motion, and at both ends of the test, a window keeps its length and the polynomial is taken
     off its middle, with an uncertainty that is accordingly larger. No statement that holds for every motion is narrower
     than the worst motion demands (Low, Ann Stat 25, 1997; Cai and Low, Ann Stat 32, 2004): a change of two or three
-    standard uncertainties within a frame may be overlooked. How far the stated holds is in ``docs/results.md``.
+    standard uncertainties within a frame may be overlooked. How far the stated holds is in ``docs/how-to/results.md``.
 
     Parameters
     ----------

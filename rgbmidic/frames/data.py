@@ -1,4 +1,4 @@
-"""Raw frames as the camera recorded them, the first step of docs/conventions.md, and how and when it recorded them."""
+"""Raw frames as the camera recorded them, the first step of docs: conventions, and how and when it recorded them."""
 
 from __future__ import annotations
 

@@ -327,7 +327,7 @@ def raw_frame(
 ) -> Mosaic | ChannelFrame:
     """Return the checked frame from what the file, the user and a calibration state.
 
-    Every frame passes here, and nowhere else do the three meet: docs/test-file.md has the table. Each fills in what
+    Every frame passes here, and nowhere else do the three meet: docs: test-file has the table. Each fills in what
     those before it leave open.
 
     Parameters

@@ -1,7 +1,7 @@
 """Checks that a raw frame is of the camera and the lights that were calibrated, from that frame alone.
 
 Every check is one-sided: what a frame does not show, as noise under texture, passes. The constants are measured:
-docs/inspect.md shows which manipulations are found and that good frames pass.
+docs/how-to/inspect.md shows which manipulations are found and that good frames pass.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ __all__ = ["DemoRow", "PlateRow", "run_demo", "run_plate", "write_plate"]
 
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
-# Body, paint, lamps and camera are those that stand in where a scene states none (docs/planning.md).
+# Body, paint, lamps and camera are those that stand in where a scene states none (docs/how-to/planning.md).
 [camera]
 shape = [{size}, {size}]
 

@@ -37,7 +37,7 @@ _UNLIKELY = 0.01
 """Probability of chi-square under which a warning names the frame (chosen)."""
 _SHAPE = 1.5
 """Chi-square of what the best scale leaves above which the shape differs: 1.2 times the stated uncertainty, more than
-that is wrong by in any scene of docs/uncertainty.md."""
+that is wrong by in any scene of docs/explanation/uncertainty.md."""
 _BINS = np.linspace(-6, 6, 49)
 """Of a histogram of ratios; those beyond are counted in the outermost ones."""
 _GROUPS = {"displacement": QUANTITIES[:2], "strain": QUANTITIES[2:]}

@@ -9,7 +9,7 @@ Chi-square per degree of freedom is the mean square of the ratios of difference 
 under the stated covariance is the mean of the diagonal of the correlation matrix R, which is 1 whatever the correlation
 of neighbouring nodes; that reduces the degrees of freedom to ``n^2 / tr(R^2)`` (Satterthwaite, Biometrics Bulletin 2,
 1946). The stated variance is itself estimated, from blocks of pixels, so that the quotient is distributed like
-Fisher's F. The form with the inverse of R is not taken: docs/compare.md.
+Fisher's F. The form with the inverse of R is not taken: docs/how-to/compare.md.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class ResultQuantity:
         Attribute of the object that it comes from, such as a `Solution`, a column of it behind a dot; empty where the
         main job provides it.
     meaning
-        Its description in docs/conventions.md.
+        Its description in docs/reference/conventions.md.
     dtype
         Type of the array, in memory and on disk: what is known to no more than some digits has single precision.
     blank

@@ -35,7 +35,7 @@ class Result:
     """The result of a test: what a laboratory post-processes.
 
     `Result.open` opens a result folder as far as it has come; nothing but the mesh and the table of the frames is read
-    then. The quantities are those of `rgbmidic.results.QUANTITIES` (table in ``docs/conventions.md``), and there are
+    then. The quantities are those of `rgbmidic.results.QUANTITIES` (table in docs: conventions), and there are
     four ways to read them:
 
     - ``result.u``, ``result.misfit`` and so on: one quantity of all T frames as an array with the frames as first

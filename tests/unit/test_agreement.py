@@ -1,4 +1,4 @@
-"""What is stated twice must agree: the table of docs/test-file.md, row by row and pair by pair."""
+"""What is stated twice must agree: the table of docs/reference/test-file.md, row by row and pair by pair."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from rgbmidic.pipeline import Plan
 from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration import cli as calibrate
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "test-file.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "test-file.md"
 LIGHTS = ("red", "green", "blue")
 TABLE = PAGE.read_text(encoding="utf-8").partition("## What is stated twice")[2]
 ROWS = {row[1]: row[2].split("; ") for row in re.finditer(r"^\| ([\w ]+) \| ([^|]+) \| error", TABLE, re.M)}

@@ -28,9 +28,9 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def documented() -> dict[str, dict[str, str]]:
-    """Section, key and default as docs/test-file.md states them."""
+    """Section, key and default as docs/reference/test-file.md states them."""
     sections: dict[str, dict[str, str]] = {}
-    for line in (DOCS / "test-file.md").read_text(encoding="utf-8").splitlines():
+    for line in (DOCS / "reference/test-file.md").read_text(encoding="utf-8").splitlines():
         if heading := re.fullmatch(r"## \[(\w+)\]", line):
             keys = sections.setdefault(heading[1], {})
         elif row := re.match(r"\| `(\w+)` \| ([^|]+) \|", line):
@@ -76,7 +76,7 @@ def test_every_key_of_the_test_file_is_documented_with_its_default():
 
 
 def test_every_choice_of_a_key_is_named():
-    text = (DOCS / "test-file.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference/test-file.md").read_text(encoding="utf-8")
     from typing import get_args
 
     for section, keys in _sections(TestSettings).items():
@@ -86,7 +86,7 @@ def test_every_choice_of_a_key_is_named():
                 assert choice in row, f"{section}.{key}: {choice}"
 
 
-@pytest.mark.parametrize("page", [DOCS / "test-file.md", ROOT / "README.md"])
+@pytest.mark.parametrize("page", [DOCS / "reference/test-file.md", ROOT / "README.md"])
 def test_example_settings_are_accepted(page):
     examples = blocks(page, "toml")
     assert examples
@@ -96,7 +96,7 @@ def test_example_settings_are_accepted(page):
 
 @pytest.mark.parametrize("codes", [Status, NodeStatus])
 def test_status_codes_are_documented(codes):
-    text = (DOCS / "conventions.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference/conventions.md").read_text(encoding="utf-8")
     for code in codes:
         assert f"| {int(code)} | `{code.name}` |" in text
 
@@ -112,8 +112,8 @@ GUIDE += ["spatial resolution", "interpolant", "data point spacing", "initial gu
 
 
 def glossary():
-    """Rows of the glossary of docs/conventions.md: term, name here, symbol, definition."""
-    text = (DOCS / "conventions.md").read_text(encoding="utf-8").split("## Words and symbols")[1]
+    """Rows of the glossary of docs/reference/conventions.md: term, name here, symbol, definition."""
+    text = (DOCS / "reference/conventions.md").read_text(encoding="utf-8").split("## Words and symbols")[1]
     return [line.strip("|").split("|") for line in text.splitlines() if line.startswith("|")][2:]
 
 
@@ -144,7 +144,7 @@ SIZES |= {"image row": "H", "image column": "W", "file": "files", "reference_upd
 
 @pytest.mark.parametrize(("quantities", "frames"), [(SHARED, ()), (QUANTITIES, ("T",))])
 def test_every_quantity_of_a_result_is_documented(quantities, frames):
-    text = (DOCS / "conventions.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference/conventions.md").read_text(encoding="utf-8")
     for name, quantity in quantities.items():
         sizes = (*frames, *(str(SIZES.get(axis, axis)) for axis in quantity.axes))
         shape = f"({', '.join(sizes)}{',' * (len(sizes) == 1)})"
@@ -201,6 +201,6 @@ def test_the_python_of_the_readme_runs_on_the_demo_s_files_as_written(demo, monk
 
 
 def test_links_between_the_documents_lead_somewhere():
-    for page in [ROOT / "README.md", *DOCS.glob("*.md")]:
+    for page in [ROOT / "README.md", *DOCS.rglob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"

@@ -19,7 +19,7 @@ __all__ = ["TOO_FINE", "ChannelSummary", "Finding", "Inspection", "LightSummary"
 
 
 TOO_FINE = 0.75
-"""Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs/inspect.md)."""
+"""Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs: inspect)."""
 COARSE = 3.0
 """Least number of speckles along the side of an element (iDICs Good Practices Guide, for subsets)."""
 SATURATED, DARK, HIDDEN, NEGATIVE, GREENS = 0.01, 0.1, 0.01, 0.01, 0.05

@@ -134,7 +134,7 @@ def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
     Where its surroundings are bright and flattest, a sample's contrast is predicted from the 24 samples around it, of
     any channel, by linear regression, one for each position in the cell of the mosaic. The residual holds the
     sample's own noise, that of its neighbours through the regression, and texture that they do not predict: fair where
-    paint is flat over five samples, too high for finer speckle and in reflections (docs/inspect.md). Its scale is
+    paint is flat over five samples, too high for finer speckle and in reflections (docs: inspect). Its scale is
     1.4826 times the median absolute value.
     """
     means = [_mean(channel) for channel in channels]

@@ -369,7 +369,7 @@ def test_what_cannot_be_compared_is_refused_in_a_line_and_nothing_is_written(tmp
 
 
 def test_the_examples_of_the_page_run_as_written(tmp_path, states, monkeypatch, capsys):
-    page = (Path(__file__).parents[3] / "docs" / "compare.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "how-to" / "compare.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     mesh = finite_elements()
     write_state(tmp_path / "plate.vtu", stretch(), mesh)

@@ -17,7 +17,7 @@ from rgbmidic.results import QUANTITIES, FrameRecord, Result, ResultStore
 from rgbmidic.settings import ScaleSettings
 
 xr = pytest.importorskip("xarray")
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "results.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "results.md"
 STRAIN = [name + end for end in ("", "_std") for name in ("exx", "eyy", "exy")]
 
 
