@@ -47,9 +47,9 @@ from rgbmidic.weights.threshold import threshold_weights
 
 from .tables import Row, table
 from .uncertainty_scenes import (
-    CACHE,
+    KINDS,
+    PAINTS,
     SPOILS,
-    Kind,
     Pair,
     Setting,
     both,
@@ -63,14 +63,9 @@ from .uncertainty_scenes import (
 if TYPE_CHECKING:
     from bench import Bench
 
-KINDS: dict[Kind, str] = {"rgb": "3-CCD", "bayer": "Bayer"}
 ZONES = ("mat", "reflection", "edge")
 THRESHOLDS = (0.26, 0.28, 0.3, 0.33, 0.36, 0.4, 0.45, 0.5, 0.6, 0.7, 0.85, 2.0)
 """Blurred grey levels, as shares of the full scale, above which the masks exclude a light; 2 excludes nothing."""
-SPHERE_TARGETS = {
-    "rgb": {0.33: 0.0029, 1: 0.0034, 2: 0.0043, 4: 0.0061, 8: 0.0099},
-    "bayer": {0.33: 0.0045, 1: 0.0065, 2: 0.0076, 4: 0.0100, 8: 0.0150},
-}
 REFLECTION_SHARE = 1 / 3
 NODAL = ("u", "v", "u_std", "v_std")
 EDGE = 12
@@ -183,31 +178,43 @@ def row(*cells: object) -> None:
     print("| " + " | ".join(f"{c:.4f}" if isinstance(c, float) else str(c) for c in cells) + " |", flush=True)
 
 
-def sphere(quick: bool) -> None:
-    """Sphere: error over the field, best threshold, ratio and coverage by zone."""
-    angles = (0.33, 1.0, 4.0) if quick else (0.33, 1.0, 2.0, 4.0, 8.0, 14.0)
-    by_zone = "/".join(ZONES)
-    heading(
-        "camera", "angle", "rms (asked)", "best threshold", "lost", "ratio u v", "covered u v", f"ratio {by_zone}",
-        f"covered {by_zone}", "strain ratio", "strain covered", f"strain ratio {by_zone}",
-    )  # fmt: skip
-    for kind, name in KINDS.items():
-        for angle in angles:
-            pair = pair_of(Setting(body="sphere", state=turn(angle), size=448 if quick else 640))
-            images = both(pair, kind)
-            solution = solve_pair(pair, images)
-            verdict, zones = Verdict.of(solution, pair), zones_of(pair, solution)
-            threshold, opponent, _ = best_threshold(pair, images, solution)
-            row(
-                name, f"{angle:g}°", f"{verdict.rms:.4f} ({SPHERE_TARGETS[kind].get(angle, float('nan')):.4f})",
-                f"{opponent:.4f} at {threshold:g}", f"{verdict.unmeasured:.2%}",
-                *_by_part(verdict.ratio.T), *_by_part([verdict.ratio[zones[z]] for z in ZONES]),
-                *_by_part([verdict.strain_ratio]), _by_part([verdict.strain_ratio[zones[z]] for z in ZONES])[0],
-            )  # fmt: skip
+ANGLES = (0.33, 1.0, 2.0, 4.0, 8.0)
+SPHERES = [("3-CCD", "mild", "smooth", 4.2), ("Bayer", "mild", "smooth", 4.2)]
+"""Camera, crosstalk, paint and speckle of the spheres: 30 CPU s for another paint or speckle, 4 for another crosstalk."""
 
 
-def _by_part(parts: Any) -> tuple[str, str]:
-    return " / ".join(f"{rms(p):.2f}" for p in parts), " / ".join(f"{covered(p):.1%}" for p in parts)
+@table("sphere", page="explanation/uncertainty", cost=60, keys=4, seed=11, own_quick=True)
+def sphere(quick: bool) -> Iterator[Row]:
+    """Turning sphere: rms error of the displacement over the field after a turn; then, over all angles and nodes, error
+    over stated uncertainty (also within reflections alone), errors within 1.96 stated uncertainties, and the same of
+    strain.
+    """
+    for camera, crosstalk, paint, speckle in SPHERES[1:2] if quick else SPHERES:
+        errors: dict[str, object] = {}
+        ratios, strains, reflecting = list[FloatArray](), list[FloatArray](), list[BoolArray]()
+        for angle in ANGLES[1::2] if quick else ANGLES:
+            setting = Setting(
+                body="sphere", state=turn(angle), size=256 if quick else 640, speckle=speckle, **PAINTS[paint]
+            )
+            pair = pair_of(setting)
+            solution = solve_pair(pair, both(pair, KINDS[camera], crosstalk=crosstalk))
+            verdict = Verdict.of(solution, pair)
+            errors[f"error at {angle:g}° [px]"] = verdict.rms
+            ratios.append(verdict.ratio)
+            strains.append(verdict.strain_ratio)
+            reflecting.append(zones_of(pair, solution)["reflection"])
+        ratio, strain, inside = (np.concatenate(parts) for parts in (ratios, strains, reflecting))
+        yield {
+            "camera": camera,
+            "crosstalk": crosstalk,
+            "paint": paint,
+            "speckle [px]": speckle,
+            **errors,
+            "error/stated": rms(ratio),
+            "in reflections": rms(ratio[inside]),
+            "covered [%]": 100 * covered(ratio),
+            "strain error/stated": rms(strain),
+        }
 
 
 def areas(quick: bool) -> None:
@@ -511,16 +518,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tables", nargs="*", choices=[*TABLES, []], help="all if none is named")
     parser.add_argument("--quick", action="store_true", help="fewer angles, variants and draws")
-    parser.add_argument("--cache", type=Path, default=CACHE["folder"], help="folder for rendered scenes")
     arguments = parser.parse_args()
-    CACHE["folder"] = arguments.cache
     for name in arguments.tables or TABLES:
         print(f"\n## {name}: {(TABLES[name].__doc__ or name).strip()}")
         TABLES[name](arguments.quick)
 
 
 TABLES: dict[str, Callable[[bool], None]] = {
-    "sphere": sphere,
     "areas": areas,
     "scenes": scenes,
     "noise": noise,
