@@ -8,7 +8,10 @@ What shows a measurement comes from the demo's own files (``rgbmidic demo`` make
 from __future__ import annotations
 
 import argparse
+import re
+import shutil
 import subprocess
+import tempfile
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -79,7 +82,8 @@ def way(theme: str) -> None:
     s = Sheet(theme, 7.2, 2.9, metres=(7.2, 2.9))
     rows = [
         ["raw frame\n(Bayer mosaic)", "linearise", "demosaic and\nunmix crosstalk", "one image\nper light"],
-        ["strain, rates,\nprobes", "displacement and\nits uncertainty", "one MIDIC solve,\nall lights at once", "weights: where\neach light counts"],
+        ["strain, rates,\nprobes", "displacement and\nits uncertainty"]
+        + ["one MIDIC solve,\nall lights at once", "weights: where\neach light counts"],
     ]  # fmt: skip
     width, height, step = 1.48, 0.78, 1.86
     for row, (names, y) in enumerate(zip(rows, (1.85, 0.3), strict=True)):
@@ -258,18 +262,58 @@ def save(figure: Any, name: str, theme: str) -> None:
     plt.close(figure)
 
 
+PICTURES = {
+    "plan": "plan/plan.png",
+    "inspection": "inspected/inspection.png",
+    "fractions": "result/figures/fractions_000013.png",
+    "displacement": "result/figures/displacement_000013.png",
+    "history": "history.png",
+}
+"""Pictures of the tutorial, and what its commands call them."""
+
+
+def tutorial() -> None:
+    """Run the commands of the tutorial as written, and keep the pictures that they make, 800 px wide at most."""
+    import cv2
+
+    page = ROOT / "docs" / "tutorials" / "impact.md"
+    text = page.read_text(encoding="utf-8")
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        shutil.copy(ROOT / "examples" / "scenes" / "impact.toml", folder)
+        for language, block in re.findall(r"^```(bash|toml)\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE):
+            if language == "toml":
+                (folder / block.split()[1]).write_text(block, encoding="utf-8")
+            else:
+                subprocess.run(["bash", "-ec", block], cwd=folder, check=True)
+        for name, source in PICTURES.items():
+            picture = cv2.imread(str(folder / source))
+            assert picture is not None
+            width = min(picture.shape[1], 800)
+            small = cv2.resize(
+                picture, (width, picture.shape[0] * width // picture.shape[1]), interpolation=cv2.INTER_AREA
+            )
+            cv2.imwrite(str(page.parent / "images" / f"{name}.png"), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
 SKETCHES: dict[str, Callable[[str], None]] = {"set_up": set_up, "way": way, "house": house}
 MEASURED: dict[str, Callable[[str, Demo], None]] = {"reflection": reflection, "match": match, "weights": weights}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join([*SKETCHES, *MEASURED])}; none: all")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"of {', '.join([*SKETCHES, *MEASURED])}, tutorial; none: all"
+    )
     parser.add_argument("--demo", type=Path, default=Path("rgbmidic-demo"), metavar="FOLDER")
     arguments = parser.parse_args()
-    names = arguments.names or [*SKETCHES, *MEASURED]
-    if unknown := set(names) - {*SKETCHES, *MEASURED}:
-        parser.error(f"unknown: {', '.join(unknown)}; allowed are {', '.join([*SKETCHES, *MEASURED])}")
+    every = [*SKETCHES, *MEASURED, "tutorial"]
+    names = arguments.names or every
+    if unknown := set(names) - {*every}:
+        parser.error(f"unknown: {', '.join(unknown)}; allowed are {', '.join(every)}")
+    if "tutorial" in names:
+        tutorial()
+        names = [name for name in names if name != "tutorial"]
     if measured := [name for name in names if name in MEASURED]:
         if not arguments.demo.is_dir():
             subprocess.run(["rgbmidic", "demo", "--out", str(arguments.demo)], check=True)
