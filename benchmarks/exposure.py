@@ -17,8 +17,9 @@ def electrons(
 ) -> float:  # fmt: skip
     """Electrons that a pixel collects from mat white paint.
 
-    A Lambertian surface under the irradiance E (W/m²) has the radiance ρE/π; a lens of f-number F and transmission τ gives
-    the image the irradiance τ ρE / (4 F² (1 + m)²), of which a pixel of the side a converts η λ/(hc) to electrons.
+    A Lambertian surface under the irradiance E (W/m²) has the radiance ρE/π; a lens of f-number F and transmission τ
+    gives the image the irradiance τ ρE / (4 F² (1 + m)²), of which a pixel of the side a converts η λ/(hc) to
+    electrons.
     """
     image = transmission * reflectance * irradiance / (4 * f_number**2 * (1 + magnification) ** 2)  # W/m²
     return image * pixel**2 * exposure * efficiency * wavelength / (PLANCK * LIGHT_SPEED)

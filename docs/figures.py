@@ -82,8 +82,12 @@ def way(theme: str) -> None:
     s = Sheet(theme, 7.2, 2.9, metres=(7.2, 2.9))
     rows = [
         ["raw frame\n(Bayer mosaic)", "linearise", "demosaic and\nunmix crosstalk", "one image\nper light"],
-        ["strain, rates,\nprobes", "displacement and\nits uncertainty"]
-        + ["one MIDIC solve,\nall lights at once", "weights: where\neach light counts"],
+        [
+            "strain, rates,\nprobes",
+            "displacement and\nits uncertainty",
+            "one MIDIC solve,\nall lights at once",
+            "weights: where\neach light counts",
+        ],
     ]  # fmt: skip
     width, height, step = 1.48, 0.78, 1.86
     for row, (names, y) in enumerate(zip(rows, (1.85, 0.3), strict=True)):
