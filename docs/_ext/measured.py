@@ -6,7 +6,7 @@
     ```
 
 shows a table (or some of its columns, or the rows whose first cells are the ones named) with its caption (or another,
-`:caption:`), date and commit; {measured}`sphere | Bayer, 8 | rms error [px]` is one figure of it. An unknown table, row or
+`:caption:`), date and commit; {measured}`sphere | Bayer, 8 | rms error [px]` is one figure. An unknown table, row or
 column is an error.
 """
 
