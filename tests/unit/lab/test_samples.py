@@ -18,6 +18,7 @@ from real_files import SAMPLES as FOLDERS
 
 from rgbmidic import cli
 from rgbmidic.command import execute
+from rgbmidic.frames import list_frames
 from rgbmidic.lab import samples
 from rgbmidic.lab.samples import SAMPLES, Sample, SampleFile
 from rgbmidic.settings import read_test
@@ -112,6 +113,17 @@ def test_samples_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
         (line,) = (line for line in lines if line.startswith(f"{name} "))
         assert known.licence in line
         assert known.source in line
+
+
+@pytest.mark.parametrize("name", [name for name, known in SAMPLES.items() if known.settings])
+def test_settings_of_a_sample_are_a_test_of_its_files(name: str, tmp_path: Path) -> None:
+    (tmp_path / "test.toml").write_text(SAMPLES[name].settings)
+    for file in SAMPLES[name].files:
+        (tmp_path / file.name).touch()
+    frames = read_test(tmp_path / "test.toml").frames
+    found = list_frames(frames.path[0], tmp_path)
+    assert max(frames.reference) < len(found)
+    assert "ef" in found[frames.reference[0]].stem or name in ("tension", "open-hole")  # ref, Reference; else the first
 
 
 def test_hashes_are_those_of_the_full_files_and_of_what_the_crops_were_cut_from() -> None:
