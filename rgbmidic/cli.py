@@ -293,8 +293,8 @@ def _calibrate_demo_camera(test: Path) -> None:
 
 @app.command()
 def sample(
-    name: Annotated[str, typer.Argument(metavar="[NAME]", help="Which one; without it, they are listed.")] = "",
-    folder: Annotated[Path | None, typer.Argument(metavar="[FOLDER]", help="Empty or new; else NAME.")] = None,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Which one; without it, they are listed.")] = "",
+    folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="Empty or new; else NAME.")] = None,
 ) -> None:
     """Fetch real files to try from where they are published, with their TEST.toml; or list what there is."""
     from rgbmidic.lab.samples import SAMPLES, write_sample

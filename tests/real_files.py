@@ -38,7 +38,7 @@ def real_folder(name: str, file: str = "") -> Path:
     for folder in (full, *_cached(name), CROPS / name):
         if folder.is_dir() and (folder / file).exists():
             return folder
-    sample = f", nor fetched by `rgbmidic sample {SAMPLES[name]}`" if name in SAMPLES else ""
+    sample = f", nor in the cache (`rgbmidic sample {SAMPLES[name]}`, with a network)" if name in SAMPLES else ""
     pytest.skip(f"no shared data at {full / file}{sample}; its licence or size keeps it out of tests/data")
 
 
