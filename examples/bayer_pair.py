@@ -1,4 +1,7 @@
-"""A test as a laboratory has it, end to end: two raw Bayer frames, a calibration file and TEST.toml on disk.
+"""A Bayer test from end to end
+============================
+
+A test as a laboratory has it, end to end: two raw Bayer frames, a calibration file and TEST.toml on disk.
 
 The frames are virtual (a painted plate under red, green and blue lamps, 12 bit, noise, crosstalk), so the truth is
 known. Last line: rms error of the displacement in px.

@@ -1,4 +1,7 @@
-"""Frames from a camera maker's library: whatever has a length and a frame by index is a source, without any file.
+"""Frames of a camera maker's library
+==================================
+
+Frames from a camera maker's library: whatever has a length and a frame by index is a source, without any file.
 
 The library here is virtual: a monochrome camera of 12 bit before a strip that is pulled to the right. What the source
 knows of names and times goes into the result. Last line: error of the measured speed in px per second.

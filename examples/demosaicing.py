@@ -1,4 +1,7 @@
-"""Which demosaicing? One virtual pair with a reflection over the green light, measured by several methods.
+"""Which demosaicing?
+==================
+
+Which demosaicing? One virtual pair with a reflection over the green light, measured by several methods.
 
 The plate lies wholly in the reflection of the green lamp, whose paint sparkles differently in the two states. Each
 method separates the lights of the same two raw frames; the solve is the same. Last line: scatter of the displacement

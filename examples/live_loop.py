@@ -1,4 +1,7 @@
-"""A live loop: each frame is measured as it is taken, and the stage is corrected before the next one.
+"""A live loop
+===========
+
+A live loop: each frame is measured as it is taken, and the stage is corrected before the next one.
 
 A stage drifts by some tenths of a pixel a frame, in a direction that wanders; the measured displacement moves it back.
 `measure_sequence` takes the camera's generator and gives each solution before it asks for the next frame. Last line:

@@ -1,4 +1,7 @@
-"""Masks made by hand: where each lamp reflects is known, and that light is excluded there in every frame.
+"""Masks made by hand
+==================
+
+Masks made by hand: where each lamp reflects is known, and that light is excluded there in every frame.
 
 Two lights see a speckle that moves by 1.3 px; each has a bright spot with a texture of its own that stays where it is.
 The same masks as images: `method = "images"` and `images = ["mask_1.png", "mask_2.png"]` in [weights] of TEST.toml.

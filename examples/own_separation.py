@@ -1,4 +1,7 @@
-"""A separation of one's own in place of the package's: raw Bayer frames in, images of the lights out, by a plain one.
+"""A separation of your own
+========================
+
+A separation of one's own in place of the package's: raw Bayer frames in, images of the lights out, by a plain one.
 
 Every colour is interpolated by a local mean of its own samples, and the crosstalk is inverted. Everything else, from
 tracking to the result folder, stays. Last line: rms error of the displacement in px.

@@ -1,4 +1,7 @@
-"""Plain DIC on two arrays: a speckle image, the same stretched by 1 % and turned by 2 degrees, and what comes back.
+"""Plain DIC on two arrays
+=======================
+
+Plain DIC on two arrays: a speckle image, the same stretched by 1 % and turned by 2 degrees, and what comes back.
 
 The speckle is a sum of cosines, so the deformed image is exact. Last line: rms error of the displacement in px.
 """

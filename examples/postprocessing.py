@@ -1,4 +1,7 @@
-"""A result as people post-process it in a notebook: named dimensions, units, lazily frame by frame (xarray).
+"""Post-processing with xarray
+===========================
+
+A result as people post-process it in a notebook: named dimensions, units, lazily frame by frame (xarray).
 
 A strip is stretched by 0.1 % a frame. Needs the package xarray (pip install rgbmidic[xarray]). Last line: largest error
 of the mean strain in the middle, in 1e-6.

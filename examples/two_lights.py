@@ -1,4 +1,7 @@
-"""Two lamps fired in succession before a monochrome camera: each is excluded where it reflects (the paper's bench).
+"""Two lamps in succession
+=======================
+
+Two lamps fired in succession before a monochrome camera: each is excluded where it reflects (the paper's bench).
 
 A painted sphere turns by half a degree; the reflection of each lamp stays where it is while the speckle moves. The
 masks are the paper's: blur, threshold at a fraction of the dynamic range. Last line: error of the two lights together
