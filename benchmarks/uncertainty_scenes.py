@@ -1,21 +1,21 @@
-"""Scenes of the uncertainty benchmark: bodies in two states with exact truth, and what spoils a frame.
+"""Scenes of the tables of uncertainty: bodies in two states with exact truth, cameras, and what corrupts a frame.
 
-Rendering is the slow part: what has been rendered is kept on disk.
+A scene is rendered light by light without the camera's colours, so cameras and crosstalk matrices share renderings.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-from demosaicing import TILT, painted
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.crosstalk import unmix
@@ -23,13 +23,24 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
-from rgbmidic.scene.camera import PIXEL
+from rgbmidic.scene.camera import PIXEL, REFERENCE_CROSSTALK
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-Kind = Literal["rgb", "bayer"]
+from .demosaicing import TILT, painted
 
-CACHE = {"folder": Path(tempfile.gettempdir()) / "rgbmidic-uncertainty"}
-"""Where rendered images are kept."""
+Kind = Literal["rgb", "bayer"]
+KINDS: dict[str, Kind] = {"3-CCD": "rgb", "Bayer": "bayer"}
+CROSSTALKS: dict[str, tuple[tuple[float, ...], ...]] = {"mild": REFERENCE_CROSSTALK}
+"""What each light gives in the channels of another: that of the virtual experiments, and those of measured cameras."""
+PAINTS: dict[str, dict[str, float]] = {
+    "smooth": {},
+    "glossy": {"gloss": 3.0},
+    "coarse": {"wrinkles": 0.075},
+}
+"""Options of `Setting`: wrinkles 25 um apart that reflect 1.5 times the full white; twice that; three times as wide."""
+RENDERS = "RGBMIDIC_RENDERS"
+"""Environment variable: folder of rendered scenes that several tables share; the driver sets it for its run."""
+_OWN_RENDERS = tempfile.TemporaryDirectory(prefix="rgbmidic-renders-")
 
 
 def turn(angle: float) -> State:
@@ -86,16 +97,17 @@ class Pair:
 
 
 def stored_render(scene: Scene, state: State | None) -> FloatImage:
-    """`render`, kept on disk: rendering is the slow part."""
+    """`render`, kept on disk while tables are measured: rendering is the slow part."""
     key = hashlib.sha1(repr((scene, state)).encode()).hexdigest()[:20]
-    path = CACHE["folder"] / f"render_{key}.npy"
+    path = Path(os.environ.get(RENDERS, _OWN_RENDERS.name)) / f"render_{key}.npy"
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, render(scene, state))
+        temporary = path.with_suffix(f".{os.getpid()}.npy")
+        np.save(temporary, render(scene, state))
+        temporary.replace(path)
     return np.asarray(np.load(path))
 
 
-@cache
+@lru_cache(maxsize=8)
 def pair_of(setting: Setting) -> Pair:
     """Render a setting, its mat twin and its truth."""
     scene, mat = setting.scene(), setting.scene(gloss=0.0)
@@ -128,9 +140,12 @@ def images_of(raw: Mosaic | ChannelFrame, scene: Scene) -> IlluminationImages:
     return separate(linear, crosstalk)
 
 
-def both(pair: Pair, kind: Kind, seed: int = 11) -> tuple[IlluminationImages, IlluminationImages]:
-    """Illumination images of both states with camera noise."""
-    scene = pair.scene
+def both(
+    pair: Pair, kind: Kind, seed: int = 11, crosstalk: str = "mild"
+) -> tuple[IlluminationImages, IlluminationImages]:
+    """Illumination images of both states with camera noise, seen with one of the `CROSSTALKS`."""
+    camera = replace(pair.scene.camera, crosstalk=np.array(CROSSTALKS[crosstalk]))
+    scene = replace(pair.scene, camera=camera)
     first, second = (images_of(frame(i, scene, kind, 1000 * seed + n), scene) for n, i in enumerate(pair.lights))
     return first, second
 
