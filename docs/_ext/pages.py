@@ -16,7 +16,11 @@ logger = logging.getLogger(__name__)
 
 DOCS = Path(__file__).resolve().parents[1]
 ROOT = DOCS.parent
-OUTSIDE = {"README.md": "tutorials/first-steps", "calibration/README.md": "how-to/calibration", "CHANGELOG.md": "changelog"}
+OUTSIDE = {
+    "README.md": "tutorials/first-steps",
+    "calibration/README.md": "how-to/calibration",
+    "CHANGELOG.md": "changelog",
+}
 """Pages that include a file from outside docs/."""
 
 

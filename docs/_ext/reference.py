@@ -31,6 +31,9 @@ MODULES = [
     "rgbmidic.frames",
     "rgbmidic.illumination",
     "rgbmidic.illumination.calibration",
+    "rgbmidic.illumination.separation",
+    "rgbmidic.illumination.linear",
+    "rgbmidic.illumination.texture",
     "rgbmidic.weights",
     "rgbmidic.mesh",
     "rgbmidic.correlation",
@@ -78,11 +81,14 @@ def table(heading: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def described(kind: type) -> dict[str, str]:
     """Attributes of a class with the words of its docstring."""
-    from numpydoc.docscrape import NumpyDocString
-
-    found = NumpyDocString(inspect.getdoc(kind) or "")["Attributes"]
-    entries = [(name.strip(), " ".join(entry.desc)) for entry in found for name in entry.name.split(",")]
-    return {name: re.sub(r"``(.*?)``", r"`\1`", words) for name, words in entries}
+    _, _, text = (inspect.getdoc(kind) or "").partition("Attributes\n----------\n")
+    section = re.split(r"\n\n\w+\n---", text)[0]
+    entries = re.findall(r"^(\S.*)\n((?:    .*\n?|\n)*)", section, re.MULTILINE)
+    meanings = {}
+    for names, words in entries:
+        for name in names.partition(" : ")[0].split(", "):
+            meanings[name] = re.sub(r"``(.*?)``", r"`\1`", " ".join(words.split()))
+    return meanings
 
 
 def default(entry: Field[Any]) -> str:
@@ -125,7 +131,7 @@ def type_words(hint: Any, bounds: Mapping[str, float] | None = None) -> str:
         return f"[{', '.join(type_words(kind) for kind in kinds)}]{limits}"
     if is_dataclass(hint):
         return "section"
-    return (_WORDS.get(hint) or "list of lists of numbers") + limits
+    return (_WORDS.get(hint) or "array of numbers") + limits
 
 
 def _several(hint: Any) -> str:
@@ -193,7 +199,7 @@ _LIGHT = {
 }  # fmt: skip
 _CAMERA = {
     "shape": ("[whole number, whole number]", "`[640, 640]`", "Rows and columns of the frame."),
-    "mm_per_pixel": ("number > 0", "`0.055`", "At the body's front point; it gives `focal_px` where that is not stated."),
+    "mm_per_pixel": ("number > 0", "`0.055`", "At the body's front point; gives `focal_px` if that is not stated."),
     "focal_px": ("number", "-", "Focal length in px: distance / (mm per px at that distance)."),
     "crosstalk": ("list of lists of numbers", "-", "A in channels = A · lights: a row for each channel. Not stated: "
                   "from the spectra, where there are any, else that of the reference camera."),
@@ -218,7 +224,12 @@ def scene() -> str:
         text += f'\n### kind = "{name}"\n\n' + _keys(kind, {})
     parts: list[tuple[str, type, Mapping[str, tuple[str, str, str]], tuple[str, ...]]] = [
         ("[surface]", Surface, {}, ("white", "black")),
-        ("[surface.white], [surface.black]", Finish, {"albedo": ("number", "`0.8`, `0.1`", described(Finish)["albedo"])}, ()),
+        (
+            "[surface.white], [surface.black]",
+            Finish,
+            {"albedo": ("number", "`0.8`, `0.1`", described(Finish)["albedo"])},
+            (),
+        ),
         ("[[lights]]", Light, _LIGHT, ("spectrum",)),
         ("[camera]", Camera, _CAMERA, ()),
         ("[[states]]", State, _STATE, ("displacement",)),
@@ -246,6 +257,15 @@ def calibration() -> str:
     ):
         text += f"\n### {name}\n\n" + _keys(kind, {})
     return text
+
+
+def camera() -> str:
+    """Keys of a file with lens and plane."""
+    from rgbmidic.fields.plane import LENS_PARAMETERS, CameraCalibration
+
+    lens = f"numbers {', '.join(f'`{name}`' for name in LENS_PARAMETERS)}"
+    focal = "Focal length and principal point in px, then the distortion in OpenCV's order; null: it does not distort."
+    return _keys(CameraCalibration, {"lens": (lens, "-", focal)}, ["name"])
 
 
 # ---- results and formats
@@ -315,6 +335,7 @@ GENERATORS: dict[str, Callable[[], str]] = {
     "commands rgbmidic-calibrate": lambda: commands("rgbmidic-calibrate"),
     "scene": scene,
     "calibration": calibration,
+    "camera": camera,
     "quantities": quantities,
     "formats": formats,
 }
@@ -374,14 +395,19 @@ def write_api(folder: Path) -> None:
         classes = [name for name, found in names if inspect.isclass(found)]
         functions = [name for name, found in names if inspect.isroutine(found)]
         constants = [name for name, _ in names if name not in (*classes, *functions)]
-        elsewhere = [name for name in import_module(module).__all__ if name not in dict(names) and name != "__version__"]
+        elsewhere = [
+            name for name in import_module(module).__all__ if name not in dict(names) and name != "__version__"
+        ]
         if classes or functions:
             lines += [".. autosummary::", "   :nosignatures:", ""]
             lines += [f"   {name}" for name in (*classes, *functions)] + [""]
         if elsewhere:
             lines += [".. rubric:: Described with another module", ""]
             homes = {id(found): f"{home}.{name}" for home, entries in pages.items() for name, found in entries}
-            lines += [", ".join(f":py:obj:`~{homes[id(getattr(import_module(module), name))]}`" for name in elsewhere), ""]
+            lines += [
+                ", ".join(f":py:obj:`~{homes[id(getattr(import_module(module), name))]}`" for name in elsewhere),
+                "",
+            ]
         for title, kind, members in (("Classes", "class", classes), ("Functions", "function", functions)):
             if members:
                 lines += [title, "-" * len(title), ""]

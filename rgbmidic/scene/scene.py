@@ -154,16 +154,20 @@ class State:
 
     Attributes
     ----------
-    angle_deg, axis
-        Rotation about an axis (camera directions) through the pivot.
+    angle_deg
+        Rotation about an axis through the pivot.
+    axis
+        Its direction (x, y, z) in the camera's axes.
     pivot
         Point on the axis (mm); None: the body's front point.
     translation
-        mm.
+        (x, y, z) in mm.
     displacement
         In-plane displacement of a plate; None: none.
-    velocity, spin_deg
-        mm/s and degrees per second (same axis and pivot) during the camera's exposure time.
+    velocity
+        mm/s during the camera's exposure time.
+    spin_deg
+        Degrees per second during it, about the same axis and pivot.
     """
 
     angle_deg: float = 0.0

@@ -1,17 +1,22 @@
 """Every block of every page runs, in the page's order, in a folder that holds the demo's files.
 
-A block is Python, commands (bash) or settings (toml). What cannot run here has the reason above it, in a comment that no
-reader sees: ``<!-- not run: it needs a cluster -->``; ``<!-- file: NAME -->`` makes a block that file of the folder.
+A block is Python, commands (bash) or settings (toml). What cannot run here has the reason above it, in a comment that
+no reader sees: ``<!-- not run: it needs a cluster -->``; ``<!-- file: NAME -->`` makes a block that file of the folder.
 """
 
 from __future__ import annotations
 
+import doctest
 import re
 import shlex
 import shutil
+import sys
 import time
 import tomllib
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -27,6 +32,9 @@ from rgbmidic.lab.demo import run_demo, run_plate, write_plate
 from rgbmidic_calibration import cli as calibrate
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "docs/_ext"))
+import reference  # noqa: E402 (it is no package)
+
 OUTSIDE = ["README.md", "calibration/README.md", "CHANGELOG.md"]
 PAGES = OUTSIDE + sorted(
     path.relative_to(ROOT).as_posix()
@@ -34,7 +42,7 @@ PAGES = OUTSIDE + sorted(
     if not path.is_relative_to(ROOT / "docs/examples")
 )
 NOT_RUN = 14
-"""Blocks that do not run, at most: installation, servers, clusters, MATLAB, other people's packages, minutes of work."""
+"""Blocks that do not run, at most: installation, servers, clusters, MATLAB, others' packages, minutes of work."""
 BLOCK = re.compile(r"(?:^<!-- (.*?) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -183,6 +191,64 @@ def test_the_blocks_of_a_page_run_as_written(page, demo, tmp_path, monkeypatch, 
         scales = [camera.scale(camera.centre)[0] for camera in made]
         assert scales[:2] == pytest.approx([0.0939855] * 2, rel=3e-5)
         assert scales[2] == pytest.approx(0.0939855, rel=0.01)
+
+
+def reachable(home, parts):
+    """Whether a name of the code has these parts, fields of a dataclass included."""
+    for part in parts:
+        if is_dataclass(home) and part in {entry.name for entry in fields(home)}:
+            return True
+        if not hasattr(home, part):
+            return False
+        home = getattr(home, part)
+    return True
+
+
+def exists(words):
+    """Whether `package.module.name` or `Class.name` is there."""
+    first, *parts = words.split(".")
+    if first.startswith("rgbmidic"):
+        for count in range(len(parts), -1, -1):
+            with suppress(ImportError):
+                return reachable(import_module(".".join([first, *parts[:count]])), parts[count:])
+    homes = [found for _, name, found in reference.public() if name == first]
+    return any(reachable(home, parts) for home in homes)
+
+
+NO_NAMES = ("rgbmidic.frame_formats", "Competitor.prepare")
+"""A group of entry points, and a class of examples/paper."""
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_names_that_a_page_mentions_exist(page):
+    text = re.sub(r"```.*?```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    found = re.findall(r"`((?:rgbmidic(?:_calibration)?|[A-Z][a-z]\w+)(?:\.[A-Za-z_]\w*)+)(?:\(.*?\))?`", text)
+    assert not [words for words in found if words not in NO_NAMES and not exists(words)]
+
+
+@pytest.mark.parametrize("name", ["rgbmidic.nothing", "rgbmidic.results.Nothing", "Result.nothing", "Nothing.at_all"])
+def test_a_name_that_is_not_there_is_found_out(name):
+    assert not exists(name)
+
+
+def test_every_name_that_pages_and_examples_import_is_on_the_page_of_public_names():
+    texts = [code for page in PAGES for _, language, code in blocks(page) if language == "python"]
+    texts += [path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.py")]
+    imported = {line for text in texts for line in re.findall(r"^from (rgbmidic\S*) import", text, re.MULTILINE)}
+    assert imported - set(reference.MODULES) == set()
+
+
+PACKAGES = [*(ROOT / "rgbmidic").rglob("*.py"), *(ROOT / "calibration").rglob("*.py")]
+DOCTESTS = [path for path in PACKAGES if ">>> " in path.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("path", DOCTESTS, ids=[path.stem for path in DOCTESTS])
+def test_the_examples_of_the_docstrings_run(path, demo, monkeypatch):
+    monkeypatch.chdir(demo)
+    name = path.relative_to(ROOT).with_suffix("").as_posix().removeprefix("calibration/").replace("/", ".")
+    found = doctest.testmod(import_module(name))
+    assert found.attempted
+    assert not found.failed
 
 
 def test_few_blocks_do_not_run():
