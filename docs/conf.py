@@ -25,6 +25,7 @@ extensions = [
 ]
 exclude_patterns = ["_ext", "tables"]
 default_role = "py:obj"
+suppress_warnings = ["toc.empty_glob"]
 
 myst_enable_extensions = ["attrs_block", "colon_fence", "dollarmath"]
 myst_heading_anchors = 4

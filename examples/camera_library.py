@@ -10,6 +10,7 @@ knows of names and times goes into the result. Last line: error of the measured 
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.ndimage import fourier_shift, gaussian_filter
 
@@ -55,3 +56,13 @@ with tempfile.TemporaryDirectory() as folder:
 speed = np.polyfit(seconds, position, 1)[0]
 print(f"speed {speed:.2f} px/s, true {SPEED:.2f} px/s")
 print(f"error: {abs(speed - SPEED):.3f} px/s")
+
+# %%
+# Mean position over the camera's own times.
+
+figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
+axes.plot(1e3 * seconds, position, "o", label="measured")
+axes.plot(1e3 * seconds, SPEED * seconds, "-", label="true")
+axes.set(xlabel="time (ms)", ylabel="mean u (px)")
+axes.legend()
+plt.show()

@@ -10,6 +10,7 @@ of the mean strain in the middle, in 1e-6.
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from rgbmidic import TestSettings, measure
@@ -46,3 +47,13 @@ with tempfile.TemporaryDirectory() as folder:
     error = np.abs(strain.values - STEP * np.arange(COUNT)).max()
 
 print(f"largest error: {1e6 * error:.1f} (1e-6)")
+
+# %%
+# Mean strain, frame after frame.
+
+figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
+axes.plot(strain.frame, 100 * strain, "o", label="measured")
+axes.plot(strain.frame, 100 * STEP * strain.frame, "-", label="true")
+axes.set(xlabel="frame", ylabel="strain (%)")
+axes.legend()
+plt.show()

@@ -11,6 +11,7 @@ with masks, over that of the first light alone, in the part of the field where t
 from dataclasses import replace
 from functools import partial
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from rgbmidic import correlate
@@ -49,3 +50,13 @@ rms = [np.sqrt(np.nanmean((one.displacement - true)[reflecting] ** 2)) for one i
 print(f"{scene.lights[0].name} excluded on {1 - masks[0][0].mean():.0%} of the image, {reflecting.sum()} nodes there")
 print(f"rms error there: {rms[0]:.4f} px with {scene.lights[0].name} alone, {rms[1]:.4f} px with both and masks")
 print(f"ratio: {rms[1] / rms[0]:.3f}")
+
+# %%
+# What either lamp shows; the dotted lines enclose what its mask excludes.
+
+figure, parts = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
+for axes, image, mask, light in zip(parts, reference.values, masks[0], scene.lights, strict=True):
+    axes.imshow(image, cmap="gray")
+    axes.contour(mask, [0.5], colors="tab:orange", linestyles="dotted")
+    axes.set(title=light.name, xticks=[], yticks=[])
+plt.show()
