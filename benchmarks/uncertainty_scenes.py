@@ -50,7 +50,7 @@ def turn(angle: float) -> State:
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """A scene in two states, with everything that tells it from another."""
+    """A scene in two states, with everything that distinguishes it from another."""
 
     body: str
     state: State
@@ -75,7 +75,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Pair:
-    """Noise-free lights (k, H, W) in both states, share of their local mean that is not diffuse, and the truth."""
+    """Noise-free lights (k, H, W) in both states, fraction of their local mean that is not diffuse, and the truth."""
 
     scene: Scene
     lights: tuple[FloatImage, FloatImage]
@@ -159,8 +159,8 @@ def _nowhere(x: FloatArray, y: FloatArray) -> BoolArray:
 
 
 @dataclass(frozen=True)
-class Spoil:
-    """What spoils a frame: the zone it covers, what it does to the lights and to the samples of state 0 or 1."""
+class Corruption:
+    """What corrupts a frame: the zone it covers, what it does to the lights and to the samples of state 0 or 1."""
 
     name: str
     zone: Callable[[Any, Any], BoolArray] = _nowhere
@@ -215,7 +215,7 @@ def _dead(values: Any, zone: BoolArray, state: int) -> None:
 
 
 def _saturated(channel: int) -> Callable[[Any, BoolArray, int], None]:
-    def spoil(values: Any, zone: BoolArray, state: int) -> None:
+    def corrupt(values: Any, zone: BoolArray, state: int) -> None:
         if values.ndim == 3:
             values[channel][zone] = 4095
             return
@@ -224,7 +224,7 @@ def _saturated(channel: int) -> Callable[[Any, BoolArray, int], None]:
         there = (y % 2 == samples[0]) & (x % 2 == samples[1]) if channel != 1 else (x + y) % 2 == 1
         values[zone & there] = 4095
 
-    return spoil
+    return corrupt
 
 
 def _left_third(x: Any, y: Any) -> BoolArray:
@@ -242,14 +242,14 @@ def _lamp_spot(x: Any, y: Any) -> BoolArray:
     return np.asarray(bright > 1.5 * np.median(bright))
 
 
-SPOILS = [
-    Spoil("nothing"),
-    Spoil("red light off", light=_off),
-    Spoil("20 % flicker", light=_flicker),
-    Spoil("red saturated on a third", zone=_left_third, sensor=_saturated(0)),
-    Spoil("green saturated on a third", zone=_left_third, sensor=_saturated(1)),
-    Spoil("1 % dead and hot pixels", sensor=_dead),
-    Spoil("dark fragment", zone=_box, light=_fragment),
-    Spoil("speckled fragment", zone=_box, light=_rough_fragment),
-    Spoil("all reflections in one place", zone=_lamp_spot, overlapping=True),
+CORRUPTIONS = [
+    Corruption("nothing"),
+    Corruption("red light off", light=_off),
+    Corruption("20 % flicker", light=_flicker),
+    Corruption("red saturated on a third", zone=_left_third, sensor=_saturated(0)),
+    Corruption("green saturated on a third", zone=_left_third, sensor=_saturated(1)),
+    Corruption("1 % dead and hot pixels", sensor=_dead),
+    Corruption("dark fragment", zone=_box, light=_fragment),
+    Corruption("speckled fragment", zone=_box, light=_rough_fragment),
+    Corruption("all reflections in one place", zone=_lamp_spot, overlapping=True),
 ]
