@@ -285,9 +285,10 @@ def tutorial() -> None:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         shutil.copy(ROOT / "examples" / "scenes" / "impact.toml", folder)
-        for language, block in re.findall(r"^```(bash|toml)\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE):
-            if language == "toml":
-                (folder / block.split()[1]).write_text(block, encoding="utf-8")
+        marked = r"(?:^<!-- file: (\S+) -->\n)?^```(?:bash|toml)\n(.*?)^```"
+        for name, block in re.findall(marked, text, flags=re.DOTALL | re.MULTILINE):
+            if name:
+                (folder / name).write_text(block, encoding="utf-8")
             else:
                 subprocess.run(["bash", "-ec", block], cwd=folder, check=True)
         for name, source in PICTURES.items():

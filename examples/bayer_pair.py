@@ -1,4 +1,7 @@
-"""A test as a laboratory has it, end to end: two raw Bayer frames, a calibration file and TEST.toml on disk.
+"""A Bayer test from end to end
+============================
+
+A test as a laboratory has it, end to end: two raw Bayer frames, a calibration file and TEST.toml on disk.
 
 The frames are virtual (a painted plate under red, green and blue lamps, 12 bit, noise, crosstalk), so the truth is
 known. Last line: rms error of the displacement in px.
@@ -7,12 +10,12 @@ known. Last line: rms error of the displacement in px.
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from rgbmidic import Calibration, measure, read_test
 from rgbmidic.fields import at_nodes
-from rgbmidic.frames.data import Mosaic
-from rgbmidic.frames.images import write_dng
+from rgbmidic.frames import Mosaic, write_dng
 from rgbmidic.lab.virtual import State, plate_scene, record, render, strained_plate, truth
 
 SETTINGS = """
@@ -51,3 +54,14 @@ error = found - at_nodes(truth(scene, states[1]), result.nodes)
 print(f"lights {', '.join(result.lights)}; frame 1 in {iterations} iterations")
 print(f"predicted uncertainty: {np.sqrt(np.mean(std**2)):.4f} px")
 print(f"rms error: {np.sqrt(np.mean(error**2)):.4f} px")
+
+# %%
+# A part of the second raw frame, as its camera wrote it, and the displacement measured from it with its uncertainty.
+
+figure, parts = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
+parts[0].imshow(frame.values[80:110, 80:110], cmap="gray")
+parts[0].set(title="raw samples", xticks=[], yticks=[])
+for axes, values, what in ((parts[1], found[:, 0], "u (px)"), (parts[2], std[:, 0], "uncertainty of u (px)")):
+    figure.colorbar(axes.tripcolor(*result.nodes.T, result.elements, values, shading="gouraud"), ax=axes, label=what)
+    axes.set(aspect="equal", ylim=(172, 20))
+plt.show()

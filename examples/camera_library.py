@@ -1,4 +1,7 @@
-"""Frames from a camera maker's library: whatever has a length and a frame by index is a source, without any file.
+"""Frames of a camera maker's library
+==================================
+
+Frames from a camera maker's library: whatever has a length and a frame by index is a source, without any file.
 
 The library here is virtual: a monochrome camera of 12 bit before a strip that is pulled to the right. What the source
 knows of names and times goes into the result. Last line: error of the measured speed in px per second.
@@ -7,6 +10,7 @@ knows of names and times goes into the result. Last line: error of the measured 
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.ndimage import fourier_shift, gaussian_filter
 
@@ -52,3 +56,13 @@ with tempfile.TemporaryDirectory() as folder:
 speed = np.polyfit(seconds, position, 1)[0]
 print(f"speed {speed:.2f} px/s, true {SPEED:.2f} px/s")
 print(f"error: {abs(speed - SPEED):.3f} px/s")
+
+# %%
+# Mean position over the camera's own times.
+
+figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
+axes.plot(1e3 * seconds, position, "o", label="measured")
+axes.plot(1e3 * seconds, SPEED * seconds, "-", label="true")
+axes.set(xlabel="time (ms)", ylabel="mean u (px)")
+axes.legend()
+plt.show()

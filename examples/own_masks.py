@@ -1,10 +1,14 @@
-"""Masks made by hand: where each lamp reflects is known, and that light is excluded there in every frame.
+"""Masks made by hand
+==================
+
+Masks made by hand: where each lamp reflects is known, and that light is excluded there in every frame.
 
 Two lights see a speckle that moves by 1.3 px; each has a bright spot with a texture of its own that stays where it is.
 The same masks as images: `method = "images"` and `images = ["mask_1.png", "mask_2.png"]` in [weights] of TEST.toml.
 Last line: rms error with the masks, over that without any weights.
 """
 
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.ndimage import fourier_shift, gaussian_filter
 
@@ -44,3 +48,13 @@ for name, weights in (("without weights", None), ("with masks", masks)):
     rms[name] = np.sqrt(np.nanmean(error**2))
     print(f"{name}: {last.measured.mean():.0%} of the nodes measured, rms error {rms[name]:.4f} px")
 print(f"ratio: {rms['with masks'] / rms['without weights']:.3f}")
+
+# %%
+# The two lights in the reference; the dotted lines enclose what their masks exclude.
+
+figure, parts = plt.subplots(1, 2, figsize=(8, 3.8), layout="constrained")
+for axes, image, spot in zip(parts, states[0], spots, strict=True):
+    axes.imshow(image, cmap="gray")
+    axes.contour(spot, [0.5], colors="tab:orange", linestyles="dotted")
+    axes.set(xticks=[], yticks=[])
+plt.show()

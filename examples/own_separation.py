@@ -1,4 +1,7 @@
-"""A separation of one's own in place of the package's: raw Bayer frames in, images of the lights out, by a plain one.
+"""A separation of your own
+========================
+
+A separation of one's own in place of the package's: raw Bayer frames in, images of the lights out, by a plain one.
 
 Every colour is interpolated by a local mean of its own samples, and the crosstalk is inverted. Everything else, from
 tracking to the result folder, stays. Last line: rms error of the displacement in px.
@@ -7,6 +10,7 @@ tracking to the result folder, stays. Last line: rms error of the displacement i
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.ndimage import convolve
 
@@ -50,3 +54,13 @@ with tempfile.TemporaryDirectory() as folder:
 
 error = found - at_nodes(truth(scene, states[1]), nodes)
 print(f"rms error: {np.sqrt(np.nanmean(error**2)):.4f} px")
+
+# %%
+# The reference's lights, as this separation gives them.
+
+images = separation((frames[0],))
+figure, parts = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
+for axes, image, name in zip(parts, images.values, images.names, strict=True):
+    axes.imshow(image, cmap="gray")
+    axes.set(title=name, xticks=[], yticks=[])
+plt.show()

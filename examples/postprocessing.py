@@ -1,4 +1,7 @@
-"""A result as people post-process it in a notebook: named dimensions, units, lazily frame by frame (xarray).
+"""Post-processing with xarray
+===========================
+
+A result as people post-process it in a notebook: named dimensions, units, lazily frame by frame (xarray).
 
 A strip is stretched by 0.1 % a frame. Needs the package xarray (pip install rgbmidic[xarray]). Last line: largest error
 of the mean strain in the middle, in 1e-6.
@@ -7,6 +10,7 @@ of the mean strain in the middle, in 1e-6.
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from rgbmidic import TestSettings, measure
@@ -43,3 +47,13 @@ with tempfile.TemporaryDirectory() as folder:
     error = np.abs(strain.values - STEP * np.arange(COUNT)).max()
 
 print(f"largest error: {1e6 * error:.1f} (1e-6)")
+
+# %%
+# Mean strain, frame after frame.
+
+figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
+axes.plot(strain.frame, 100 * strain, "o", label="measured")
+axes.plot(strain.frame, 100 * STEP * strain.frame, "-", label="true")
+axes.set(xlabel="frame", ylabel="strain (%)")
+axes.legend()
+plt.show()

@@ -131,6 +131,11 @@ def shift_cfa(cfa: str, rows: int, columns: int) -> str:
     -------
     str
         One of `BAYER_PATTERNS`.
+
+    Examples
+    --------
+    >>> shift_cfa("RGGB", 1, 0)
+    'GBRG'
     """
     cell = np.array(list(cfa.upper())).reshape(2, 2)
     return "".join(np.roll(cell, (-rows, -columns), axis=(0, 1)).ravel())

@@ -47,8 +47,10 @@ class Calibration:
         All figures of the photon transfer measurement, per colour plane; `noise` is its summary.
     registration
         Lateral registration of the lights; of the same lights, in the same order, as the crosstalk.
-    kind, cfa, black_level, white_level
-        The camera settings of the captures, as far as they are known; the black level is the mean over the positions.
+    kind, cfa, white_level
+        The camera settings of the captures, as far as they are known.
+    black_level
+        The same; the mean over the positions of the Bayer cell.
     shape
         Rows and columns of the captures.
     name

@@ -123,6 +123,7 @@ class Crosstalk:
     matrix : ndarray, shape (C, k)
         A in ``channels = A @ lights``; the largest entry of every column is 1. Its mean where it varies.
     lights : tuple of str, length k
+        Their names, in the order of the columns.
     covariance : ndarray, shape (C k, C k), or None
         Covariance of the entries, taken row by row (``matrix.ravel()``).
     std : ndarray, shape (C, k), or None

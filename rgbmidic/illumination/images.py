@@ -59,6 +59,7 @@ class Registration:
     Attributes
     ----------
     lights : tuple of str, length k
+        Their names.
     parameters : ndarray, shape (k, 5)
         `PARAMETERS` of every light; the first light's are 0.
     centre : tuple of float

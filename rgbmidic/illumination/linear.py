@@ -145,6 +145,7 @@ class CameraNoise:
     Attributes
     ----------
     planes : tuple of str, length P
+        Their names; every figure below has a value and its standard uncertainty for each.
     gain : Quantity
         1/K in e-/DN.
     read_noise : Quantity

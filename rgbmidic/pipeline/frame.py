@@ -323,6 +323,15 @@ def correlate(
         Images of different shapes, a weight or initial guess that does not fit, an unknown setting.
     RegionError
         The region is empty, too small or outside the image.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(120, 160)), 1.5)
+    >>> solution = correlate(speckle, np.roll(speckle, 2, axis=1), region=(20, 20, 140, 100))
+    >>> solution.status.name, solution.displacement[solution.measured].mean(axis=0).round(2) + 0
+    ('CONVERGED', array([2., 0.]))
     """
     f, g = as_light_stack(reference, "reference"), as_light_stack(deformed, "deformed")
     if f.shape != g.shape:

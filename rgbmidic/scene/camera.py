@@ -145,8 +145,10 @@ class Camera:
     exposure
         Fraction of full scale that an ideal white gives under a light of power 1 at its nominal distance, in the
         channel that sees the light best.
-    bits, black_level
-        Depth of the analogue-digital converter; grey level of a dark sample. Saturation is at 2**bits - 1.
+    bits
+        Depth of the analogue-digital converter; samples saturate at 2**bits - 1.
+    black_level
+        Grey level of a dark sample.
     gain
         Electrons per grey level.
     read_noise

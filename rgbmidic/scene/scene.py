@@ -37,7 +37,15 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sphere:
-    """A sphere. `centre` in mm, camera axes."""
+    """A sphere.
+
+    Attributes
+    ----------
+    radius
+        mm.
+    centre
+        (x, y, z) in mm, camera axes.
+    """
 
     radius: float = 41.25
     centre: Vector = (0.0, 0.0, 641.25)
@@ -63,7 +71,17 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cylinder:
-    """The mantle of a cylinder; its axis is parallel to y until it is tilted (degrees about z)."""
+    """The mantle of a cylinder; its axis is parallel to y until it is tilted.
+
+    Attributes
+    ----------
+    radius, length
+        mm.
+    centre
+        Middle of the axis: (x, y, z) in mm, camera axes.
+    tilt_deg
+        Degrees about z.
+    """
 
     radius: float = 15.0
     length: float = 1000.0
@@ -91,7 +109,17 @@ class Cylinder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plate:
-    """A flat plate facing the camera until it is tilted: degrees about y, then about x."""
+    """A flat plate facing the camera until it is tilted.
+
+    Attributes
+    ----------
+    width, height
+        mm.
+    centre
+        (x, y, z) in mm, camera axes.
+    tilt_deg
+        Degrees about y, then about x.
+    """
 
     width: float = 75.0
     height: float = 50.0
@@ -126,16 +154,20 @@ class State:
 
     Attributes
     ----------
-    angle_deg, axis
-        Rotation about an axis (camera directions) through the pivot.
+    angle_deg
+        Rotation about an axis through the pivot.
+    axis
+        Its direction (x, y, z) in the camera's axes.
     pivot
         Point on the axis (mm); None: the body's front point.
     translation
-        mm.
+        (x, y, z) in mm.
     displacement
         In-plane displacement of a plate; None: none.
-    velocity, spin_deg
-        mm/s and degrees per second (same axis and pivot) during the camera's exposure time.
+    velocity
+        mm/s during the camera's exposure time.
+    spin_deg
+        Degrees per second during it, about the same axis and pivot.
     """
 
     angle_deg: float = 0.0

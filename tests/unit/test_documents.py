@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import re
-import shlex
-import tomllib
+import sys
 from dataclasses import MISSING, fields
 from pathlib import Path
 
 import pytest
+import typer
 
-from rgbmidic import CameraCalibration, NodeStatus, Status, TestSettings, cli
+from rgbmidic import NodeStatus, Status, TestSettings, cli
 from rgbmidic.command import execute
-from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.demo import run_demo, run_plate, write_plate
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
 from rgbmidic.settings import _place, _sections
@@ -21,10 +19,8 @@ from rgbmidic_calibration import cli as calibrate
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-
-
-def blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+sys.path.append(str(DOCS / "_ext"))
+import reference  # noqa: E402 (it is no package)
 
 
 def documented() -> dict[str, dict[str, str]]:
@@ -86,14 +82,6 @@ def test_every_choice_of_a_key_is_named():
                 assert choice in row, f"{section}.{key}: {choice}"
 
 
-@pytest.mark.parametrize("page", [DOCS / "reference/test-file.md", ROOT / "README.md"])
-def test_example_settings_are_accepted(page):
-    examples = blocks(page, "toml")
-    assert examples
-    for text in examples:
-        TestSettings.from_mapping(tomllib.loads(text))
-
-
 @pytest.mark.parametrize("codes", [Status, NodeStatus])
 def test_status_codes_are_documented(codes):
     text = (DOCS / "reference/conventions.md").read_text(encoding="utf-8")
@@ -138,69 +126,43 @@ def test_the_identifiers_of_the_glossary_exist():
             assert part in keys or re.search(rf"(class|def) {part}\b|^ *{part}( =|:)", source, re.MULTILINE), name
 
 
-SIZES = {"node": "N", "light": "k", "element": "E", "function": "m", "row": "h", "column": "w", "iteration": "i"}
-SIZES |= {"image row": "H", "image column": "W", "file": "files", "reference_update": "r"}
-
-
-@pytest.mark.parametrize(("quantities", "frames"), [(SHARED, ()), (QUANTITIES, ("T",))])
-def test_every_quantity_of_a_result_is_documented(quantities, frames):
-    text = (DOCS / "reference/conventions.md").read_text(encoding="utf-8")
-    for name, quantity in quantities.items():
-        sizes = (*frames, *(str(SIZES.get(axis, axis)) for axis in quantity.axes))
-        shape = f"({', '.join(sizes)}{',' * (len(sizes) == 1)})"
-        assert f"| `{name}` | {shape} | {quantity.unit} | {quantity.meaning} |".replace("  ", " ") in text, name
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    """Folder of the demo's files, smaller and with fewer frames than the command makes."""
-    out = tmp_path_factory.mktemp("demo") / "rgbmidic-demo"
-    lines = []
-    rows = run_demo(out, lines.append, cli._calibrate_demo, size=320, angles=(0.33, 1.0, 2.0, 4.0))
-    assert [row.angle_deg for row in rows] == [0.33, 1.0, 2.0, 4.0]
-    assert all(row.rms_px < min(row.single_px) for row in rows)
-    assert len(lines) == 4
-    truth = write_plate(out / "test")
-    cli._calibrate_demo_camera(out / "test")
-    plate = run_plate(out / "test", truth)
-    assert all(row.strain[0] < 1.5 * row.stated_strain < 0.1 * row.strain[1] for row in plate)
-    assert all(row.displacement_mm[0] < 1.5 * row.stated_mm < 0.1 * row.displacement_mm[1] for row in plate)
-    return out / "test"
-
-
-def commands(page):
-    """The commands of a page's examples, one list of words each, continued lines joined."""
-    text = re.sub(r"```(?:bash)?\n(rgbmidic.*?)```", r"\0\1\0", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    examples = "\n".join(text.split("\0")[1::2]).replace("\\\n", " ")
-    return [shlex.split(line) for line in examples.splitlines() if line.startswith("rgbmidic")]
-
-
-@pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "calibration" / "README.md"])
-def test_the_commands_of_a_page_run_on_the_demo_s_files_as_written(page, demo, monkeypatch, capsys):
-    monkeypatch.chdir(demo)
-    programs = {"rgbmidic": cli.app, "rgbmidic-calibrate": calibrate.app}
-    found = commands(page)
-    assert len(found) >= 5
-    for program, *arguments in found:
-        arguments = [part.replace("60,60,390,390", "60,60,260,260") for part in arguments]  # smaller files here
-        assert execute(programs[program], arguments) == 0, (arguments, capsys.readouterr().err)
-    if page.parent.name == "calibration":
-        noise = Calibration.read("noise.json").camera_noise
-        assert (noise.linearity_error.value < 0.05).all()  # of a camera that is linear
-        made = [CameraCalibration.read(name) for name in ("lens_and_plane.json", "new_plane.json", "by_corners.json")]
-        scales = [camera.scale(camera.centre)[0] for camera in made]
-        assert scales[:2] == pytest.approx([0.0939855] * 2, rel=3e-5)
-        assert scales[2] == pytest.approx(0.0939855, rel=0.01)
-
-
-def test_the_python_of_the_readme_runs_on_the_demo_s_files_as_written(demo, monkeypatch):
-    monkeypatch.chdir(demo)
-    for text in blocks(ROOT / "README.md", "python"):
-        exec(compile(text, "README.md", "exec"), {})
-    assert (demo / "python_result" / "provenance.json").is_file()
-
-
 def test_links_between_the_documents_lead_somewhere():
-    for page in [ROOT / "README.md", *DOCS.rglob("*.md")]:
+    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "calibration/README.md", *DOCS.rglob("*.md")]
+    for page in pages:
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+# ---- what the site generates: the modules of docs/_ext need no Sphinx to make it
+
+
+def test_the_page_of_the_test_file_has_the_code_s_types_and_defaults():
+    page = reference.with_types((DOCS / "reference/test-file.md").read_text(encoding="utf-8"))
+    for section, keys in reference.test_keys().items():
+        part = page.split(f"## [{section}]\n")[1]
+        for key, (kind, default) in keys.items():
+            assert f"\n| `{key}` | {kind} | {default} | " in part, f"{section}.{key}"
+
+
+@pytest.mark.parametrize("program", [cli.app, calibrate.app])
+def test_every_option_of_every_command_is_on_its_page(program, capsys):
+    page = reference.commands(program.info.name)
+    for name in (group := typer.main.get_command(program)).commands:
+        execute(program, [name, "--help"])
+        part = page.split(f"\n## {program.info.name} {name}\n")[1].split("\n## ")[0]
+        options = set(re.findall(r"^ +(--[a-z][a-z-]*)", capsys.readouterr().out, re.MULTILINE)) - {"--help"}
+        assert len(options) >= min(1, len(group.commands[name].params) - 1)
+        assert options == set(re.findall(r"^\| `(--[a-z][a-z-]*)", part, re.MULTILINE))
+
+
+@pytest.mark.parametrize("name", ["scene", "calibration", "camera", "quantities"])
+def test_a_generated_table_leaves_no_meaning_open(name):
+    rows = [line.split(" | ") for line in reference.GENERATORS[name]().splitlines() if line.startswith("| `")]
+    assert len(rows) > 4
+    assert not [row[0] for row in rows if not row[-1].strip(" |")]
+
+
+def test_every_public_name_has_one_page():
+    names = [f"{module}.{name}" for module, name, _ in reference.public()]
+    assert len(names) == len(set(names)) > 300
+    assert {"rgbmidic.Result", "rgbmidic.fields.strain_of", "rgbmidic_calibration.verify.check"} & set(names)

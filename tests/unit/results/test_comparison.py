@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -366,21 +364,3 @@ def test_what_cannot_be_compared_is_refused_in_a_line_and_nothing_is_written(tmp
     assert message in error
     assert error.count("\n") == 1
     assert not out.exists()
-
-
-def test_the_examples_of_the_page_run_as_written(tmp_path, states, monkeypatch, capsys):
-    page = (Path(__file__).parents[3] / "docs" / "how-to" / "compare.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    mesh = finite_elements()
-    write_state(tmp_path / "plate.vtu", stretch(), mesh)
-    (tmp_path / "all.pvd").rename("simulation.pvd")
-    (tmp_path / "table.csv").rename("simulation.csv")
-    known = {"finite_elements": mesh, "placement": PLACEMENT, "references": [0]}
-    measured(tmp_path / "my_result", np.arange(2)[:, None, None] * stretch() + noise(2), **known)
-    commands = re.findall(r"```bash\n(.*?)```", page, flags=re.DOTALL)[0].replace("\\\n", " ").splitlines()
-    assert len(commands) == 2
-    for line in commands:
-        assert execute(cli.app, shlex.split(line)[1:]) == 0, capsys.readouterr().err
-    for text in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
-        exec(compile(text, "compare.md", "exec"), {})
-    assert "(99,)" in capsys.readouterr().out

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 import pickle
-import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record, smooth_record
+from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import QUANTITIES, FrameRecord, Result, ResultStore
 from rgbmidic.settings import ScaleSettings
 
 xr = pytest.importorskip("xarray")
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "results.md"
 STRAIN = [name + end for end in ("", "_std") for name in ("exx", "eyy", "exy")]
 
 
@@ -119,14 +117,3 @@ def test_without_xarray_the_error_says_what_to_install(result: Result, monkeypat
     monkeypatch.delitem(sys.modules, "rgbmidic.results.dataset", raising=False)
     with pytest.raises(InputError, match=r'xarray: pip install "rgbmidic\[xarray\]"'):
         result.to_xarray()
-
-
-def test_the_python_of_the_page_runs_as_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    make_result(tmp_path / "my_result", frames=5, record=smooth_record)
-    monkeypatch.chdir(tmp_path)
-    found = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
-    names: dict[str, object] = {}
-    for text in found:
-        exec(compile(text, PAGE.name, "exec"), names)
-    strains = names["stretch"]
-    np.testing.assert_allclose(strains, 0.002 * np.arange(5), atol=1e-9)
