@@ -146,6 +146,7 @@ def strike(folder):
 
 PREPARED = {
     "README.md": lambda folder: shutil.rmtree(folder / "my_result"),
+    "docs/tutorials/first-steps.md": lambda folder: shutil.rmtree(folder / "my_result"),
     "docs/how-to/compare.md": simulate,
     "docs/how-to/fast-tests.md": interrupt,
     "docs/how-to/movies.md": send_wave,
