@@ -588,7 +588,8 @@ class TestSettings(_Checked):
         ``accept`` in ``[calibration]``: checks of the reference frame against the calibration whose contradictions are
         accepted (`rgbmidic.illumination.frame_check`).
     element_size
-        ``element_size`` in ``[mesh]``: side of the elements in px; None with `mesh_file`, which has its own.
+        ``element_size`` in ``[mesh]``: side of the elements in px; ``"auto"``: what a study of the test's own frames
+        recommends (`rgbmidic.pipeline.resolution`); None with `mesh_file`, which has its own.
     cracks
         ``cracks`` in ``[mesh]``: paths, each of corners (x, y) in px on the reference, along which the mesh is split.
     mesh_file
@@ -610,7 +611,9 @@ class TestSettings(_Checked):
     region: RegionSettings = field(default_factory=RegionSettings)
     calibration_file: Path | None = field(default=None, metadata={"key": "calibration.file"})
     accept: tuple[FrameCheck, ...] = field(default=(), metadata={"key": "calibration.accept"})
-    element_size: float | None = field(default=None, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
+    element_size: float | Literal["auto"] | None = field(
+        default=None, metadata={"key": "mesh.element_size", "bounds": {"above": 0}}
+    )
     cracks: tuple[tuple[tuple[float, float], ...], ...] = field(default=(), metadata={"key": "mesh.cracks"})
     mesh_file: Path | None = field(default=None, metadata={"key": "mesh.file"})
     mesh_points: tuple[tuple[float, float, float, float], ...] | None = field(
@@ -655,8 +658,8 @@ class TestSettings(_Checked):
 
     @property
     def side(self) -> float:
-        """Side of the elements in px, where the mesh is made here; the default where it is not."""
-        return self.element_size or ELEMENT_SIZE
+        """Side of the elements in px, where it is stated; the default where it is not, or is found by the run."""
+        return self.element_size if isinstance(self.element_size, float) else ELEMENT_SIZE
 
     @classmethod
     def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:

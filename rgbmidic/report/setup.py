@@ -85,7 +85,8 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         cracked = len(mesh.crack_edges) > 0
         levels = f"divided by their local mean, σ = {normalise * (WIDER_AT_CRACKS if cracked else 1):g} px"
         correction = "mean" if cracked and correction != "local" else correction
-    side = physical.in_units(mesh.size if size is None else size)
+    chosen = result.provenance.get("element_size")  # of element_size = "auto"
+    side = physical.in_units(mesh.size if size is None else size if chosen is None else chosen["element_size"])
     rows = (
         ("software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"),
         ("reference", reference_text(physical)),
@@ -94,6 +95,7 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         ("image filter", _PREFILTERS.get(set_("solver", "prefilter"))),
         ("weights of the lights", _WEIGHTS.get(set_("weights", "method"))),
         ("elements", f"{len(mesh.elements)} triangles of three nodes, {len(mesh.nodes)} nodes; side {side}"),
+        ("choice of the elements", None if chosen is None else f"by the run: {chosen['reason']}"),
         ("shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"),
         ("matching criterion", "weighted sum of squared differences over all lights at once"),
         ("interpolant", "cubic B-spline"),
