@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from rgbmidic.fields import at_nodes
 from rgbmidic.pipeline import resolution
 from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.resolution import SPECKLES, study_sizes
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 
 from .tables import Row, table
@@ -96,3 +97,51 @@ class Scene:
             error = solution.displacement - at_nodes(field, sized.reference.mesh.nodes)
             found[size] = float(np.sqrt(np.nanmean(error**2)))
         return found
+
+
+SCENES = (
+    Scene("bump", 12, 2.0, 0.03),
+    Scene("bump", 25, 2.0, 0.05, lights=3),
+    Scene("bump", 50, 3.0, 0.10),
+    Scene("bump", 18, 0.5, 0.20, lights=3),
+    Scene("wave", 60, 1.0, 0.03, lights=3),
+    Scene("wave", 120, 1.0, 0.10),
+    Scene("wave", 90, 0.5, 0.20, lights=3, speckle=4.2),
+    Scene("band", 12, 1.5, 0.05, lights=3),
+    Scene("band", 30, 1.5, 0.15),
+    Scene("affine", 100, 2.0, 0.10),
+)
+"""Features of 12 to 120 px, noise of 3 to 20 % of the contrast, one light and three of which one reflects."""
+QUICK = (1, 5, 7)
+
+
+def judged(scene: Scene) -> Row:
+    """Recommended size of a scene beside the best one."""
+    states, field = scene.images()
+    true = scene.true_errors(states, field)
+    study = study_sizes(scene.settings(), SIZES, gauges=(), source=list(states.astype(np.float32)))
+    enough = [size for size in SIZES if size >= SPECKLES * study.speckle]
+    best, chosen = min(enough, key=true.__getitem__), study.choice
+    assert chosen is not None
+    stated = next(one for one in study.sizes if one.element_size == chosen.element_size)
+    return {
+        "field": scene.name,
+        "lights": str(scene.lights),
+        "noise [%]": f"{100 * scene.noise:g}",
+        "recommended [px]": int(chosen.element_size),
+        "best [px]": int(best),
+        "error of the recommended [px]": true[chosen.element_size],
+        "least error [px]": true[best],
+        "estimated error [px]": stated.total,
+    }
+
+
+@table("resolution", page="how-to/resolution", cost=40, keys=3)
+def recommended(quick: bool) -> Iterator[Row]:
+    """Element size that `rgbmidic resolution` recommends, beside the one of the least true error (rms at the nodes).
+
+    Sizes of 10 (where three speckles fit), 16, 25, 40 and 63 px, two frames of 256 px, one draw of speckle and noise.
+    """
+    for number, scene in enumerate(SCENES):
+        if not quick or number in QUICK:
+            yield judged(scene)

@@ -12,6 +12,7 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -195,6 +196,7 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
 _NO_GAUGE = dict.fromkeys(("length_px", "noise", "largest", "cut_off_px"), float("nan"))
 
 
+@lru_cache(maxsize=1)
 def _gauge_cut_offs(study: ResolutionStudy) -> list[FloatArray]:
     """Cut-off in px of the displacement, of the strain at the nodes, and of each gauge, of every element size."""
     ratios = [[gauge.length / one.element_size for gauge in one.gauges] for one in study.sizes]
@@ -250,26 +252,29 @@ def _figure(study: ResolutionStudy) -> Figure:
     """Draw errors over the element size and, over the gauges' length, strain resolution and largest strain."""
     from rgbmidic.report.style import NUMBERS, draw_figure
 
-    panels = (("noise", "strain resolution (1e-6)"), ("largest", "99 % quantile of the strain (1e-6)"))
+    panels = (("noise", 1e6, "strain resolution (1e-6)"), ("largest", 1e3, "strain, 99 % quantile (1e-3)"))
 
     def draw(axes: list[Axes]) -> None:
         _draw_errors(axes[0], study)
-        for axis, (key, label) in zip(axes[1:], panels, strict=False):
+        for axis, (key, unit, label) in zip(axes[1:], panels, strict=False):
             for one in (one for one in study.sizes if one.gauges):
-                values = [1e6 * getattr(gauge, key) for gauge in one.gauges]
-                axis.loglog([gauge.length for gauge in one.gauges], values, "o-", label=f"{one.element_size:g} px")
-            axis.legend(title="elements")
+                values = [unit * getattr(gauge, key) for gauge in one.gauges]
+                axis.plot([gauge.length for gauge in one.gauges], values, "o-", label=f"{one.element_size:g} px")
+            axis.set_yscale("log" if key == "noise" else "linear")
             lengths = [gauge.length for one in study.sizes for gauge in one.gauges]
             _finish(axis, lengths, "virtual strain gauge (px)", label)
+        if len(axes) > 1:
+            axes[-1].legend(title="elements")
 
     count = 3 if any(one.gauges for one in study.sizes) else 1
-    return draw_figure(draw, count=count, aspect=1.25, beside=NUMBERS)
+    return draw_figure(draw, count=count, aspect=1.4, beside=NUMBERS)
 
 
 def _draw_errors(axis: Axes, study: ResolutionStudy) -> None:
     sizes = [one.element_size for one in study.sizes]
     for key, label in (("noise", "noise"), ("discretisation", "discretisation error"), ("total", "both")):
-        axis.loglog(sizes, [getattr(one, key) for one in study.sizes], "o-", label=label)
+        axis.plot(sizes, [getattr(one, key) for one in study.sizes], "o-", label=label)
+    axis.set_yscale("log")
     if study.choice is not None:
         axis.axvline(study.choice.element_size, color="0.6", zorder=0)
     if np.isfinite(study.speckle):
@@ -280,11 +285,18 @@ def _draw_errors(axis: Axes, study: ResolutionStudy) -> None:
 
 
 def _finish(axis: Axes, lengths: Sequence[float], x: str, y: str) -> None:
-    """Label logarithmic axes, with the lengths themselves along x."""
+    """Label the axes: lengths along x, on a logarithmic scale, and plain numbers along y."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
     shown = sorted(set(lengths))
+    axis.set_xscale("log")
+    if axis.get_yscale() == "log":
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_xticks(shown, [f"{length:g}" for length in shown])
     axis.set_xticks([], minor=True)
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    axis.grid(linewidth=0.4, color="0.88", which="both")
+    axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)

@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Reference, Solution, Start, Status, track
+from rgbmidic.correlation import Deformed, PrecisionMethod, Reference, Solution, Start, Status, track
+from rgbmidic.correlation.discretisation import discretisation_error
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh.pixel_map import quadratic_fit
 from rgbmidic.pipeline.frame import read_state
 from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.source import correlated
@@ -49,6 +51,9 @@ _ALIKE = 1.05
 """Total errors within this factor count as the same, and the larger elements are taken, for their smaller noise of
 strain: what the estimate of a discretisation error is good for at best."""
 
+_SURE, _INDEPENDENT = 2.0, 0.5
+"""Standard deviations by which a mean square must exceed that of noise, and independent values in a nodal one, whose
+neighbours are correlated. Chosen."""
 _LARGEST = 0.99
 """Quantile over the nodes and components that stands for the largest strain: the very largest is one node's noise."""
 _EQUAL = 0.1
@@ -95,7 +100,7 @@ class SizeFigures:
     bias, scatter, strain_bias, strain_scatter
         Noise floor: rms over the static frames of the mean over the nodes, and the scatter about it.
     stated, strain_stated
-        Standard uncertainty from noise, as the solve states it in the key frame.
+        Standard uncertainty from noise in the key frame.
     discretisation, strain_discretisation
         What the mesh and the recovery leave out in the key frame.
     seconds
@@ -270,11 +275,11 @@ def study_sizes(
     key = _KeyFrame.find(plan, frames)
     at_rest = settings.frames.reference[:_STATIC] if static and len(settings.frames.reference) > 1 else ()
     rest = [_deformed(plan, index) for index in at_rest]
-    figures = []
+    figures, finer = [], list[_Field]()
     for number, size in enumerate(sizes):
         report(number + 1, len(sizes) + 1, f"elements of {size:g} px")
         try:
-            figures.append(_figures(_resized(plan, size), key, rest, lengths))
+            figures.append(_figures(_resized(plan, size), key, rest, lengths, finer))
         except RgbmidicError as error:
             logger.warning("elements of %g px: %s", size, error)
             figures.append(SizeFigures(element_size=size, reason=str(error)))
@@ -391,8 +396,11 @@ def _resized(plan: Plan, size: float) -> Plan:
 
 
 def _solve(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
-    method = precision_method(plan.weights, plan.settings.weights.method)
-    return track(plan.reference, deformed, Start(displacement=start), plan.solver, method)
+    return track(plan.reference, deformed, Start(displacement=start), plan.solver, _method(plan))
+
+
+def _method(plan: Plan) -> PrecisionMethod | None:
+    return precision_method(plan.weights, plan.settings.weights.method)
 
 
 def _beyond_affine(solution: Solution) -> float:
@@ -403,13 +411,59 @@ def _beyond_affine(solution: Solution) -> float:
     return _rms(np.asarray(moved - basis @ np.linalg.lstsq(basis, moved, rcond=None)[0]))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Field:
+    """Displacement and strain (N, 5) on a mesh, and their noise."""
+
+    mesh: Tri3Mesh
+    values: FloatArray
+    noise: FloatArray
+
+    @classmethod
+    def of(cls, mesh: Tri3Mesh, solution: Solution) -> _Field:
+        """Those of a solution, the noise without the misfit of the elements."""
+        values = np.hstack([solution.displacement, solution.strain])
+        return cls(mesh=mesh, values=values, noise=np.hstack([solution.displacement_std, solution.strain_std]))
+
+    def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The field at points (P, 2), by the quadratics through the nodes around each node (`at_pixels`), and noise."""
+        used = np.asarray(np.isfinite(self.values)[self.mesh.elements].all(axis=(1, 2)))
+        known = np.nan_to_num(self.values)
+        _, x, y, xx, xy, yy = (operator @ known for operator in quadratic_fit(self.mesh, used))
+        places = Places.of(self.mesh, points)
+        node, weight = self.mesh.elements[places.element], places.barycentric
+        dx, dy = np.moveaxis(points[:, None] - self.mesh.nodes[node], -1, 0)[..., None]
+        bent = xx[node] * dx * dx / 2 + xy[node] * dx * dy + yy[node] * dy * dy / 2
+        out = np.einsum("pc,pci->pi", weight, self.values[node] + x[node] * dx + y[node] * dy + bent)
+        noise = np.sqrt(np.einsum("pc,pci->pi", weight, self.noise[node] ** 2))
+        return np.where(places.inside[:, None] & used[places.element][:, None], out, np.nan), noise
+
+    def apart(self, finer: Sequence[_Field]) -> tuple[list[float], list[float]]:
+        """How far this field is from each of `finer` elements beyond the noise of both, displacement and strain.
+
+        Halved elements show little of what is far smaller than they are; the finer sizes of a study have measured it.
+        """
+        found: tuple[list[float], list[float]] = ([], [])
+        for other in finer:
+            there, noise = other.at(self.mesh.nodes)
+            square, variance = (self.values - there) ** 2, self.noise**2 + noise**2
+            for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
+                known = np.isfinite(square[:, part] + variance[:, part])
+                beyond, expected = (square - variance)[:, part][known], variance[:, part][known]
+                plain = beyond.sum() > _SURE * np.sqrt(2 * (expected**2).sum() / _INDEPENDENT)
+                errors.append(float(np.sqrt(beyond.mean())) if plain else 0.0)
+        return found
+
+
 def _rms(values: FloatArray) -> float:
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
-def _figures(plan: Plan, key: _KeyFrame, rest: Sequence[Deformed], gauges: Sequence[float]) -> SizeFigures:
-    """The figures of the size of a plan's elements."""
+def _figures(
+    plan: Plan, key: _KeyFrame, rest: Sequence[Deformed], gauges: Sequence[float], finer: list[_Field]
+) -> SizeFigures:
+    """The figures of the size of a plan's elements; its field is added to those of `finer` elements."""
     mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
     before = time.process_time()
     solution = _solve(plan, key.deformed, key.start(mesh))
@@ -419,7 +473,11 @@ def _figures(plan: Plan, key: _KeyFrame, rest: Sequence[Deformed], gauges: Seque
     still = [_solve(plan, deformed, np.zeros_like(mesh.nodes)) for deformed in rest]
     single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
     moved, strain = (_floor([getattr(one, name) for one in still], single) for name in ("displacement", "strain"))
-    error, strain_error = _discretisation(plan, key.deformed, solution)
+    known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, _method(plan))
+    field = _Field.of(mesh, known)
+    errors = [_rms(known.displacement_error), _rms(known.strain_error)]
+    errors = [float(np.fmax.reduce([error, *apart])) for error, apart in zip(errors, field.apart(finer), strict=True)]
+    finer.append(field)
     return SizeFigures(
         element_size=plan.element_size,
         speckles=plan.element_size / speckle,
@@ -429,10 +487,10 @@ def _figures(plan: Plan, key: _KeyFrame, rest: Sequence[Deformed], gauges: Seque
         scatter=moved[1],
         strain_bias=strain[0],
         strain_scatter=strain[1],
-        stated=_rms(solution.displacement_std),
-        strain_stated=_rms(solution.strain_std),
-        discretisation=_rms(error),
-        strain_discretisation=_rms(strain_error),
+        stated=_rms(known.displacement_std),
+        strain_stated=_rms(known.strain_std),
+        discretisation=errors[0],
+        strain_discretisation=errors[1],
         seconds=seconds,
         gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
     )
@@ -471,7 +529,3 @@ def _gauge_figures(
         yield GaugeFigures(
             length=length, noise=floor if np.isfinite(floor) else _rms(loaded.components_std), largest=largest
         )
-
-
-def _discretisation(plan: Plan, deformed: Deformed, solution: Solution) -> tuple[FloatArray, FloatArray]:
-    return np.full((1, 2), np.nan), np.full((1, 3), np.nan)

@@ -1,0 +1,166 @@
+"""Element size from a test's own frames: which one is recommended, and `element_size = "auto"` in a run."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[3]))
+
+from benchmarks.resolution import Scene
+
+from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, InputError
+from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
+from rgbmidic.pipeline.resolution import ResolutionStudy, SizeFigures, study_sizes
+from rgbmidic.settings import TestSettings
+
+STATES = Scene("bump", width=12, height=1.5, noise=0, side=144).images()[0].astype(np.float32)
+NOISE = np.random.default_rng(3).normal(scale=10, size=(5, *STATES[0].shape)).astype(np.float32)
+FRAMES = [STATES[int(place == 3)] + noise for place, noise in enumerate(NOISE)]
+"""Three at rest, one deformed, and one at rest that is no reference."""
+
+
+def settings(**sections: dict[str, object]) -> TestSettings:
+    document = {"frames": {"path": []}, "region": {"rectangle": [8, 8, 135, 135]}, "mesh": {"element_size": "auto"}}
+    return TestSettings.from_mapping(document | sections)
+
+
+def study(*sizes: SizeFigures) -> ResolutionStudy:
+    return ResolutionStudy(frame=1, name="x.tif", static=0, speckle=3.5, preparation=0.1, sizes=sizes)
+
+
+def one(size: float, noise: float, error: float, *, speckles: float = 5.0, measured: float = 1.0) -> SizeFigures:
+    return SizeFigures(element_size=size, speckles=speckles, measured=measured, stated=noise, discretisation=error)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "chosen"),
+    [
+        ([one(10, 0.03, 0.001), one(16, 0.02, 0.01), one(25, 0.012, 0.05)], 16),
+        ([one(10, 0.03, 0.001), one(16, 0.02, 0.0225), one(25, 0.012, 0.05)], 16),  # alike: the larger
+        ([one(10, 0.03, 0.001, speckles=2.9), one(16, 0.02, 0.03), one(25, 0.012, 0.05)], 16),
+        ([one(10, 0.03, 0.001, speckles=np.nan), one(16, 0.02, 0.03)], 10),
+        ([one(10, 0.03, 0.001, measured=0.8), one(16, 0.02, 0.03)], 16),
+        ([one(10, 0.03, np.nan), one(16, 0.02, 0.03), SizeFigures(element_size=25, reason="lost")], 16),
+        ([one(10, 0.03, np.nan), one(16, 0.02, 0.03, speckles=2)], None),
+    ],
+)
+def test_the_size_of_the_least_total_error_is_recommended(sizes, chosen):
+    choice = study(*sizes).choice
+    assert (choice and choice.element_size) == chosen
+
+
+def test_the_noise_floor_counts_where_it_is_above_what_is_stated():
+    figures = replace(one(10, 0.03, 0.04), scatter=0.05)
+    assert (figures.noise, figures.total) == (0.05, np.hypot(0.05, 0.04))
+    assert replace(figures, scatter=0.01).noise == replace(figures, scatter=float("nan")).noise == 0.03
+
+
+def test_the_reason_names_the_neighbours_and_the_speckles():
+    reason = study(
+        one(8, 0.1, 0.0, speckles=2.3), one(10, 0.03, 0.001), one(16, 0.02, 0.01), one(25, 0.01, 0.05)
+    ).choice
+    assert reason is not None
+    for text in ("16 px have the least total error in x.tif: 0.022", "with 10 px the noise is 0.03", "8 px are less"):
+        assert text in reason.reason
+    assert "with 25 px the discretisation error is 0.05" in reason.reason
+
+
+def test_figures_of_a_scene_with_static_frames():
+    found = study_sizes(
+        settings(frames={"path": [], "reference": [0, 1, 2]}), (10, 16, 25), gauges=(50, 80), source=FRAMES
+    )
+    assert (found.frame, found.static) == (3, 3)  # of two candidates the one that is deformed
+    fine, middle, coarse = found.sizes
+    assert fine.scatter > 1.3 * middle.scatter > 1.3**2 * coarse.scatter
+    assert fine.strain_scatter > 1.6 * middle.strain_scatter > 1.6**2 * coarse.strain_scatter
+    for size in found.sizes:  # noise is what the solve states, and rest is rest
+        assert 0.75 < size.scatter / size.stated < 1.33
+        assert size.bias < 0.5 * size.scatter
+        assert size.measured == 1
+        assert size.seconds > 0
+    assert [[gauge.length for gauge in size.gauges] for size in found.sizes] == [[50, 80], [50, 80], [80]]
+    short, long = fine.gauges
+    assert short.noise > 1.8 * long.noise
+    assert short.largest > long.largest
+    assert np.isclose(short.noise, middle.gauges[0].noise, rtol=0.4)
+    assert coarse.discretisation > 2 * middle.discretisation
+
+
+def test_without_static_frames_the_noise_is_as_stated():
+    found = study_sizes(settings(), (16,), frames=(3,), source=FRAMES)
+    assert np.isnan([found.sizes[0].scatter, found.sizes[0].bias, found.sizes[0].strain_scatter]).all()
+    assert found.sizes[0].noise == found.sizes[0].stated > 0
+    assert found.static == 0
+
+
+def test_a_run_takes_the_recommended_size_and_goes_on_with_it(tmp_path, monkeypatch):
+    stated = settings()
+    chosen = resolution.choose(stated, source=FRAMES)
+    auto = measure(stated, tmp_path / "auto", source=FRAMES)
+    kept = auto.provenance["element_size"]
+    assert kept == {"element_size": chosen.element_size, "reason": chosen.reason}
+    assert auto.setting("mesh", "element_size") == "auto"
+    by_hand = measure(replace(stated, element_size=chosen.element_size), tmp_path / "hand", source=FRAMES)
+    np.testing.assert_array_equal(auto.u, by_hand.u)
+    assert "element_size" not in by_hand.provenance
+
+    asked = []
+    monkeypatch.setattr("rgbmidic.pipeline.run.choose", lambda *a, **b: asked.append(a) or chosen)
+    parts = tmp_path / "parts"
+    for part in (range(0, 2), range(2, 5)):
+        last = measure(stated, parts, source=FRAMES, frames=part)
+    assert len(asked) == 1  # by the first part; the second finds it
+    np.testing.assert_array_equal(last.u[3], auto.u[3])
+    measure(stated, parts, source=FRAMES, resume=True)
+    assert len(asked) == 1
+    with pytest.raises(AnotherTestError, match=r"mesh.element_size was \"auto\", now 30"):
+        measure(replace(stated, element_size=30.0), parts, source=FRAMES, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("sections", "given", "error", "text"),
+    [
+        ({"frames": {"path": [], "last": 0}}, {}, FrameError, "no deformed frame.*state a number"),
+        ({}, {"mesh": Plan}, ConfigurationError, "a mesh is given"),
+        ({"frames": {"path": [], "reference": [0, 1], "last": 1}}, {}, FrameError, "no deformed frame"),
+    ],
+)
+def test_auto_is_refused_where_there_is_nothing_to_choose(tmp_path, sections, given, error, text):
+    with pytest.raises(error, match=text):
+        measure(settings(**sections), tmp_path / "out", source=FRAMES, **given)
+    assert not (tmp_path / "out").exists()
+
+
+def test_auto_is_refused_beside_a_mesh_file_and_for_a_live_sequence():
+    with pytest.raises(ConfigurationError, match=r"mesh.element_size is for a mesh made here"):
+        settings(mesh={"element_size": "auto", "file": "x.inp", "points": [[0, 0, 0, 0], [1, 1, 1, 1]]})
+    with pytest.raises(ConfigurationError, match='must be a number or "auto", not "coarse"'):
+        settings(mesh={"element_size": "coarse"})
+    with pytest.raises(ConfigurationError, match="state a number"):
+        list(measure_sequence(FRAMES, settings()))
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"sizes": (10, 60)}, "60 px are too large for the region: 42 px"),
+        ({"sizes": (2,)}, "at least 4 px"),
+        ({"sizes": (25,), "gauges": (40,)}, "40 px at most are too short"),
+        ({"sizes": (25,), "frames": (0,)}, "frame 0 is of the reference"),
+        ({"sizes": (25,), "frames": (9,)}, "frame 9 is not among 0 to 4"),
+    ],
+)
+def test_a_study_refuses_what_does_not_fit(options, text):
+    with pytest.raises(InputError, match=text):
+        study_sizes(settings(), source=FRAMES, **options)
+
+
+def test_frames_of_which_none_can_be_measured():
+    empty = [FRAMES[0], np.random.default_rng(0).normal(1000, 200, FRAMES[0].shape).astype(np.float32)]
+    with pytest.raises(FrameError, match="no deformed frame can be measured: frame 1"):
+        study_sizes(settings(), (16,), source=empty)
