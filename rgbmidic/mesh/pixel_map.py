@@ -281,7 +281,7 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
     return out
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)  # of a mesh and of its halves
 def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
     """Return the nodes that the polynomial of each node is fitted to.
 
@@ -316,7 +316,7 @@ def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
     return np.asarray(np.where(fraction > 0, fraction, 1.0))
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=4)  # with and without the offset
 def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
     """Evaluate 1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element: (N, 6, W)."""
     other = _window(mesh, used)[0]

@@ -18,7 +18,18 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import aside
-from rgbmidic.correlation import Deformed, PrecisionMethod, Reference, Solution, Start, Status, fill, solve, track
+from rgbmidic.correlation import (
+    Deformed,
+    PrecisionMethod,
+    Reference,
+    Solution,
+    Start,
+    Status,
+    discretisation_error,
+    fill,
+    solve,
+    track,
+)
 from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import brightness_change
@@ -281,6 +292,7 @@ def correlate(
     deformed_weights: npt.ArrayLike | None = None,
     normalise: float | None = None,
     statistics: bool | PrecisionMethod = True,
+    mesh_error: bool = False,
     **options: Any,
 ) -> Solution:
     """Measure the displacement between two states seen under k lights (k = 1: plain DIC).
@@ -307,6 +319,8 @@ def correlate(
     statistics
         Weight the lights by what the residual around each pixel shows (`rgbmidic.weights.Statistics`), by a method of
         one's own, or, if False, by `weights` alone.
+    mesh_error
+        Estimate the discretisation error, too (`rgbmidic.discretisation_error`).
     **options
         Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, fill,
         tolerance, max_iterations.
@@ -344,6 +358,8 @@ def correlate(
         solution = track(first, second.result(), Start(displacement=None), solver, method)
     else:
         solution = solve(first, second.result(), start, solver, method)
+    if mesh_error:
+        solution = discretisation_error(first, second.result(), solution, solver, method)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 
