@@ -25,6 +25,12 @@ import numpy as np
 from . import ROOT
 
 Row = dict[str, object]
+
+
+class MissingDataError(Exception):
+    """The files that a table is measured on are not here."""
+
+
 FOLDER = ROOT / "docs" / "tables"
 QUICK_FOLDER = FOLDER / "quick"
 """Committed files of the tables whose quick rows are a smaller case instead of some rows of the full table."""

@@ -11,7 +11,7 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 from benchmarks import ROOT
-from benchmarks.tables import FOLDER, TABLES, Entry, Table, disagreements, load, table, written
+from benchmarks.tables import FOLDER, TABLES, Entry, MissingDataError, Table, disagreements, load, table, written
 
 BROKEN = load()
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -60,7 +60,10 @@ def test_each_file_is_of_a_table():
 @pytest.mark.parametrize("name", TABLES)
 def test_quick_rows_are_those_of_the_page(name):
     entry = TABLES[name]
-    made = Table.of(entry, entry.measure(True))
+    try:
+        made = Table.of(entry, entry.measure(True))
+    except MissingDataError as error:
+        pytest.skip(str(error))
     if not entry.timing:
         assert not disagreements(entry, made, Table.read(entry.committed()))
 
