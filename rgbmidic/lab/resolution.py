@@ -264,7 +264,7 @@ def _figure(study: ResolutionStudy) -> Figure:
             lengths = [gauge.length for one in study.sizes for gauge in one.gauges]
             _finish(axis, lengths, "virtual strain gauge (px)", label)
         if len(axes) > 1:
-            axes[-1].legend(title="elements")
+            axes[-1].legend(title="elements", loc="best")
 
     count = 3 if any(one.gauges for one in study.sizes) else 1
     return draw_figure(draw, count=count, aspect=1.4, beside=NUMBERS)
@@ -280,7 +280,7 @@ def _draw_errors(axis: Axes, study: ResolutionStudy) -> None:
     if np.isfinite(study.speckle):
         axis.axvspan(0.7 * min(sizes), SPECKLES * study.speckle, color="0.93", zorder=0)
     axis.set_xlim(0.85 * min(sizes), 1.18 * max(sizes))
-    axis.legend()
+    axis.legend(loc="best")
     _finish(axis, sizes, "element size (px)", "displacement, rms over the nodes (px)")
 
 

@@ -48,12 +48,15 @@ _MEASURED = 0.9
 """Fraction of the nodes that a size must measure, of the size that measures most: elements that lose more nodes leave
 out those of the largest errors, and their figures are not comparable."""
 _ALIKE = 1.05
-"""Total errors within this factor count as the same, and the larger elements are taken, for their smaller noise of
-strain: what the estimate of a discretisation error is good for at best."""
+"""Total errors of the displacement within this factor count as the same, and those of strain decide: an estimate of the
+discretisation error is no better than that."""
 
 _SURE, _INDEPENDENT = 2.0, 0.5
 """Standard deviations by which a mean square must exceed that of noise, and independent values in a nodal one, whose
 neighbours are correlated. Chosen."""
+_ILL_KNOWN = 3.0
+"""Noise over the median of its field from which a node shows nothing of a coarser one: corners, of which a coarse mesh
+has many. Chosen."""
 _LARGEST = 0.99
 """Quantile over the nodes and components that stands for the largest strain: the very largest is one node's noise."""
 _EQUAL = 0.1
@@ -183,17 +186,18 @@ class ResolutionStudy:
         if not usable:
             return None
         least = min(one.total for one in usable)
-        best = [one for one in usable if one.total <= _ALIKE * least][-1]
-        place = usable.index(best)
+        best = min(
+            (one for one in usable if one.total <= _ALIKE * least), key=lambda one: np.nan_to_num(one.strain_total, nan=np.inf)
+        )
+        smaller, larger = usable[: usable.index(best)][-1:], usable[usable.index(best) + 1 :][:1]
+        lead = "the least" if best.total == least else "within 5 % of the least"
         parts = [
-            f"elements of {best.element_size:g} px have the least total error in {self.name}: {best.total:.2g} px, of "
-            f"noise {best.noise:.2g} px and discretisation error {best.discretisation:.2g} px"
+            f"elements of {best.element_size:g} px have {lead} total error in {self.name}: {best.total:.2g} px, from "
+            f"noise of {best.noise:.2g} px and a discretisation error of {best.discretisation:.2g} px"
         ]
-        parts += [f"with {one.element_size:g} px the noise is {one.noise:.2g} px" for one in usable[:place][-1:]]
-        larger = usable[place + 1 : place + 2]
-        parts += [
-            f"with {one.element_size:g} px the discretisation error is {one.discretisation:.2g} px" for one in larger
-        ]
+        for one, what in (*((one, "noise") for one in smaller), *((one, "discretisation error") for one in larger)):
+            value = one.noise if what == "noise" else one.discretisation
+            parts.append(f"with {one.element_size:g} px it is {one.total:.2g} px, for a {what} of {value:.2g} px")
         if few:
             names = ", ".join(f"{one.element_size:g}" for one in few)
             parts.append(f"{names} px are less than {SPECKLES:g} speckles of {self.speckle:.1f} px")
@@ -446,6 +450,7 @@ class _Field:
         found: tuple[list[float], list[float]] = ([], [])
         for other in finer:
             there, noise = other.at(self.mesh.nodes)
+            noise = np.where(noise > _ILL_KNOWN * np.nanmedian(other.noise, axis=0), np.nan, noise)
             square, variance = (self.values - there) ** 2, self.noise**2 + noise**2
             for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
                 known = np.isfinite(square[:, part] + variance[:, part])

@@ -1,4 +1,4 @@
-"""The command `rgbmidic resolution`: what it prints and writes, what it refuses, and the spatial resolution it states."""
+"""The command `rgbmidic resolution`: what it prints, writes and refuses; the spatial resolution it states."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[3]))
 
 from benchmarks.resolution import Scene
-
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.frames import write_tiff
