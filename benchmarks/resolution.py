@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from rgbmidic.fields import at_nodes
+from rgbmidic.fields import field_rms
 from rgbmidic.pipeline import resolution
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.resolution import SPECKLES, study_sizes
@@ -90,15 +90,14 @@ class Scene:
         )
 
     def true_errors(self, states: Array, field: Array, sizes: tuple[float, ...] = SIZES) -> dict[float, float]:
-        """Error against the truth of elements of each size, rms over the measured nodes and both components, px."""
+        """Error against the truth of elements of each size, rms over the pixels of the region and both components, px."""
         found = {}
         plan = Plan.from_settings(self.settings(), source=list(states.astype(np.float32)))
         deformed = resolution._deformed(plan, 1)
         for size in sizes:
             sized = resolution._resized(plan, size)
             solution = resolution._solve(sized, deformed, None)
-            error = solution.displacement - at_nodes(field, sized.reference.mesh.nodes)
-            found[size] = float(np.sqrt(np.nanmean(error**2)))
+            found[size] = field_rms(sized.reference.mesh, solution.displacement, field)
         return found
 
 
@@ -142,7 +141,7 @@ def judged(scene: Scene) -> Row:
 
 @table("resolution", page="how-to/resolution", cost=40, keys=3)
 def recommended(quick: bool) -> Iterator[Row]:
-    """Element size that `rgbmidic resolution` recommends, beside the one of the least true error (rms at the nodes).
+    """Element size that `rgbmidic resolution` recommends, beside the one of the least true error (rms over the pixels).
 
     Sizes of 10 (where three speckles fit), 16, 25, 40 and 63 px, two frames of 256 px, one draw of speckle and noise.
     """

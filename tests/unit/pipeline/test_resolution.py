@@ -94,6 +94,16 @@ def test_figures_of_a_scene_with_static_frames():
     assert coarse.discretisation > 2 * middle.discretisation
 
 
+def test_what_is_smaller_than_the_elements_is_known_from_the_finer_ones():
+    scene = Scene("bump", width=12, height=1.5, noise=0.05, side=144, seed=2)
+    states, field = scene.images()
+    true = scene.true_errors(states, field, (16, 40))
+    found = study_sizes(settings(), (16, 40), gauges=(), source=list(states.astype(np.float32)))
+    assert true[40] > 3 * true[16]
+    assert 0.8 < found.sizes[1].total / true[40] < 1.25
+    assert found.choice.element_size == 16
+
+
 def test_without_static_frames_the_noise_is_as_stated():
     found = study_sizes(settings(), (16,), frames=(3,), source=FRAMES)
     assert np.isnan([found.sizes[0].scatter, found.sizes[0].bias, found.sizes[0].strain_scatter]).all()
