@@ -90,7 +90,7 @@ class Scene:
         )
 
     def true_errors(self, states: Array, field: Array, sizes: tuple[float, ...] = SIZES) -> dict[float, float]:
-        """Error against the truth of elements of each size, rms over the pixels of the region and both components, px."""
+        """Error of elements of each size, rms over the pixels of the region and both components, px."""
         found = {}
         plan = Plan.from_settings(self.settings(), source=list(states.astype(np.float32)))
         deformed = resolution._deformed(plan, 1)
