@@ -10,6 +10,7 @@ J. Comput. Phys. 103, 1992): undoing that shows the error of strain where waves 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -18,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
-from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import interpolate_nodal
 from rgbmidic._kernels.illumination import scores
@@ -32,10 +32,39 @@ from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_v
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.mesh.pixel_map import quadratic_fit
-from rgbmidic.settings import SolverSettings
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
+from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["discretisation_error"]
+
+
+_STEPS = 2
+"""Gauss-Newton steps on the finer mesh: four more change the difference by less than 1 % (measured)."""
+_DRAWS = 16
+"""Random scores from which the variance of the difference is found: averaged over a window to 6 % (derived)."""
+_NOISES = 2
+"""Images of noise from which is found what both fits leave of it: 800 blocks of 13 px in 380 px, to 5 % (derived)."""
+_SPREAD = 4
+"""Times that squares are averaged with those of the nodes beside: a window of standard deviation 1.5 elements."""
+_OF_DIFFERENCE = np.array([1.05, 1.05, 1.2, 1.2, 1.2])
+"""Error over the difference. Of what the mesh loses the halved one loses 1/16 for displacement and 1/4 for strain where
+waves are long, next to nothing at 3 elements: 1.07 and 4/3 to 1.1 (derived; 1.1 to 1.2 on the DIC Challenge star)."""
+_UNSMOOTHED = 0.72
+"""Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates."""
+_EDGE = 2.5
+"""Error of one-sided slopes over that of central ones (measured on the DIC Challenge star)."""
+_SURE, _SURE_SMOOTH = np.array([0.7, 0.7, 4.0, 4.0, 4.0]), 2.0
+"""Standard deviations of the mean square of noise alone by which the difference must exceed it. Strain's is 3 to 4
+times its noise, so that what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at
+most."""
+_UNEVEN = np.array([1.1, 1.1, 1.3, 1.3, 1.3])
+"""Variance of the difference, and of what is unsmoothed, over that with equal weights: a robust loss weighs pixels
+unevenly (measured on affine fields)."""
+_CHANCE = 0.75
+"""Scores' variance on the finer mesh over that at the recovered field from which it is less by chance: both are known
+to 12 % (67 blocks, `SCORE_RANGE`), and nothing is taken off the stated noise."""
+_HELD = 1e-6
+"""Fraction of the mean texture that is added to that of an element, so that its square root exists (derived)."""
 
 
 def discretisation_error(
@@ -46,6 +75,8 @@ def discretisation_error(
     method: PrecisionMethod | None,
 ) -> Solution:
     """Estimate what mesh and recovery leave out of a solution.
+
+    It takes about as long as the solve; what depends on the reference alone is prepared with its first frame.
 
     Parameters
     ----------
@@ -63,18 +94,17 @@ def discretisation_error(
         uncertainty with both.
     """
     mesh, measured = reference.mesh, solution.measured
-    if not measured.any() or mesh.size < _SMALLEST:
+    if not measured.any() or mesh.size < SMALLEST_HALVED:
         return solution
-    halves = _Halves.of(reference)
-    used = np.asarray(measured[mesh.elements].all(axis=1))
+    halves = _halves(reference)
     with one_blas_thread():
-        fine = _FineField.solve(halves, deformed, solution, used, options, method)
-    own = np.concatenate([solution.displacement, solution.strain], axis=1)
-    std = np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
-    along = fine.noise_ratio / halves.noise_ratio
-    along[along > _CHANCE] = 1
-    std = std * np.sqrt(np.column_stack([along, along, along.mean(axis=1)]))
-    error = halves.error(own - fine.values, solution.strain, std)
+        values, left = _finer_field(halves, deformed, solution, options, method)
+        along = left / halves.noise_ratio
+        along[along > _CHANCE] = 1
+        along = np.sqrt(np.column_stack([along, along, along.mean(axis=1)]))
+        std = along * np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
+        own = np.concatenate([solution.displacement, solution.strain], axis=1)
+        error = halves.error(own - values, solution.strain, std)
     return replace(
         solution,
         displacement_std=std[:, :2],
@@ -84,90 +114,52 @@ def discretisation_error(
     )
 
 
-_SMALLEST = 8.0
-"""Side (px) of the smallest elements that are halved: those of 4 px have some eight samples for six unknowns."""
-_STEPS = 2
-"""Gauss-Newton steps on the finer mesh: what a third would change is 1 % of the difference (measured)."""
-_DRAWS = 24
-"""Random scores from which the variance of the difference is found: averaged over a window to 5 % (derived)."""
-_SPREAD = 4
-"""Times that squares are averaged with those of the nodes beside: a window of standard deviation 1.5 elements."""
-_OF_DIFFERENCE = np.array([1.0, 1.0, 1.2, 1.2, 1.2])
-"""Error over the difference. The finer mesh keeps 1/16 of the displacement's error and 1/4 of the strain's where waves
-are long, nothing at 3 elements: 4/3 to 1.1 for strain."""
-_UNSMOOTHED = 0.72
-"""Second moment of the mass matrix's rows on TRI3 over h^2/3, inverted: what `_Halves.unsmoothed` overstates."""
-_SURE = np.array([1.0, 1.0, 4.0, 4.0, 4.0])
-_SURE_SMOOTH = 2.0
-_UNEVEN = np.array([1.1, 1.1, 1.3, 1.3, 1.3])
-"""Variance of the difference, and of what is unsmoothed, over that with equal weights: a robust loss weighs pixels
-unevenly (measured on affine fields)."""
-_CHANCE = 0.75
-"""Scores' variance on the finer mesh over that at the recovered field from which it is less by chance: both are known to
-12 % (67 blocks, `SCORE_RANGE`), and nothing is taken off the stated noise."""
-_EDGE = 2.5
-"""Error of one-sided slopes over that of central ones."""
+def _finer_field(
+    halves: _Halves,
+    deformed: Deformed,
+    solution: Solution,
+    options: SolverSettings,
+    method: PrecisionMethod | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Take Gauss-Newton steps on the halved mesh from the recovered field.
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _FineField:
-    """The field on the halved mesh.
-
-    Attributes
-    ----------
-    values : ndarray, shape (N, 5)
-        u, v, exx, eyy, exy at the nodes of the coarse mesh.
-    noise_ratio : ndarray, shape (N, 2)
-        Variance of the scores in x and y on the finer mesh over that at the recovered field.
+    Returns
+    -------
+    tuple
+        u, v, exx, eyy, exy (N, 5) at the nodes of the solution, NaN where the finer mesh sees too little; and the
+        variance of the scores in x and y that it leaves, over that at the recovered field, (N, 2).
     """
+    mesh, fine, count = halves.mesh, halves.fine, len(halves.mesh.nodes)
+    used = np.asarray(solution.measured[mesh.elements].all(axis=1))
+    start, curvature = halves.interpolated(solution.displacement[mesh.nearest(solution.measured)[1]], used)
+    functions = rigid_functions(mesh.nodes, options.rigid).reshape(count, -1)
+    functions = halves.prolonged(functions).reshape(2 * len(start), -1)
+    problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
+    estimate = Estimate(displacement=start, rigid=np.nan_to_num(solution.rigid))
+    first = compare(problem, fine.values, estimate)
+    values = corrected_values(first, options.brightness)
+    first = replace(first, values=values, difference=first.difference_from(values))
+    children = np.repeat(used, len(_CHILDREN))
+    given = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
+    weights, loss = _weighed(method, first, given)
+    equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
+    for number in range(_STEPS):
+        estimate = stepped(problem, equations, values, estimate, None if number else first.difference)
+    # a robust loss bends less than the weights of one residual state: with these the steps are too short
+    found = start + loss[:, None] * (estimate.displacement - start)
+    last = compare(problem, values, replace(estimate, displacement=found))
+    recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
+    before = _score_variance(first.without(np.zeros_like(start), curvature), weights, mesh.size)
+    after = halves.straightened(last, recovery, found)
+    ratio = _score_variance(after, _weighed(method, last, given)[0], fine.mesh.size) / np.maximum(before, _TINY)
+    known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
+    field = np.concatenate([recovery.displacement(found), recovery.strain(found)], axis=1)
+    around = [fine.mesh.to_nodes(part * fine.mesh.areas) for part in ratio.T]
+    ratio = np.stack(around, axis=1) / fine.mesh.to_nodes(fine.mesh.areas)[:, None]
+    return np.where(known[:, None], field, np.nan), ratio[:count]
 
-    values: FloatArray
-    noise_ratio: FloatArray
 
-    @classmethod
-    def solve(
-        cls,
-        halves: _Halves,
-        deformed: Deformed,
-        solution: Solution,
-        used: BoolArray,
-        options: SolverSettings,
-        method: PrecisionMethod | None,
-    ) -> _FineField:
-        """Take Gauss-Newton steps from the recovered field."""
-        mesh, fine = halves.mesh, halves.fine
-        known = solution.displacement[mesh.nearest(solution.measured)[1]]
-        start, curvature = halves.interpolated(known, used)
-        functions = rigid_functions(mesh.nodes, options.rigid)
-        rigid = np.nan_to_num(solution.rigid)
-        functions = halves.prolonged(functions.reshape(len(mesh.nodes), -1)).reshape(2 * len(start), -1)
-        problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
-        estimate = Estimate(displacement=start, rigid=rigid)
-        first = compare(problem, fine.values, estimate)
-        values = corrected_values(first, options.brightness)
-        first = replace(first, values=values, difference=first.difference_from(values))
-        inside = np.repeat(np.repeat(used, 4), np.diff(fine.pixels.offsets))
-        given = first.weights * inside
-        weights, loss = _weighed(method, first, given)
-        equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
-        for number in range(_STEPS):
-            estimate = stepped(problem, equations, values, estimate, None if number else first.difference)
-        # the loss bends less than the weights of one residual say
-        found = start + loss[:, None] * (estimate.displacement - start)
-        last = compare(problem, values, replace(estimate, displacement=found))
-        used = np.repeat(used, 4) & equations.textured[fine.mesh.elements].all(axis=1)
-        recovery, offset = halves.recovery(used, equations.information(fine))
-        last_weights, _ = _weighed(method, last, given)
-        before = _score_variance(first.without(np.zeros_like(start), curvature), weights, mesh.size)
-        after = _score_variance(last.without(*recovery.bend(found, offset)), last_weights, fine.mesh.size)
-        ratio = np.divide(after, before, out=np.ones_like(after), where=before > 0)
-        count = len(mesh.nodes)
-        known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
-        field = np.concatenate([recovery.displacement(found), recovery.strain(found)], axis=1)[:count]
-        return cls(
-            values=np.where(known[:, None], field, np.nan),
-            noise_ratio=_at_nodes(fine.mesh, ratio)[:count],
-        )
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 def _weighed(method: PrecisionMethod | None, residual: Residual, given: FloatImage) -> tuple[FloatImage, FloatArray]:
@@ -180,7 +172,7 @@ def _weighed(method: PrecisionMethod | None, residual: Residual, given: FloatIma
 
 
 def _score_variance(residual: Residual, weights: FloatImage, size: float) -> FloatArray:
-    """Variance of the fit's noise in x and y (E, 2), by the scores of blocks, up to a factor."""
+    """Variance of the scores in x and y (E, 2) over the square of their information, per pixel, around each element."""
     pixels, mesh = residual.reference.pixels, residual.reference.mesh
     side = block_side(pixels, size)
     sums = np.empty((4, weights.shape[1]), dtype=np.float32)
@@ -191,16 +183,26 @@ def _score_variance(residual: Residual, weights: FloatImage, size: float) -> Flo
         for grid in (x * x, y * y, information, count)
     )
     scale = np.divide(count, information**2, out=np.zeros_like(count), where=information > 0)
-    variance = np.stack([xx * scale, yy * scale], axis=-1)
     place = mesh.nodes[mesh.elements].mean(axis=1)[:, ::-1] - pixels.bounds[:2]
     row, column = np.clip(np.round(place / side - 0.5).astype(int), 0, np.array(count.shape) - 1).T
-    return np.asarray(variance[row, column])
+    return np.stack([(xx * scale)[row, column], (yy * scale)[row, column]], axis=1)
 
 
-def _at_nodes(mesh: Tri3Mesh, per_element: FloatArray) -> FloatArray:
-    """Mean (N, C) of values (E, C) over the elements around each node."""
-    sums = [mesh.to_nodes(part * mesh.areas) for part in per_element.T]
-    return np.stack(sums, axis=1) / mesh.to_nodes(mesh.areas)[:, None]
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Gains:
+    """What noise does, by draws of it.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (N, 8)
+        Variance of the difference of both fields over that of the coarse one (5), and of `_Halves.unsmoothed` strain
+        over that of strain (3).
+    scatter : ndarray, shape (N, 8)
+        Relative standard deviation of their mean square over a window.
+    """
+
+    variance: FloatArray
+    scatter: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -217,33 +219,33 @@ class _Halves:
         The two nodes that each other node of the finer mesh is between.
     around : csr_matrix, shape (N, N)
         Mean over each node and those beside it, boundary and interior apart.
-    difference_gain : ndarray, shape (N, 5)
-        Variance of the difference of both fields over that of the coarse one.
-    unsmoothed_gain : ndarray, shape (N, 3)
-        Variance of `unsmoothed` strain over that of strain.
-    scatter : ndarray, shape (N, 8)
-        Standard deviation of the mean square of both over a window, relative.
+    unsmooth
+        Takes strain (N, C) to ``(M^-1 L - 1) s``, 0 at the boundary: what recovered slopes of a smooth field have lost.
+    gains
+        Of noise; None before they are found.
     noise_ratio : float
-        That of `_FineField`, of noise alone.
+        Ratio of the scores' variances (`_finer_field`) of noise alone.
     """
 
     mesh: Tri3Mesh
     fine: Reference
     ends: npt.NDArray[np.int64]
     around: sp.csr_matrix
-    difference_gain: FloatArray
-    unsmoothed_gain: FloatArray
-    scatter: FloatArray
-    noise_ratio: float
-
-    @classmethod
-    def of(cls, reference: Reference) -> _Halves:
-        """Halve the elements of a reference; the last result is kept."""
-        return _halves(reference)
+    unsmooth: Callable[[FloatArray], FloatArray]
+    gains: _Gains | None = None
+    noise_ratio: float = 1.0
 
     def prolonged(self, nodal: FloatArray) -> FloatArray:
-        """Linear interpolation at the nodes of the finer mesh."""
+        """Interpolate linearly at the nodes of the finer mesh."""
         return np.concatenate([nodal, nodal[self.ends].mean(axis=1)])
+
+    def restricted(self, sums: FloatArray) -> FloatArray:
+        """Sum right-hand sides (2 M, R) of the finer mesh to those (2 N, R) of the coarse one."""
+        parts, count = sums.reshape(-1, 2, *sums.shape[1:]), len(self.mesh.nodes)
+        total = parts[:count].copy()
+        for end in self.ends.T:
+            np.add.at(total, end, parts[count:] / 2)
+        return total.reshape(2 * count, *sums.shape[1:])
 
     def interpolated(self, field: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Interpolate a field (N, 2) between nodes with its second derivatives there, and interpolate these."""
@@ -255,168 +257,181 @@ class _Halves:
         fine[len(field) :] -= np.einsum("nct,nt->nc", second[len(field) :], squares) / 8
         return fine, second
 
-    def recovery(self, used: BoolArray, information: FloatArray) -> tuple[Recovery, FloatArray]:
-        """Recovery on the finer mesh, and the linear fit's offset there."""
-        geometry = self.fine.geometry
-        return Recovery.over(geometry.material, used, information, geometry.linear_offset), geometry.linear_offset
+    def recovery(self, used: BoolArray, equations: Equations) -> Recovery:
+        """Recover the field on the finer mesh, at the nodes of the coarse one."""
+        geometry, information = self.fine.geometry, equations.information(self.fine)
+        return Recovery.over(geometry.material, used, information, geometry.linear_offset, len(self.mesh.nodes))
+
+    def straightened(self, residual: Residual, recovery: Recovery, found: FloatArray) -> Residual:
+        """Take out what the recovered field (its fit on the finer mesh is `found`) has over that fit."""
+        carried, second = recovery.bend(found, self.fine.geometry.linear_offset)
+        return residual.without(self.prolonged(carried), self.prolonged(second))
 
     def averaged(self, values: FloatArray) -> FloatArray:
-        """Weighted mean (N, C) over a window of some 1.5 elements; NaN takes no part."""
+        """Mean (N, C) over a window of some 1.5 elements; NaN takes no part."""
         known = np.isfinite(values)
         total, number = np.where(known, values, 0), known.astype(np.float64)
         for _ in range(_SPREAD):
             total, number = self.around @ total, self.around @ number
-        return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
-
-    def unsmoothed(self, strain: FloatArray) -> FloatArray:
-        """``(M^-1 L - 1) s``, the boundary held: what recovered slopes (N, C) of a smooth field have lost."""
-        return _unsmoothing(self.mesh)(np.nan_to_num(strain))
+        return np.asarray(np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0))
 
     def error(self, difference: FloatArray, strain: FloatArray, std: FloatArray) -> FloatArray:
         """Error (N, 5) from the difference of the two fields (N, 5), strain (N, 3) and noise (N, 5)."""
-        edge = self.mesh.on_boundary
-        noise, sure = std**2 * self.difference_gain, _SURE * self.scatter[:, :5] * (1 + edge[:, None])
-        square = _OF_DIFFERENCE**2 * self._beyond(difference, _UNEVEN * noise, sure)
-        unsmoothed = np.where(edge[:, None], np.nan, self.unsmoothed(strain))
-        noise = _UNEVEN[2:] * std[:, 2:] ** 2 * self.unsmoothed_gain
-        smooth = _UNSMOOTHED**2 * self._beyond(unsmoothed, noise, _SURE_SMOOTH * self.scatter[:, 5:])
-        smooth[edge] = _EDGE**2 * self._beside_edge(smooth)[edge]
-        square[:, 2:] = np.fmax(square[:, 2:], smooth)
-        return np.sqrt(square)
-
-    def _beside_edge(self, values: FloatArray) -> FloatArray:
-        """Mean of interior values (N, C) over the nodes beside each."""
-        inner = ~self.mesh.on_boundary
-        i, j = self.mesh.neighbours.T
-        near = sp.csr_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), shape=(len(inner),) * 2)
-        number = near @ (inner[:, None] & np.isfinite(values)).astype(np.float64)
-        total = near @ np.where(inner[:, None], np.nan_to_num(values), 0)
-        return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
+        assert self.gains is not None
+        noise = np.concatenate([_UNEVEN, _UNEVEN[2:]]) * self.gains.variance * std[:, _OF] ** 2
+        edge = self.mesh.on_boundary[:, None]
+        sure = np.append(_SURE, [_SURE_SMOOTH] * 3) * self.gains.scatter * (1 + edge / 2)
+        unsmoothed = np.where(edge, np.nan, self.unsmooth(np.nan_to_num(strain)))
+        square = self._beyond(np.concatenate([difference, unsmoothed], axis=1), noise, sure)
+        square *= np.append(_OF_DIFFERENCE, [_UNSMOOTHED] * 3) ** 2
+        smooth = np.where(edge, _EDGE**2 * self._inside(square[:, 5:]), square[:, 5:])
+        return np.asarray(np.sqrt(np.concatenate([square[:, :2], np.fmax(square[:, 2:5], smooth)], axis=1)))
 
     def _beyond(self, values: FloatArray, variance: FloatArray, sure: FloatArray) -> FloatArray:
-        """Mean square of values around each node beyond their noise, where it is surely beyond."""
-        known = np.isfinite(values * variance) & (variance > 0)
-        weight = np.where(known, 1 / np.where(known, variance, 1), np.nan)
-        scale = self.averaged(weight)
-        square, noise = self.averaged(weight * np.where(known, values, 0) ** 2) / scale, 1 / scale
-        return np.where(np.isnan(square), np.nan, np.where(square > noise * (1 + sure), square - noise, 0.0))
+        """Mean square around each node beyond the noise, 0 where it may be noise; nodes count by their precision."""
+        known = np.isfinite(values) & (variance > 0)
+        weight = np.divide(1, variance, out=np.full_like(variance, np.nan), where=known)
+        noise = 1 / self.averaged(weight)
+        square = noise * self.averaged(weight * np.where(known, values, 0) ** 2)
+        return np.where(square > noise * (1 + sure), square - noise, np.where(np.isnan(square), np.nan, 0))
+
+    def _inside(self, values: FloatArray) -> FloatArray:
+        """Mean (N, C) of interior values over the nodes beside each."""
+        inner = ~self.mesh.on_boundary[:, None] & np.isfinite(values)
+        (i, j), total, number = self.mesh.neighbours.T, np.zeros_like(values), np.zeros_like(values)
+        for one, other in ((i, j), (j, i)):
+            np.add.at(total, one, np.where(inner, values, 0)[other])
+            np.add.at(number, one, inner[other])
+        return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
+
+
+_OF = [0, 1, 2, 3, 4, 2, 3, 4]
+"""Field to whose noise that of each of the eight quantities is compared."""
+_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+"""Corners of the four parts of an element, 3 to 5 being the middles of its edges 01, 12 and 20."""
 
 
 @lru_cache(maxsize=1)
-def _unsmoothing(mesh: Tri3Mesh) -> AnyArray:
-    mass = mass_matrix(mesh).tocsr()
-    lumped = np.asarray(mass.sum(axis=1)).ravel()
-    edge = mesh.on_boundary
-    inner, outer = np.flatnonzero(~edge), np.flatnonzero(edge)
-    factors = splu(mass[inner][:, inner].tocsc()) if inner.size else None
-
-    def apply(strain: FloatArray) -> FloatArray:
-        out = np.zeros_like(strain)
-        if factors is not None:
-            right = lumped[inner, None] * strain[inner] - mass[inner][:, outer] @ strain[outer]
-            out[inner] = factors.solve(right) - strain[inner]
-        return out
-
-    return apply
-
-
-def _split(mesh: Tri3Mesh) -> tuple[Tri3Mesh, npt.NDArray[np.int64]]:
-    """Each element in four, its children together, and the ends (M, 2) of the edges in whose middle a node is added."""
-    corners, count = mesh.elements.astype(np.int64), len(mesh.nodes)
+def _halves(reference: Reference) -> _Halves:
+    """Halve the elements of a reference; the last result is kept."""
+    mesh, count = reference.mesh, len(reference.mesh.nodes)
+    corners = mesh.elements.astype(np.int64)
     edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
     keys, place = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
     ends = np.stack(np.divmod(keys, count), axis=1)
-    (a, b, c), (ab, bc, ca) = corners.T, count + place.reshape(3, -1)
-    children = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
-    return Tri3Mesh(nodes=np.concatenate([mesh.nodes, mesh.nodes[ends].mean(axis=1)]), elements=children), ends
+    six = np.concatenate([corners, count + place.reshape(3, -1).T], axis=1)
+    nodes = np.concatenate([mesh.nodes, mesh.nodes[ends].mean(axis=1)])
+    fine_mesh = Tri3Mesh(nodes=nodes, elements=six[:, _CHILDREN].reshape(-1, 3))
+    edge = mesh.on_boundary
+    i, j = mesh.neighbours[edge[mesh.neighbours[:, 0]] == edge[mesh.neighbours[:, 1]]].T
+    itself = np.arange(count)
+    row, column = np.concatenate([i, j, itself]), np.concatenate([j, i, itself])
+    number = np.bincount(row, minlength=count)
+    halves = _Halves(
+        mesh=mesh,
+        fine=_on_mesh(reference, fine_mesh),
+        ends=ends,
+        around=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
+        unsmooth=_unsmoothing(mesh),
+    )
+    return _with_noise(halves, reference)
 
 
-_CHILDREN = np.array(
-    [
-        [[1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5]],
-        [[0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5]],
-        [[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]],
-        [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]],
-    ]
-)
-"""Values of an element's shape functions (last axis) at the corners of its four children."""
-
-
-def _refined_reference(reference: Reference, mesh: Tri3Mesh) -> Reference:
-    """The same reference on a finer mesh of the same pixels."""
+def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
+    """Return a reference on another mesh of the same pixels."""
     old = reference.pixels
     region = Region.from_mask(old.scatter(np.ones(old.local_x.size, dtype=np.float32)) > 0)
     geometry = ReferenceGeometry.of(mesh, region, reference.origin, None)
 
     def moved(values: FloatImage) -> FloatImage:
-        flat = values.reshape(-1, values.shape[-1])
-        images = [geometry.pixels.gather(old.scatter(row)) for row in flat]
-        return np.array(images, dtype=np.float32).reshape(*values.shape[:-1], geometry.pixels.local_x.size)
+        out = np.empty((*values.shape[:-1], geometry.pixels.local_x.size), dtype=np.float32)
+        for row, place in zip(values.reshape(-1, values.shape[-1]), out.reshape(-1, out.shape[-1]), strict=True):
+            place[:] = geometry.pixels.gather(old.scatter(row))
+        return out
 
-    arrays = ("values", "gradient", "pixel_weights", "texture", "channel_specific")
     return replace(
-        reference, geometry=geometry, unfitted=1.0, **{name: moved(getattr(reference, name)) for name in arrays}
+        reference,
+        geometry=geometry,
+        values=moved(reference.values),
+        gradient=moved(reference.gradient),
+        pixel_weights=moved(reference.pixel_weights),
+        texture=moved(reference.texture),
+        channel_specific=moved(reference.channel_specific),
     )
 
 
-@lru_cache(maxsize=1)
-def _halves(reference: Reference) -> _Halves:
-    mesh, count = reference.mesh, len(reference.mesh.nodes)
-    fine_mesh, ends = _split(mesh)
-    fine = _refined_reference(reference, fine_mesh)
-    edge = mesh.on_boundary
-    i, j = mesh.neighbours[edge[mesh.neighbours[:, 0]] == edge[mesh.neighbours[:, 1]]].T
-    itself = np.arange(count)
-    row, column = np.concatenate([i, j, itself]), np.concatenate([j, i, itself])
-    around = sp.csr_matrix((np.ones(row.size), (row, column)), shape=(count, count))
-    halves = _Halves(
-        mesh=mesh, fine=fine, ends=ends, around=sp.diags(1 / np.diff(around.indptr)) @ around,
-        difference_gain=np.ones((count, 5)), unsmoothed_gain=np.ones((count, 3)), scatter=np.ones((count, 8)), noise_ratio=1.0,
-    )  # fmt: skip
-    return _with_noise(halves, reference)
+def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
+    """See `_Halves.unsmooth`."""
+    mass, edge = mass_matrix(mesh).tocsr(), mesh.on_boundary
+    lumped = np.asarray(mass.sum(axis=1)).ravel()
+    inner, outer = np.flatnonzero(~edge), np.flatnonzero(edge)
+    solve = splu(mass[inner][:, inner].tocsc()).solve if inner.size else None
+
+    def unsmooth(strain: FloatArray) -> FloatArray:
+        out = np.zeros_like(strain)
+        if solve is not None:
+            right = lumped[inner, None] * strain[inner] - mass[inner][:, outer] @ strain[outer]
+            out[inner] = solve(right) - strain[inner]
+        return out
+
+    return unsmooth
 
 
 def _with_noise(halves: _Halves, reference: Reference) -> _Halves:
-    """Find the gains of noise from draws of it."""
-    mesh, fine, count = halves.mesh, halves.fine, len(halves.mesh.nodes)
-    random = np.random.default_rng(0)
-    weights = fine.pixel_weights
-    equations = Equations.build(fine, weights, np.zeros((2 * len(fine.mesh.nodes), 0)), np.zeros_like(fine.mesh.nodes))
-    coarse = Equations.build(
-        reference, reference.pixel_weights, np.zeros((2 * count, 0)), np.zeros_like(mesh.nodes)
+    """Find what noise alone does, from draws: nothing else about it is assumed."""
+    mesh, fine, count, random = halves.mesh, halves.fine, len(halves.mesh.nodes), np.random.default_rng(0)
+    finer, coarse = (
+        Equations.build(one, one.pixel_weights, np.zeros((one.assembly.size, 0)), np.zeros_like(one.mesh.nodes))
+        for one in (fine, reference)
     )
-    everywhere = np.ones(len(mesh.elements), dtype=bool)
-    offset = reference.geometry.linear_offset
-    recovery = Recovery.over(reference.geometry.material, everywhere, coarse.information(reference), offset)
-    finer, fine_offset = halves.recovery(np.repeat(everywhere, 4), equations.information(fine))
-    # scores with the covariance of the Hessian, element by element
+    geometry = reference.geometry
+    everywhere, information = np.ones(len(mesh.elements), dtype=bool), coarse.information(reference)
+    recovery = Recovery.over(geometry.material, everywhere, information, geometry.linear_offset)
+    fine_recovery = halves.recovery(np.repeat(everywhere, len(_CHILDREN)), finer)
+    drawn = _scores(finer, random)
+    right = np.stack([fine.assembly.vector(one) for one in drawn], axis=1)
+    fields = _fields(recovery, coarse.solve(halves.restricted(right)))
+    strain = np.ascontiguousarray(fields[..., 2:])
+    unsmoothed = halves.unsmooth(strain.reshape(count, -1)).reshape(strain.shape)
+    unsmoothed[mesh.on_boundary] = np.nan
+    difference = fields - _fields(fine_recovery, finer.solve(right))
+    squares = np.concatenate([difference, unsmoothed], axis=2) ** 2
+    means = halves.averaged(squares.reshape(count, -1)).reshape(squares.shape)
+    typical = means.mean(axis=1)
+    own = halves.averaged((fields**2).mean(axis=1))[:, _OF]
+    scatter = np.sqrt(halves.averaged(means.var(axis=1) / typical**2))
+    ratios = []
+    for _ in range(_NOISES):
+        noise = np.stack([apply_prefilter(one, fine.prefilter) for one in _white(random, fine)])
+        noise = fine.pixels.gather(noise)
+        lights = zip(fine.pixel_weights, noise, fine.gradient.swapaxes(0, 1), strict=True)
+        side = fine.assembly.vector(np.sum([fine.projected(*light) for light in lights], axis=0))
+        fit = recovery.displacement(coarse.solve(halves.restricted(side)).reshape(-1, 2))
+        start, curvature = halves.interpolated(fit, everywhere)
+        found = finer.solve(side).reshape(-1, 2)
+        before = _left(fine, noise, start).without(np.zeros_like(start), curvature)
+        after = halves.straightened(_left(fine, noise, found), fine_recovery, found)
+        pair = ((after, fine.mesh.size), (before, mesh.size))
+        ratios.append([_score_variance(one, fine.pixel_weights, size).sum(axis=1) for one, size in pair])
+    last, first = np.sum(ratios, axis=0) @ fine.mesh.areas
+    return replace(halves, gains=_Gains(variance=typical / own, scatter=scatter), noise_ratio=float(last / first))
+
+
+def _white(random: np.random.Generator, reference: Reference) -> FloatImage:
+    """White noise (k, H, W)."""
+    return random.standard_normal((len(reference.values), *reference.pixels.shape), dtype=np.float32)
+
+
+def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:
+    """Element vectors (draws, E, 3, 2) of random scores with the covariance of the Hessian."""
     blocks = equations.blocks
     covariance = np.empty((len(blocks), 6, 6))
     for a in range(2):
         for b in range(2):
             covariance[:, a::2, b::2] = blocks[..., a + b]
-    covariance += 1e-6 * np.trace(blocks.sum(axis=0).sum(axis=0)[..., [0, 2]].sum() * np.eye(6)) / len(blocks) * np.eye(6)
-    root = np.linalg.cholesky(covariance)
-    drawn = (root @ random.standard_normal((len(blocks), 6, _DRAWS))).reshape(len(blocks), 3, 2, _DRAWS)
-    right = np.stack([fine.assembly.vector(drawn[..., draw]) for draw in range(_DRAWS)], axis=1)
-    lower = right.reshape(-1, 2, _DRAWS)
-    restricted = lower[:count].copy()
-    for end in halves.ends.T:
-        np.add.at(restricted, end, lower[count:] / 2)
-    fields = _fields(recovery, coarse.solve(restricted.reshape(2 * count, _DRAWS)))
-    fine_fields = _fields(finer, equations.solve(right))[:count]
-    flat = np.ascontiguousarray(fields[..., 2:]).reshape(count, -1)
-    unsmoothed = halves.unsmoothed(flat).reshape(count, _DRAWS, 3)
-    unsmoothed[mesh.on_boundary] = np.nan
-    drawn = np.concatenate([fields - fine_fields, unsmoothed], axis=2) ** 2
-    means = halves.averaged(drawn.reshape(count, -1)).reshape(count, _DRAWS, 8)
-    scatter = halves.averaged(means.var(axis=1) / means.mean(axis=1) ** 2) ** 0.5
-    gains = means.mean(axis=1) / halves.averaged((fields**2).mean(axis=1))[:, [0, 1, 2, 3, 4, 2, 3, 4]]
-    ratios = [_drawn_ratio(halves, reference, equations, coarse, finer, recovery, random) for _ in range(2)]
-    return replace(
-        halves, difference_gain=gains[:, :5], unsmoothed_gain=gains[:, 5:], scatter=scatter,
-        noise_ratio=float(np.mean(ratios)),
-    )  # fmt: skip
+    covariance += _HELD * np.trace(covariance.mean(axis=0)) * np.eye(6)
+    drawn = np.linalg.cholesky(covariance) @ random.standard_normal((len(blocks), 6, _DRAWS))
+    return np.moveaxis(drawn, 2, 0).reshape(_DRAWS, -1, 3, 2)
 
 
 def _fields(recovery: Recovery, fitted: FloatArray) -> FloatArray:
@@ -426,50 +441,10 @@ def _fields(recovery: Recovery, fitted: FloatArray) -> FloatArray:
     return np.stack([recovery.value @ u, recovery.value @ v, xu, yv, (yu + xv) / 2], axis=-1)
 
 
-def _drawn_ratio(
-    halves: _Halves,
-    reference: Reference,
-    equations: Equations,
-    coarse: Equations,
-    finer: Recovery,
-    recovery: Recovery,
-    random: np.random.Generator,
-) -> float:
-    """Ratio of the scores' variances of `_FineField` for white noise that went through the prefilter."""
-    fine, shape = halves.fine, halves.fine.pixels.shape
-    noise = np.stack(
-        [
-            fine.pixels.gather(apply_prefilter(random.standard_normal(shape, dtype=np.float32), fine.prefilter))
-            for _ in fine.values
-        ]
-    )
-    right = fine.assembly.vector(
-        sum(fine.projected(*light) for light in zip(fine.pixel_weights, noise, fine.gradient.swapaxes(0, 1), strict=True))
-    )
-    count = len(halves.mesh.nodes)
-    lower = right.reshape(-1, 2)
-    restricted = lower[:count].copy()
-    for end in halves.ends.T:
-        np.add.at(restricted, end, lower[count:] / 2)
-    found = equations.solve(right).reshape(-1, 2)
-    start, curvature = halves.interpolated(
-        recovery.displacement(coarse.solve(restricted.ravel()).reshape(-1, 2)), np.ones(len(halves.mesh.elements), bool)
-    )
-    before, after = (_left(fine, noise, field) for field in (start, found))
-    before = before.without(np.zeros_like(start), curvature)
-    after = after.without(*finer.bend(found, fine.geometry.linear_offset))
-    first, last = (
-        _score_variance(residual, fine.pixel_weights, size)
-        for residual, size in ((before, halves.mesh.size), (after, fine.mesh.size))
-    )
-    return float((fine.mesh.areas @ last).sum() / (fine.mesh.areas @ first).sum())
-
-
-def _left(fine: Reference, noise: FloatImage, field: FloatArray) -> Residual:
-    """Residual that is left of noise (k, P) by a fit (N, 2) to it."""
+def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residual:
+    """Residual that a displacement (N, 2) leaves of noise (k, P)."""
     shown = np.empty((2, noise.shape[1]), dtype=np.float32)
-    interpolate_nodal(field, fine.mesh.elements, *fine.pixels.positions, shown)
-    left = noise - fine.gradient[0] * shown[0] - fine.gradient[1] * shown[1]
-    return Residual(
-        reference=fine, values=fine.values, weights=fine.pixel_weights, difference=left, moments=np.zeros(0)
-    )
+    interpolate_nodal(field, reference.mesh.elements, *reference.pixels.positions, shown)
+    left = noise - reference.gradient[0] * shown[0] - reference.gradient[1] * shown[1]
+    weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
+    return Residual(reference=reference, values=reference.values, weights=weights, difference=left, moments=moments)

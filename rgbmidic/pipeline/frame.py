@@ -47,6 +47,7 @@ from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import Statistics, as_weights, precision_method
 
 __all__ = [
+    "STRIDE",
     "as_weights",
     "correlate",
     "failed_frame",
@@ -60,6 +61,8 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
+STRIDE = 16
+"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
 _THUMBNAIL = 256
 """Longest side in px of the picture of the weights that is kept of every frame."""
 _DARK = 0.3
@@ -185,6 +188,9 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         solution = replace(solution, reason="; ".join([solution.reason, *causes]))
         end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
         logger.warning("frame %d (%s) %s: %s", index, name, end, solution.reason)
+    if _asks_for_error(plan, index) and solution.measured.any():
+        with stage("conclusion"):
+            solution = discretisation_error(reference, deformed, solution, plan.solver, method)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     moved = solution.displacement - reference.offset(deformed)
     brightness = brightness_change(plan.images.values, images.values, reference, moved)
@@ -203,6 +209,12 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": inputs,
     }
+
+
+def _asks_for_error(plan: Plan, index: int) -> bool:
+    """Whether the settings ask for the discretisation error of a frame."""
+    asked, place = plan.settings.mesh_error, plan.series.chosen.index(index)
+    return asked is True or (asked == "key" and (place % STRIDE == 0 or place == len(plan.series.chosen) - 1))
 
 
 def _causes(
