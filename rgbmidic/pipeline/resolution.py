@@ -17,7 +17,7 @@ import numpy as np
 
 from rgbmidic.correlation import Deformed, PrecisionMethod, Reference, Solution, Start, Status, track
 from rgbmidic.correlation.discretisation import discretisation_error
-from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
@@ -38,6 +38,8 @@ SIZES = (10.0, 16.0, 25.0, 40.0, 63.0)
 noise by as much and the discretisation error of a smooth field by 4 (its third power)."""
 SPECKLES = 3.0
 """Least number of speckles on the side of an element (iDICs Good Practices Guide, for subsets)."""
+_LEAST = 4.0
+"""Smallest elements, px (`Tri3Mesh.from_region`)."""
 _FEWEST = 3.0
 """Elements across the region: fewer have no node with neighbours on all sides, and no virtual strain gauge."""
 _CANDIDATES = 5
@@ -209,10 +211,20 @@ def largest_size(plan: Plan) -> float:
 
 
 def sizes_to_try(plan: Plan) -> tuple[float, ...]:
-    """The `SIZES` that hold enough speckles and of which enough lie in the region; the nearest to that if none does."""
-    least, most = SPECKLES * (plan.speckle or 0.0), largest_size(plan)
-    least = max(least, 4.0)
-    return tuple(size for size in SIZES if least <= size <= most) or (float(np.ceil(min(least, max(most, 4.0)))),)
+    """The `SIZES` that hold enough speckles and of which enough lie in the region; the nearest to that if none does.
+
+    Raises
+    ------
+    RegionError
+        The region is too small for any.
+    """
+    least, most = max(SPECKLES * (plan.speckle or 0.0), _LEAST), largest_size(plan)
+    if most < _LEAST:
+        raise RegionError(
+            f"the region is too small to compare element sizes: {_FEWEST:g} elements of {_LEAST:g} px must lie across "
+            "it; state mesh.element_size"
+        )
+    return tuple(size for size in SIZES if least <= size <= most) or (float(np.floor(min(least, most))),)
 
 
 def study_sizes(
@@ -258,6 +270,8 @@ def study_sizes(
     if settings.mesh_file is not None or given.get("mesh") is not None:
         what = "a mesh is given" if settings.mesh_file is None else f"mesh.file names {settings.mesh_file}"
         raise ConfigurationError(f"{what}, whose elements have their sizes: one is found for a mesh made here only")
+    if sizes and min(sizes) < _LEAST:
+        raise InputError(f"elements of {min(sizes):g} px are too small: {_LEAST:g} px are the least")
     middle = min(sizes, key=lambda size: abs(size - ELEMENT_SIZE), default=ELEMENT_SIZE)
     plan = Plan.from_settings(replace(settings, element_size=middle), **given)
     sizes = tuple(sorted(sizes)) or sizes_to_try(plan)
@@ -350,11 +364,11 @@ class _KeyFrame:
                 deformed = _deformed(plan, index)
                 seconds = time.process_time() - before
                 solution = _solve(plan, deformed, None)
+                if solution.status is Status.FAILED:
+                    raise FrameError(solution.reason)
             except RgbmidicError as error:
+                logger.warning("frame %d (%s) is passed over: %s", index, plan.series.name(index), error)
                 reasons.append(f"{plan.series.name(index)}: {error}")
-                continue
-            if solution.status is Status.FAILED:
-                reasons.append(f"{plan.series.name(index)}: {solution.reason}")
                 continue
             if (rest := _beyond_affine(solution)) > most:
                 mesh = plan.reference.mesh

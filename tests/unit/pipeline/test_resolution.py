@@ -12,7 +12,7 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[3]))
 
 from benchmarks.resolution import Scene
-from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, InputError
+from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, InputError, RegionError
 from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
 from rgbmidic.pipeline.resolution import ResolutionStudy, SizeFigures, study_sizes
 from rgbmidic.settings import TestSettings
@@ -74,15 +74,19 @@ def test_the_reason_names_the_neighbours_and_the_speckles():
 
 
 def test_figures_of_a_scene_with_static_frames():
-    found = study_sizes(
-        settings(frames={"path": [], "reference": [0, 1, 2]}), (10, 16, 25), gauges=(50, 80), source=FRAMES
-    )
+    stated = settings(frames={"path": [], "reference": [0, 1, 2]})
+    found = study_sizes(stated, (10, 16, 25), gauges=(50, 80), source=FRAMES)
     assert (found.frame, found.static) == (3, 3)  # of two candidates the one that is deformed
     fine, middle, coarse = found.sizes
     assert fine.scatter > 1.3 * middle.scatter > 1.3**2 * coarse.scatter
     assert fine.strain_scatter > 1.6 * middle.strain_scatter > 1.6**2 * coarse.strain_scatter
+    plan = Plan.from_settings(replace(stated, element_size=25.0), source=FRAMES)
+    at_rest = resolution._deformed(plan, 4)  # no frame of the reference: its displacement is all noise
+    for size in found.sizes[:2]:
+        solution = resolution._solve(resolution._resized(plan, size.element_size), at_rest, None)
+        assert 0.8 < size.scatter / np.sqrt(np.mean(solution.displacement**2)) < 1.25
+        assert 0.8 < size.strain_scatter / np.sqrt(np.mean(solution.strain**2)) < 1.25
     for size in found.sizes:
-        assert 0.4 < size.scatter / size.stated < 1.2  # of a frame that moved, on fewer speckles
         assert size.bias < 0.5 * size.scatter
         assert size.measured == 1
         assert size.seconds > 0
@@ -162,7 +166,7 @@ def test_auto_is_refused_beside_a_mesh_file_and_for_a_live_sequence():
     ("options", "text"),
     [
         ({"sizes": (10, 60)}, "60 px are too large for the region: 42 px"),
-        ({"sizes": (2,)}, "at least 4 px"),
+        ({"sizes": (2,)}, "2 px are too small: 4 px are the least"),
         ({"sizes": (25,), "gauges": (40,)}, "40 px at most are too short"),
         ({"sizes": (25,), "frames": (0,)}, "frame 0 is of the reference"),
         ({"sizes": (25,), "frames": (9,)}, "frame 9 is not among 0 to 4"),
@@ -171,6 +175,25 @@ def test_auto_is_refused_beside_a_mesh_file_and_for_a_live_sequence():
 def test_a_study_refuses_what_does_not_fit(options, text):
     with pytest.raises(InputError, match=text):
         study_sizes(settings(), source=FRAMES, **options)
+
+
+def test_a_frame_that_cannot_be_measured_is_passed_over_with_a_word(caplog):
+    found = study_sizes(settings(), (25,), gauges=(), source=[*FRAMES[:3], FRAMES[3], np.full_like(FRAMES[0], 5)])
+    assert found.frame == 3
+    assert "is passed over" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("corner", "sizes"), [(19, None), (28, (6.0,)), (60, (10.0, 16.0)), (135, (10.0, 16.0, 25.0, 40.0))]
+)
+def test_sizes_that_suit_speckle_and_region(corner, sizes):
+    stated = settings(region={"rectangle": [8, 8, corner, corner]}, mesh={"element_size": 8})
+    plan = replace(Plan.from_settings(stated, source=FRAMES), speckle=3.3)
+    if sizes is None:
+        with pytest.raises(RegionError, match="too small to compare element sizes"):
+            resolution.sizes_to_try(plan)
+    else:
+        assert resolution.sizes_to_try(plan) == sizes
 
 
 def test_frames_of_which_none_can_be_measured():
