@@ -115,7 +115,7 @@ SCENES = (
 )
 """Features of 14 to 160 px, a square root beside a point, noise of 3 to 20 % of the contrast, one light, and three of
 which one reflects. No constant was chosen on them."""
-QUICK = (1, 6, 7)
+QUICK = (3, 4, 6)
 
 
 def judged(scene: Scene) -> Row:
@@ -139,7 +139,7 @@ def judged(scene: Scene) -> Row:
     }
 
 
-@table("resolution", page="how-to/resolution", cost=40, keys=3)
+@table("resolution", page="how-to/resolution", cost=15, keys=3)
 def recommended(quick: bool) -> Iterator[Row]:
     """Element size that `rgbmidic resolution` recommends, beside the one of the least true error (rms over the pixels).
 

@@ -11,7 +11,8 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[3]))
 
-from benchmarks.resolution import Scene
+from benchmarks.resolution import SIZES, Scene
+from benchmarks.tables import FOLDER, Table
 from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, InputError, RegionError
 from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
 from rgbmidic.pipeline.resolution import ResolutionStudy, SizeFigures, study_sizes
@@ -113,6 +114,16 @@ def test_without_static_frames_the_noise_is_as_stated():
     assert np.isnan([found.sizes[0].scatter, found.sizes[0].bias, found.sizes[0].strain_scatter]).all()
     assert found.sizes[0].noise == found.sizes[0].stated > 0
     assert found.static == 0
+
+
+def test_recommended_sizes_of_held_out_scenes_are_within_a_step_of_the_best():
+    """Rows of the page's table, some of which tests/examples/test_tables.py measures anew."""
+    found = Table.read(FOLDER / "resolution.csv")
+    places = [SIZES.index(float(size)) for size in found.column("recommended [px]")]
+    best = [SIZES.index(float(size)) for size in found.column("best [px]")]
+    assert len(best) >= 10
+    assert max(np.abs(np.subtract(places, best))) <= 1
+    assert np.mean(np.equal(places, best)) >= 0.6
 
 
 def test_a_run_takes_the_recommended_size_and_goes_on_with_it(tmp_path, monkeypatch):
