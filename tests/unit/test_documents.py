@@ -139,7 +139,7 @@ def test_the_identifiers_of_the_glossary_exist():
 
 
 SIZES = {"node": "N", "light": "k", "element": "E", "function": "m", "row": "h", "column": "w", "iteration": "i"}
-SIZES |= {"image row": "H", "image column": "W", "file": "files", "reference_update": "r"}
+SIZES |= {"image row": "H", "image column": "W", "file": "files", "reference_update": "r", "estimated node": "N"}
 
 
 @pytest.mark.parametrize(("quantities", "frames"), [(SHARED, ()), (QUANTITIES, ("T",))])
