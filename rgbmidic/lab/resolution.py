@@ -276,11 +276,13 @@ def _draw_errors(axis: Axes, study: ResolutionStudy) -> None:
         axis.plot(sizes, [getattr(one, key) for one in study.sizes], "o-", label=label)
     axis.set_yscale("log")
     if study.choice is not None:
-        axis.axvline(study.choice.element_size, color="0.6", zorder=0)
+        axis.axvline(study.choice.element_size, color="0.5", linestyle="--", zorder=0)
     if np.isfinite(study.speckle):
         axis.axvspan(0.7 * min(sizes), SPECKLES * study.speckle, color="0.93", zorder=0)
     axis.set_xlim(0.85 * min(sizes), 1.18 * max(sizes))
-    axis.legend(loc="best")
+    shown = [one.total for one in study.sizes if np.isfinite(one.total)]
+    axis.set_ylim(top=3 * max(shown, default=1 / 3))  # room for the legend
+    axis.legend(loc="upper center")
     _finish(axis, sizes, "element size (px)", "displacement, rms over the nodes (px)")
 
 
