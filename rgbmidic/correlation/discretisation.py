@@ -51,11 +51,11 @@ _UNSMOOTHED = 0.72
 """Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates."""
 _EDGE = 1.7
 """Error of one-sided slopes over that of central ones: 2.5 across the edge, 1 along it (DIC Challenge star)."""
-_SURE, _SURE_SMOOTH = np.array([0.8, 0.8, 4.0, 4.0, 4.0]), 2.0
+_SURE, _SURE_SMOOTH = np.array([1.2, 1.2, 4.0, 4.0, 4.0]), 2.0
 """Standard deviations of the mean square of noise alone by which the difference must exceed it. Strain's is 3 to 4
 times its noise, so that what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at
 most."""
-_UNEVEN = np.array([1.1, 1.1, 1.3, 1.3, 1.3])
+_UNEVEN = np.array([1.2, 1.2, 1.4, 1.4, 1.4])
 """Variance of the difference, and of what is unsmoothed, over that with equal weights: a robust loss weighs pixels
 unevenly (measured on affine fields)."""
 _CHANCE = 0.8

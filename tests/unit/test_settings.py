@@ -401,7 +401,7 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
     prefix = "" if section == "test" else rf"{section}\."
     key = {"calibration_file": r"calibration\.file", "element_size": r"mesh\.element_size", "cracks": r"mesh\.cracks"}
     key |= {"accept": r"calibration\.accept"}
-    key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part")}
+    key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part", "error")}
     key = key if isinstance(built, TestSettings) else {}
     for instead in wrong:
         with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:
