@@ -13,8 +13,8 @@ from rgbmidic.typing import FloatArray
 
 SIZE, ELEMENT = 320, 20
 REGION = (15, 15, 304, 304)
-TOGETHER = (0.8, 1.25)  # measured: .88 to 1.20
-AT_EDGE = (0.6, 1.5)  # measured: .7 to 1.3
+TOGETHER = (0.8, 1.25)  # measured: .82 to 1.19
+AT_EDGE = (0.6, 1.6)  # measured: .69 to 1.5
 INFLATED = 1.15  # measured: 1.02 to 1.09
 Field = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
