@@ -1,7 +1,8 @@
 """Measure the tables of the pages: `python -m benchmarks [NAME ...] [--quick] [--list] [--processes N] [--out FOLDER]`.
 
 Each table is measured in a process of its own with one thread and written as a whole to docs/tables/NAME.csv, with the
-commit, date, seed, machine and versions it was measured with. `--quick` measures a few rows and writes nothing unless
+commit, date, seed, machine and versions it was measured with; with it, docs/tables/quick/NAME.csv where its quick rows
+are a smaller case. Tables of times come last, one at a time. `--quick` measures a few rows and writes nothing unless
 `--out` names a folder. A table that fails does not stop the others; the exit status is 1 then.
 """
 
@@ -28,8 +29,8 @@ ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "M
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rgbmidic")
 
 
-def provenance(command: str) -> dict[str, str]:
-    """Where figures come from: commit, date, machine, versions and the command that makes them."""
+def provenance() -> dict[str, str]:
+    """Where figures come from: commit, date, machine and versions."""
 
     def git(*arguments: str) -> str:
         done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -47,7 +48,6 @@ def provenance(command: str) -> dict[str, str]:
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": f"{os.cpu_count()} cores, {_processor()}",
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
-        "command": command,
     }
 
 
@@ -84,41 +84,49 @@ def main() -> int:
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         print(f"--out is a folder; {options.out} is a file", file=sys.stderr)
         return 2
-    names = sorted(options.names or TABLES, key=lambda name: -TABLES[name].cost)
+    names = sorted(set(options.names) or TABLES, key=lambda name: -TABLES[name].cost)
     if options.list:
         for name in sorted(names):
             print(f"{name:24} {TABLES[name].cost:6g} s  {TABLES[name].page:30} {TABLES[name].caption}")
         return 0
     os.environ |= dict.fromkeys(ONE_THREAD, "1")
-    folder = options.out or (None if options.quick else FOLDER)
     failed = {f"module {name}": reason for name, reason in broken.items()}
     start = time.perf_counter()
-    with TemporaryDirectory(prefix="rgbmidic-renders-") as renders, ThreadPoolExecutor(options.processes) as pool:
+    with TemporaryDirectory(prefix="rgbmidic-renders-") as renders:
         os.environ[RENDERS] = renders
-        mode = " --quick" if options.quick else ""
-        header = provenance("")
-        work = {}
-        for name in names:
-            work[pool.submit(isolated, name, options.quick, header | {"command": _command(name, mode)})] = name
-        for done in as_completed(work):
-            name = work[done]
-            try:
-                made, seconds = done.result()
-                if folder is not None:
-                    made.write(folder / f"{name}.csv")
-            except Exception as error:
-                failed[name] = f"{type(error).__name__}: {error}"
-                print(f"{name}: failed, {failed[name]}", file=sys.stderr, flush=True)
-            else:
-                print(f"{name}: {len(made.rows)} rows, {seconds:.1f} CPU s", flush=True)
+        for timing, processes in ((False, options.processes), (True, 1)):
+            some = [name for name in names if TABLES[name].timing == timing]
+            failed |= measure(some, options.quick, options.out, processes)
     print(f"{len(names)} tables in {time.perf_counter() - start:.0f} s")
     for name, reason in failed.items():
         print(f"failed: {name}, {reason}", file=sys.stderr)
     return 1 if failed else 0
 
 
-def _command(name: str, mode: str) -> str:
-    return f"python -m benchmarks {name}{mode}"
+def measure(names: list[str], quick: bool, out: Path | None, processes: int) -> dict[str, str]:
+    """Measure tables, several at once, write them where they belong and return why those that failed did.
+
+    With the full table the quick one is measured too where that has a file of its own.
+    """
+    folder = out or (None if quick else FOLDER)
+    header, work, failed = provenance(), {}, {}
+    with ThreadPoolExecutor(processes) as pool:
+        for name in names:
+            for small in {quick, quick or TABLES[name].own_quick}:
+                mode, place = (" --quick", "quick/" if small != quick else "") if small else ("", "")
+                command = f"python -m benchmarks {name}{mode}"
+                work[pool.submit(isolated, name, small, header | {"command": command})] = place + name
+        for done in as_completed(work):
+            try:
+                made, seconds = done.result()
+                if folder is not None:
+                    made.write(folder / f"{work[done]}.csv")
+            except Exception as error:
+                failed[work[done]] = f"{type(error).__name__}: {error}"
+                print(f"{work[done]}: failed, {failed[work[done]]}", file=sys.stderr, flush=True)
+            else:
+                print(f"{work[done]}: {len(made.rows)} rows, {seconds:.1f} CPU s", flush=True)
+    return failed
 
 
 if __name__ == "__main__":
