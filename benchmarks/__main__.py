@@ -1,9 +1,11 @@
 """Measure the tables of the pages: `python -m benchmarks [NAME ...] [--quick] [--list] [--processes N] [--out FOLDER]`.
 
 Each table is measured in a process of its own with one thread and written as a whole to docs/tables/NAME.csv, with the
-commit, date, seed, machine and versions it was measured with; with it, docs/tables/quick/NAME.csv where its quick rows
-are a smaller case. Tables of times come last, one at a time. `--quick` measures a few rows and writes nothing unless
+commit, date, seed, machine and versions it was measured with. `--quick` measures a few rows and writes nothing unless
 `--out` names a folder. A table that fails does not stop the others; the exit status is 1 then.
+
+With a full table its quick one is measured where that is a smaller case with a file of its own, docs/tables/quick/NAME.csv.
+Tables of times come last, one at a time.
 """
 
 from __future__ import annotations
@@ -104,28 +106,27 @@ def main() -> int:
 
 
 def measure(names: list[str], quick: bool, out: Path | None, processes: int) -> dict[str, str]:
-    """Measure tables, several at once, write them where they belong and return why those that failed did.
-
-    With the full table the quick one is measured too where that has a file of its own.
-    """
-    folder = out or (None if quick else FOLDER)
+    """Measure tables, several at once, write them where they belong and return why those that failed did."""
     header, work, failed = provenance(), {}, {}
+    place = out or (None if quick else FOLDER)
     with ThreadPoolExecutor(processes) as pool:
         for name in names:
-            for small in {quick, quick or TABLES[name].own_quick}:
-                mode, place = (" --quick", "quick/" if small != quick else "") if small else ("", "")
-                command = f"python -m benchmarks {name}{mode}"
-                work[pool.submit(isolated, name, small, header | {"command": command})] = place + name
+            full = header | {"command": f"python -m benchmarks {name}{' --quick' if quick else ''}"}
+            work[pool.submit(isolated, name, quick, full)] = name, place
+            if TABLES[name].own_quick and not quick:
+                small = header | {"command": f"python -m benchmarks {name} --quick"}
+                work[pool.submit(isolated, name, True, small)] = name, (out or FOLDER) / "quick"
         for done in as_completed(work):
+            name, folder = work[done]
             try:
                 made, seconds = done.result()
                 if folder is not None:
-                    made.write(folder / f"{work[done]}.csv")
+                    made.write(folder / f"{name}.csv")
             except Exception as error:
-                failed[work[done]] = f"{type(error).__name__}: {error}"
-                print(f"{work[done]}: failed, {failed[work[done]]}", file=sys.stderr, flush=True)
+                failed[name] = f"{type(error).__name__}: {error}"
+                print(f"{name}: failed, {failed[name]}", file=sys.stderr, flush=True)
             else:
-                print(f"{work[done]}: {len(made.rows)} rows, {seconds:.1f} CPU s", flush=True)
+                print(f"{name}: {len(made.rows)} rows, {seconds:.1f} CPU s", flush=True)
     return failed
 
 
