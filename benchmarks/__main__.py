@@ -3,9 +3,6 @@
 Each table is measured in a process of its own with one thread and written as a whole to docs/tables/NAME.csv, with the
 commit, date, seed, machine and versions it was measured with. `--quick` measures a few rows and writes nothing unless
 `--out` names a folder. A table that fails does not stop the others; the exit status is 1 then.
-
-With a full table its quick one is measured where that is a smaller case with a file of its own, docs/tables/quick/NAME.csv.
-Tables of times come last, one at a time.
 """
 
 from __future__ import annotations
@@ -96,6 +93,7 @@ def main() -> int:
     start = time.perf_counter()
     with TemporaryDirectory(prefix="rgbmidic-renders-") as renders:
         os.environ[RENDERS] = renders
+        # times come last, one at a time
         for timing, processes in ((False, options.processes), (True, 1)):
             some = [name for name in names if TABLES[name].timing == timing]
             failed |= measure(some, options.quick, options.out, processes)
@@ -106,7 +104,10 @@ def main() -> int:
 
 
 def measure(names: list[str], quick: bool, out: Path | None, processes: int) -> dict[str, str]:
-    """Measure tables, several at once, write them where they belong and return why those that failed did."""
+    """Measure tables, several at once, write them where they belong and return why those that failed did.
+
+    Where the quick rows are a smaller case, they are measured with the full ones and written to `quick` beside them.
+    """
     header, work, failed = provenance(), {}, {}
     place = out or (None if quick else FOLDER)
     with ThreadPoolExecutor(processes) as pool:
