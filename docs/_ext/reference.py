@@ -350,13 +350,14 @@ def expanded(text: str) -> str:
 
 
 def public() -> Iterator[tuple[str, str, Any]]:
-    """Module, name and object of every public name, once."""
+    """Module, name and object of every public name, once, aliases of classes left out."""
     seen: set[int] = set()
     for module in map(import_module, MODULES):
         for name in module.__all__:
             found = getattr(module, name)
-            described_alone = inspect.isclass(found) or inspect.isroutine(found)
-            if name != "__version__" and not (described_alone and id(found) in seen):
+            alone = inspect.isclass(found) or inspect.isroutine(found)
+            alias = inspect.isclass(found) and found.__name__ != name
+            if name != "__version__" and not alias and not (alone and id(found) in seen):
                 seen.add(id(found))
                 yield module.__name__, name, found
 
