@@ -271,7 +271,7 @@ def camera() -> str:
 # ---- results and formats
 
 _SIZES = {"node": "N", "light": "k", "element": "E", "function": "m", "row": "h", "column": "w", "iteration": "i"}
-_SIZES |= {"image row": "H", "image column": "W", "reference_update": "r"}
+_SIZES |= {"image row": "H", "image column": "W", "reference_update": "r", "estimated node": "N"}
 
 
 def quantities() -> str:
