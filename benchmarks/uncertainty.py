@@ -159,7 +159,7 @@ def sphere(quick: bool) -> Iterator[Row]:
             pair = pair_of(Setting(body="sphere", state=turn(angle), size=size, speckle=speckle, **PAINTS[paint]))
             solution = solve_pair(pair, both(pair, KINDS[camera], crosstalk=crosstalk))
             verdict = Verdict.of(solution, pair)
-            errors[f"error at {angle:g}° [px]"] = verdict.rms
+            errors[f"{angle:g}° [px]"] = verdict.rms
             ratios.append(verdict.ratio)
             strains.append(verdict.strain_ratio)
             inside.append(reflecting(pair, solution))

@@ -292,6 +292,25 @@ def _calibrate_demo_camera(test: Path) -> None:
 
 
 @app.command()
+def sample(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Which one; without it, they are listed.")] = "",
+    folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="Empty or new; else NAME.")] = None,
+) -> None:
+    """Fetch real files to try from where they are published, with their TEST.toml; or list what there is."""
+    from rgbmidic.lab.samples import SAMPLES, write_sample
+
+    if not name:
+        columns = ["sample", "MB", "licence", "source", "shows"]
+        rows = [[s.name, f"{s.bytes / 1e6:.1f}", s.licence, s.source, s.shows] for s in SAMPLES.values()]
+        print_table("real files of others, fetched from their sources and checked by SHA-256", columns, rows)
+        return
+    out = folder or Path(name)
+    written = write_sample(name, out, note)
+    print(f"{written.shows}\nlicence: {written.licence}   source: {written.source}")
+    print(f"try: cd {out} && {written.command}")
+
+
+@app.command()
 def virtual(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to render.")],
     out: Out,

@@ -1,26 +1,22 @@
-"""What all tests share: the folder of real data, where this machine has it, and an end to what hangs."""
+"""What all tests share: the folders of real files, and an end to what hangs."""
 
 from __future__ import annotations
 
 import os
 import signal
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
+import real_files
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # the processes share the cores already
     os.environ.setdefault("RGBMIDIC_THREADS", "1")
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """Folder of the shared real data: RGBMIDIC_SHARED_DATA, else ../shared/data beside the checkout, else skip."""
-    stated = os.environ.get("RGBMIDIC_SHARED_DATA")
-    folder = Path(stated) if stated else Path(__file__).resolve().parents[2] / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip(f"no shared data at {folder}; set RGBMIDIC_SHARED_DATA to its folder")
-    return folder
+def real_data() -> real_files.RealData:
+    """Gives the folder of real files of a name: the full ones where this machine has them, else their crops."""
+    return real_files.real_folder
 
 
 @pytest.fixture
@@ -38,7 +34,7 @@ def alarm() -> Iterator[None]:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say which figures of README and docs this run has not checked, because it had no real data."""
+    """Say which figures of README and docs this run has not checked, because it had no full files."""
     skipped = terminalreporter.stats.get("skipped", [])
     unchecked = sorted({report.nodeid.split("[")[0] for report in skipped if "no shared data" in str(report.longrepr)})
     if unchecked:

@@ -73,7 +73,9 @@ def decode(content: bytes, path: Path) -> AnyArray:
     """
     import cv2
 
-    previous = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    # OpenCV 4 has it at its top, OpenCV 5 in a module
+    set_log_level = cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel
+    previous = set_log_level(2)  # LOG_LEVEL_ERROR
     try:
         with complaints(b"libpng error", b"libpng warning", b"[ERROR", b"> ") as lines:
             # OpenCV opens no non-ASCII names on Windows, hence decoding from memory
@@ -81,7 +83,7 @@ def decode(content: bytes, path: Path) -> AnyArray:
     except cv2.error:
         image = None
     finally:
-        cv2.utils.logging.setLogLevel(previous)
+        set_log_level(previous)
     errors = [line for line in lines if not line.startswith("libpng warning")]  # of parts that are not used
     if image is None or errors:  # libtiff's errors do not always keep OpenCV from giving a picture
         raise damaged(path, _PLACE.sub("", errors[0]) if errors else "its image data cannot be decoded")

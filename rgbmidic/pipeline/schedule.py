@@ -143,7 +143,7 @@ class Schedule:
             return future.result().record
         deaths = self._deaths[position] = self._deaths.get(position, 0) + 1
         name = self._plan.series.name(self._index(position))
-        logger.warning("a worker died while %s was measured (%s)", name, error or type(error).__name__)
+        logger.warning("a worker died while %s was measured (%s)", name, str(error) or type(error).__name__)
         if deaths < _TRIES:
             self._suspects.append((position, start))
             return None

@@ -139,11 +139,16 @@ def history_figure(histories: Histories) -> Figure:
     def draw(axes: list[Axes]) -> None:
         for axis, ((kind, unit), quantities) in zip(axes, panels.items(), strict=False):
             step = -(-len(quantities) // _NAMED)
+            colours: dict[str, Any] = {}
             for number, quantity in enumerate(quantities):
                 known = np.isfinite(quantity.values).sum()
                 shown: dict[str, Any] = {"marker": "o" if known <= _MARKED_OF_PROBE else None, "markersize": 2.5}
                 shown["label"] = "_" if number % step else literal(quantity.name)
+                of = quantity.name.removesuffix("_before").removesuffix("_after")
+                if of in colours:  # both sides of a kink are single points of the rate
+                    shown |= {"label": "_", "color": colours[of], "linestyle": "none", "marker": "D", "markersize": 4}
                 (line,) = axis.plot(times, quantity.values, linewidth=1, **shown)
+                colours[quantity.name] = line.get_color()
                 if quantity.std is not None:
                     low, high = quantity.values - 2 * quantity.std, quantity.values + 2 * quantity.std
                     axis.fill_between(times, low, high, color=line.get_color(), alpha=0.2, linewidth=0)

@@ -107,6 +107,39 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
     yield from ((name, text) for name, text in rows if text is not None)
 
 
+def methods_text(physical: Physical, setup: SetupSettings, floor: NoiseFloor | None) -> str:
+    """Write the paragraph of a paper's methods section; what is not known is left open as [its name]."""
+    result, set_, units = physical.result, physical.result.setting, physical.units
+    rate = result.provenance.get("frame_rate") or set_("scale", "frame_rate")
+    exposure, speckle = result.provenance.get("exposure_ns"), speckle_size(result)
+    rows, columns = result.frame_shape or ("[rows]", "[columns]")
+    lights, size = result.lights, set_("mesh", "element_size")
+    named = f"{len(lights)} lights ({', '.join(lights)}; {setup.lamps or '[lamps and their directions]'})"
+    several = (
+        f"{named} lit it; the images of each light were evaluated together by multiple-illumination digital image "
+        "correlation (Poncelet and Leclerc, 2015)"
+    )
+    single = f"{setup.lamps or '[lamp]'} lit it; the images were evaluated by global digital image correlation"
+    noise = "[noise floor of static frames]"
+    if floor is not None:
+        u, v, exx, *_ = floor.measured.values()
+        noise = (
+            f"{u:.2g} {units.length} in x and {v:.2g} {units.length} in y, and {exx * 1e6:.3g} µm/m in the strain exx "
+            f"({floor.count} static frames, one standard deviation)"
+        )
+    return (
+        f"The surface was patterned with {setup.pattern or '[patterning]'} (speckle size "
+        f"{'[speckle size]' if speckle is None else physical.in_units(speckle)}). {setup.camera or '[camera]'} with "
+        f"{setup.lens or '[lens]'} recorded {columns} x {rows} px at {f'{rate:g}' if rate else '[frame rate]'} frames "
+        f"per second, exposure {'[exposure]' if exposure is None else f'{exposure / 1000:g} µs'}, while "
+        f"{several if len(lights) > 1 else single} with rgbmidic {result.provenance['versions'].get('rgbmidic', '')} "
+        f"on linear triangles of {physical.in_units(physical.mesh.size if size is None else size)}, against "
+        f"{reference_text(physical)}, with cubic B-spline interpolation. Strain is {physical.measure_name} over "
+        f"virtual strain gauges of {physical.in_units(physical.gauges.length)}. The noise floor is {noise}. "
+        "Uncertainties are standard uncertainties (k = 1)."
+    )
+
+
 def reference_text(physical: Physical) -> str:
     """State which frames are the reference."""
     frames = physical.result.setting("frames", "reference", list(physical.result.provenance["references"]))

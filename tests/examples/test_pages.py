@@ -7,6 +7,7 @@ no reader sees: ``<!-- not run: it needs a cluster -->``; ``<!-- file: NAME -->`
 from __future__ import annotations
 
 import doctest
+import os
 import re
 import shlex
 import shutil
@@ -134,11 +135,22 @@ def send_wave(folder):
     measure(read_test(folder / "wave.toml"), folder / "my_result")
 
 
+def strike(folder):
+    """Nothing but the scene of the impact."""
+    shutil.copy(folder / "examples/scenes/impact.toml", folder.parent)
+    shutil.rmtree(folder)
+    folder.mkdir()
+    shutil.move(folder.parent / "impact.toml", folder)
+    os.chdir(folder)  # the old one is gone
+
+
 PREPARED = {
     "README.md": lambda folder: shutil.rmtree(folder / "my_result"),
+    "docs/tutorials/first-steps.md": lambda folder: shutil.rmtree(folder / "my_result"),
     "docs/how-to/compare.md": simulate,
     "docs/how-to/fast-tests.md": interrupt,
     "docs/how-to/movies.md": send_wave,
+    "docs/tutorials/impact.md": strike,
 }
 """What the folder of a page lacks or has besides."""
 

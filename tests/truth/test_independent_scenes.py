@@ -15,25 +15,25 @@ from rgbmidic.illumination.separation import separate
 
 MARGIN = 25
 """px: one element."""
-CASES = [
-    ("plate_in_green_glare", 1, 0.0060, 0.0025),  # .0056, bias -.0019, at a quarter of a pixel
-    ("plate_in_green_glare", 2, 0.0085, 0.0035),  # .0080, -.0029, at half a pixel
-    ("sphere", 1, 0.0037, 0.0010),  # .0034, -.0003
-    ("sphere", 2, 0.0051, 0.0018),  # .0047, -.0014
-    ("sphere", 3, 0.0072, 0.0018),  # .0067, -.0012
-    ("sphere", 5, 0.0127, 0.0018),  # .0119, -.0006
+CASES = [  # scene, frame, (rms, bias) of the full frame and of its crop in tests/data; measured are, of the same two:
+    ("plate_in_green_glare", 1, (0.0060, 0.0010), (0.0055, 0.0010)),  # .0056, -.0005; .0050, .0000; by a quarter px
+    ("plate_in_green_glare", 2, (0.0085, 0.0018), (0.0082, 0.0018)),  # .0080, -.0012; .0076, -.0011; by half a px
+    ("sphere", 1, (0.0037, 0.0010), (0.0035, 0.0010)),  # .0034, .0003; .0032, -.0004
+    ("sphere", 2, (0.0051, 0.0010), (0.0051, 0.0010)),  # .0046, -.0001; .0047, -.0001
+    ("sphere", 3, (0.0072, 0.0010), (0.0079, 0.0010)),  # .0066, -.0005; .0073, .0002
+    ("sphere", 5, (0.0127, 0.0018), (0.0175, 0.0021)),  # .0121, -.0012; .0163, -.0014; 16 px, to the crop's edge
 ]
-CONSISTENT = (0.9, 1.15)
-"""Root mean square of the nodes' error over its stated uncertainty."""
+CONSISTENT = ((0.9, 1.15), (0.82, 1.2))
+"""Root mean square of the nodes' error over its stated uncertainty: of 256 nodes, and of the crop's 81."""
 
 
 @pytest.fixture(scope="module")
-def solved(shared_data):
+def solved(real_data):
     """Solution and truth (2, H, W) of a frame of a scene; the reference is separated once."""
     references = {}
 
     def lights(scene, frame, texture):
-        folder = shared_data / "independent_scenes" / scene
+        folder = real_data("independent_scenes") / scene
         raw = read_frame(
             folder / "frames" / f"frame_{frame:03d}.tif", cfa="RGGB", black_level=64, white_level=4095, kind="bayer"
         )
@@ -46,10 +46,11 @@ def solved(shared_data):
             references[scene] = lights(scene, 0, None)
         reference = references[scene]
         deformed = lights(scene, frame, reference.texture)
-        truth = np.load(shared_data / "independent_scenes" / scene / "truth.npz")["u"][frame]
-        found = correlate(
-            reference.values, deformed.values, region=(20, 20, 491, 491), prefilter="binomial", normalise=10.0
-        )
+        stored = np.load(real_data("independent_scenes") / scene / "truth.npz")
+        truth = stored["u"][frame] if "u" in stored else stored["steps"][frame].cumsum(1).cumsum(2) / 2**12
+        rows, columns = truth.shape[1:]
+        region = (20, 20, columns - 21, rows - 21)
+        found = correlate(reference.values, deformed.values, region=region, prefilter="binomial", normalise=10.0)
         return found, truth
 
     return solve
@@ -65,11 +66,14 @@ def errors(found, truth):
     return field, ((found.displacement - at_nodes(truth, found.nodes)) / found.displacement_std)[inner]
 
 
-@pytest.mark.parametrize(("scene", "frame", "rms", "bias"), CASES)
-def test_error_bias_and_uncertainty_in_a_reflection(scene, frame, rms, bias, solved):
+@pytest.mark.parametrize(("scene", "frame", "full", "crop"), CASES)
+def test_error_bias_and_uncertainty_in_a_reflection(scene, frame, full, crop, solved):
     found, truth = solved(scene, frame)
+    is_crop = truth.shape[1:] != (512, 512)
+    rms, bias = (full, crop)[is_crop]
     error, relative = errors(found, truth)
     assert np.isfinite(error).all()
     assert np.sqrt(np.mean(error**2)) < rms
     assert np.abs(error.mean(axis=(1, 2))).max() < bias
-    assert CONSISTENT[0] < np.sqrt(np.mean(relative**2)) < CONSISTENT[1]
+    low, high = CONSISTENT[is_crop]
+    assert low < np.sqrt(np.mean(relative**2)) < high

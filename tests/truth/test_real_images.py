@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from real_files import corner
 
 from rgbmidic import Solution, Status, Tri3Mesh, correlate, read_frame
 from rgbmidic.fields import Nodal, NodalCovariance, StrainGauges, at_nodes, at_pixels, make_probe
@@ -34,14 +35,20 @@ ALONG = 0.004
 
 
 @pytest.fixture(scope="module")
-def grey(shared_data):
-    """Reader of grey pictures below the shared data, most of which are saved as three equal channels."""
+def grey(real_data):
+    """Reader of a folder's grey pictures, most of which are saved with a palette of grey."""
 
     @cache
-    def read(name: str) -> np.ndarray:
-        return read_frame(shared_data / name, kind="monochrome").values[0]
+    def read(folder: str, name: str) -> np.ndarray:
+        return read_frame(real_data(folder) / name, kind="monochrome").values[0]
 
     return read
+
+
+def inset(image: np.ndarray, margin: int) -> tuple[int, int, int, int]:
+    """Rectangle of an image without a border."""
+    rows, columns = image.shape
+    return (margin, margin, columns - margin - 1, rows - margin - 1)
 
 
 def field(found: Solution, shape: tuple[int, int]) -> np.ndarray:
@@ -64,21 +71,22 @@ def strains(found: Solution) -> np.ndarray:
 
 @pytest.mark.parametrize("shift", [1, 5, 10, 15])
 def test_whole_pixel_shifts_are_found_without_a_hint(grey, shift):
-    images = [grey(f"dic_rigid_shift/{name}.tif") for name in ("ref", f"def_{shift}")]
-    found = correlate(*images, region=(30, 30, 480, 480))
+    images = [grey("dic_rigid_shift", f"{name}.tif") for name in ("ref", f"def_{shift}")]
+    found = correlate(*images, region=inset(images[0], 31))
     assert found.status is Status.CONVERGED
     assert found.measured.all()
     np.testing.assert_allclose(found.displacement, shift, atol=SHIFT_ERROR)
 
 
 @pytest.mark.parametrize(("level", "column"), [("L3", 3), ("L5", 5)])
-def test_challenge_sample_14_has_the_commanded_amplitude(grey, shared_data, level, column):
-    folder, region = "dic_challenge_sample14", (20, 20, 2027, 568)
-    images = [grey(f"{folder}/Sample14 {name}.tif") for name in ("Reference", f"{level} Amp0.1b")]
+def test_challenge_sample_14_has_the_commanded_amplitude(grey, real_data, level, column):
+    folder = "dic_challenge_sample14"
+    images = [grey(folder, f"Sample14 {name}.tif") for name in ("Reference", f"{level} Amp0.1b")]
+    region = inset(images[0], 20)
     found = correlate(*images, region=region, element_size=25, prefilter="binomial")
     assert found.status is Status.CONVERGED
     assert found.measured.all()
-    command = np.loadtxt(shared_data / folder / "command.csv", delimiter=",")[:, column]
+    command = np.loadtxt(real_data(folder) / "command.csv", delimiter=",")[:, column]
     u, v = field(found, images[0].shape)
     inside = np.isfinite(u)
     u, truth = u[inside], np.broadcast_to(command, inside.shape)[inside]
@@ -109,15 +117,19 @@ def check_strain_of_three_gauges(found, commanded, region):
 
 
 @pytest.mark.parametrize("load", ["04", "11"])
-def test_challenge_sample_12_agrees_with_dice_away_from_the_hole(grey, shared_data, load):
+def test_challenge_sample_12_agrees_with_dice_away_from_the_hole(grey, real_data, load):
     folder = "dic_challenge_sample12"
-    images = [grey(f"{folder}/oht_cfrp_{name}.tiff") for name in ("00", load)]
-    found = correlate(*images, region=(35, 5, 280, 1035), element_size=25)
+    images = [grey(folder, f"oht_cfrp_{name}.tiff") for name in ("00", load)]
+    left, top = corner(real_data(folder))
+    rows = len(images[0])
+    found = correlate(*images, region=(35 - left, 5, 280 - left, rows - 5), element_size=25)
     assert found.status is Status.CONVERGED
-    lines = (shared_data / folder / f"DICe_solution_{load}.txt").read_text().splitlines()
+    lines = (real_data(folder) / f"DICe_solution_{load}.txt").read_text().splitlines()
     table = np.array([line.split(",") for line in lines if line[:1].isdigit()], dtype=float)
-    hole = np.array([194, 532])
-    away = (np.hypot(*(table[:, :2] - hole).T) > 110) & (table[:, 0] < 275)
+    table[:, :2] -= (left, top)
+    hole = np.array([194 - left, 532 - top])
+    away = (np.hypot(*(table[:, :2] - hole).T) > 110) & (table[:, 0] < 275 - left)
+    away &= np.abs(table[:, 1] - rows / 2) < rows / 2 - 10
     difference = at_nodes(field(found, images[0].shape), table[away, :2]) - table[away, 2:4]
     assert np.isfinite(difference).all()
     assert len(difference) > 120
@@ -132,10 +144,13 @@ def test_challenge_sample_12_agrees_with_dice_away_from_the_hole(grey, shared_da
 
 
 @pytest.mark.parametrize(("frame", "stretch"), [(155, (0.002, 0.006)), (170, (0.012, 0.025))])
-def test_the_tension_test_converges_to_a_plausible_strain(grey, frame, stretch):
+def test_the_tension_test_converges_to_a_plausible_strain(grey, real_data, frame, stretch):
     # columns far beside the specimen are cut off: they only cost time
-    images = [grey(f"dic_real_tension_mudic/ut_{name}.tif")[:, 250:620] for name in (151, frame)]
-    found = correlate(*images, region=(75, 200, 285, 1900))
+    folder = "dic_real_tension_mudic"
+    left, top = corner(real_data(folder))
+    images = [grey(folder, f"ut_{name}.tif")[:, max(0, 250 - left) : 620 - left] for name in (151, frame)]
+    left, bottom = max(left, 250), min(1900 - top, len(images[0]) - 40)
+    found = correlate(*images, region=(325 - left, max(200 - top, 40), 535 - left, bottom))
     assert found.status is Status.CONVERGED
     assert found.measured.all()
     exx, eyy, exy = np.median(strains(found), axis=1)
@@ -146,12 +161,12 @@ def test_the_tension_test_converges_to_a_plausible_strain(grey, frame, stretch):
     rows = np.unique(found.nodes[:, 1])
     v = np.array([found.displacement[found.nodes[:, 1] == row, 1].mean() for row in rows])
     assert (np.diff(v) > -0.02).mean() > 0.95 or (np.diff(v) < 0.02).mean() > 0.95
-    check_three_gauges_and_an_extensometer(found)
+    check_three_gauges_and_an_extensometer(found, np.array([430 - left, max(400 - top, 105)]), bottom)
 
 
-def check_three_gauges_and_an_extensometer(found):
+def check_three_gauges_and_an_extensometer(found, start, bottom):
     """The mean strain along a line is that of its ends, whatever the gauge; a longer one is more certain."""
-    ends, std = np.array([[180, 400], [180, 1600]]), []
+    ends, std = np.array([start, [start[0], min(start[1] + 1200, bottom - 105)]]), []
     along = make_probe(covariance(found), "gauge", 1, ends.ravel())
     part = [found.displacement[along.nodes].T, found.displacement_std[along.nodes].T]
     read = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), np.concatenate(part)[:, None], strict=True)))
@@ -165,13 +180,14 @@ def check_three_gauges_and_an_extensometer(found):
     assert std[0] > 2 * std[1] > 3 * std[2]
 
 
-def test_the_challenge_2_wave_has_half_a_pixel_on_its_crest(grey):
-    images = [
-        grey(f"dic_challenge2_wave/DIC_Challenge_Wave_{name}_Noisy.tif")[:, 1000:] for name in ("Reference", "Deformed")
-    ]
-    found = correlate(*images, region=(20, 20, 980, 480), element_size=15, prefilter="binomial")
+def test_the_challenge_2_wave_has_half_a_pixel_on_its_crest(grey, real_data):
+    folder = "dic_challenge2_wave"
+    left, top = corner(real_data(folder))
+    names = [f"DIC_Challenge_Wave_{name}_Noisy.tif" for name in ("Reference", "Deformed")]
+    images = [grey(folder, name)[:, 1000 - left :] for name in names]
+    found = correlate(*images, region=inset(images[0], 20), element_size=15, prefilter="binomial")
     assert found.status is Status.CONVERGED
     assert found.measured.mean() > 0.99
-    u, v = np.nanmean(field(found, images[0].shape)[:, 250, 200:970], axis=1)
+    u, v = np.nanmean(field(found, images[0].shape)[:, 250 - top, 200:970], axis=1)
     assert v == pytest.approx(0.5, abs=WAVE)
     assert abs(u) < 0.01

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from real_files import RealData
 from scipy.spatial import cKDTree
 from scipy.special import erf
 from target_scene import LENS, SHAPE, TARGET, imaged, on_plane, photo, pose, random_views, view_of
@@ -343,11 +344,9 @@ def test_damaged_files_are_named(tmp_path: Path, change, reason: str) -> None:
     assert str(path) in str(caught.value)
 
 
-def test_the_pictures_of_opencv(shared_data: Path) -> None:
+def test_the_pictures_of_opencv(real_data: RealData) -> None:
     """13 real photographs of a chessboard (benchmarks/camera.py), read as OpenCV decodes them."""
-    folder = shared_data / "opencv_chessboard"
-    if not folder.is_dir():
-        pytest.skip(f"no shared data at {folder}")
+    folder = real_data("opencv_chessboard")
     target = Target.parse("chessboard:9x6:25mm")
     views = [
         find_view(frame_of(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)), target, path.name)

@@ -150,9 +150,9 @@ def test_limits_from_options():
 @pytest.mark.parametrize(
     ("together", "single", "mean", "spread"), [("03", ("01", "02"), 0.17, 0.86), ("07", ("01", "02", "04"), 0.33, 1.05)]
 )
-def test_coin_captures_add_up(shared_data, together, single, mean, spread):
+def test_coin_captures_add_up(real_data, together, single, mean, spread):
     """Real single-light captures and their sums: 8 bit, dim (10 to 17 DN), one frame each, no dark frames."""
-    folder = shared_data / "multilight_raw_coin_italy"
+    folder = real_data("multilight_raw_coin_italy")
 
     def stack(number):
         frame = read_frame(folder / f"I_{number}.png", kind="bayer", cfa="RGGB", black_level=0, white_level=255)

@@ -116,8 +116,8 @@ def rows_by_diagonal(camera):
     return response / np.diag(response)[:, None]
 
 
-def test_nine_real_cameras(shared_data):
-    files = sorted((shared_data / "camera_sensitivities").glob("*.json"))
+def test_nine_real_cameras(real_data):
+    files = sorted(real_data("camera_sensitivities").glob("*.json"))
     assert len(files) == 9
     for file in files:
         camera = read_camera(str(file))
@@ -127,10 +127,10 @@ def test_nine_real_cameras(shared_data):
         assert (found.matrix.argmax(axis=0) == [0, 1, 2]).all()
 
 
-def test_nikon_5100_of_two_sources(shared_data):
+def test_nikon_5100_of_two_sources(real_data):
     expected = [[1, 0.27, 0.09], [0.04, 1, 0.24], [0, 0.39, 1]]  # of lamps whose parameter is 18, 30, 20 nm
-    from_json = read_camera(str(shared_data / "camera_sensitivities" / "nikon_d5100_380_780_5.json"))
-    table = shared_data / "led_and_camera_spectra" / "colour_science_0.4.7_spectra.csv"
+    from_json = read_camera(str(real_data("camera_sensitivities") / "nikon_d5100_380_780_5.json"))
+    table = real_data("led_and_camera_spectra") / "colour_science_0.4.7_spectra.csv"
     from_csv = read_camera(f"{table}#Nikon 5100 (NPL)")
     for camera in (from_json, from_csv):
         assert rows_by_diagonal(camera) == pytest.approx(np.array(expected), abs=0.01)

@@ -11,6 +11,7 @@ import pytest
 import tifffile
 from cine_files import even_times, write_cine
 from frames import noisy_mosaic
+from real_files import RealData, count
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames import write_dng, write_tiff
@@ -121,10 +122,12 @@ def test_what_cannot_be_saved_is_said(tmp_path: Path, index: int, name: str, rea
         save_frame(FrameSettings(path=(str(tmp_path / "f.cine"),)), index, tmp_path / name)
 
 
-def test_real_files(shared_data: Path) -> None:
-    chart = _seen(shared_data / "cine_color_packed10" / "chart1.cine")
-    assert [chart[key] for key in KEYS[:8]] == ["Phantom .cine", 1, [1080, 2048], "GBRG", 12, 64, 4064, 25]
-    assert (chart["trigger"], chart["lost_frames"]) == (123, 0)
-    assert chart["exposure"] == pytest.approx(0.02, rel=1e-3)
-    dng = _seen(shared_data / "raw_colorchart_dng")
+def test_real_files(real_data: RealData) -> None:
+    folder = real_data("cine_mono_set")
+    grey = _seen(folder / "packed_12bpp.cine")
+    levels = [None, 12, 64, 4064, 100]
+    assert [grey[key] for key in KEYS[:8]] == ["Phantom .cine", count(folder, 6), [128, 256], *levels]
+    assert (grey["trigger"], grey["lost_frames"]) == (-60, 0)
+    assert grey["exposure"] == pytest.approx(99e-6, rel=1e-3)
+    dng = _seen(real_data("raw_colorchart_dng"))
     assert (dng["count"], dng["kind"]) == (1, "bayer")

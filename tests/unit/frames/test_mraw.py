@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mraw_files import pack_bits, write_mraw
+from real_files import RealData, count
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames import FrameSeries, Mosaic, open_series, open_source
@@ -232,14 +233,17 @@ def test_a_header_without_its_xml(tmp_path: Path) -> None:
             _series(path)
 
 
-def test_known_answers_of_real_movies(shared_data: Path) -> None:
-    nova = open_series(FrameSettings(path=("mraw_12bit_cihx/ball_12bit.cihx",), kind="monochrome"), shared_data)
+def test_known_answers_of_real_movies(real_data: RealData) -> None:
+    ball, beam = real_data("mraw_12bit_cihx"), real_data("mraw_8bit_cih")
+    nova = open_series(FrameSettings(path=("ball_12bit.cihx",), kind="monochrome"), ball)
     (frame,) = nova.read(0)
-    assert (len(nova), nova.shape, frame.values.min(), frame.values.max()) == (15, (384, 384), 105, 4095)
+    assert (len(nova), nova.shape, frame.values.min(), frame.values.max()) == (
+        *(count(ball, 15), (384, 384), 105, 4095),
+    )
     steps = [np.abs(np.diff(frame.values[0].astype(int), axis=axis)).mean() for axis in (0, 1)]
     assert max(steps) < 40  # nibbles the other way round: 145 and 359
     assert (frame.white_level, nova.recording.trigger, nova.time_ns(0)) == (4095, -52, 1733333)
-    showcase = open_series(FrameSettings(path=("mraw_8bit_cih/*.mraw",), kind="monochrome"), shared_data)
-    stored = np.fromfile(shared_data / "mraw_8bit_cih" / "data_showcase.mraw", dtype=np.uint8).reshape(75, 40, 640)
-    assert (len(showcase), showcase.shape, showcase.recording.bit_depth) == (75, (40, 640), 12)
-    np.testing.assert_array_equal([showcase.read(index)[0].values[0] for index in range(75)], stored)
+    showcase = open_series(FrameSettings(path=("*.mraw",), kind="monochrome"), beam)
+    stored = np.fromfile(beam / "data_showcase.mraw", dtype=np.uint8).reshape(-1, 40, 640)
+    assert (len(showcase), showcase.shape, showcase.recording.bit_depth) == (count(beam, 75), (40, 640), 12)
+    np.testing.assert_array_equal([frame.values[0] for (frame,) in map(showcase.read, range(len(showcase)))], stored)

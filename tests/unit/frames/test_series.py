@@ -16,6 +16,7 @@ import pytest
 from frames import noisy_mosaic
 from hypothesis import given
 from hypothesis import strategies as st
+from real_files import RealData
 from seq_files import write_seq
 
 from rgbmidic.errors import ConfigurationError, FrameError
@@ -430,7 +431,7 @@ def test_the_camera_fills_in_what_neither_the_file_nor_the_user_tells(tmp_path: 
     assert (channel.values.shape, channel.black_level.tolist(), channel.white_level) == ((1, 24, 30), [16], 4000)
 
 
-def test_real_series(shared_data: Path) -> None:
-    settings = FrameSettings(path=("dic_rigid_shift/*.tif",), kind="monochrome")
-    series = open_series(settings, shared_data)
+def test_real_series(real_data: RealData) -> None:
+    settings = FrameSettings(path=("*.tif",), kind="monochrome")
+    series = open_series(settings, real_data("dic_rigid_shift"))
     assert [series.name(i) for i in range(5)] == ["def_1.tif", "def_5.tif", "def_10.tif", "def_15.tif", "ref.tif"]

@@ -9,16 +9,14 @@ SIDE = 320
 
 
 @pytest.fixture(scope="module")
-def coin(shared_data):
+def coin(real_data):
     """Three lights (3, 320, 320), brightest hundredth at 1000 DN.
 
     Each capture is itself a raw mosaic, so its full image is known only coarser: the mean over 4 x 4 raw pixels, two
     Bayer cells each way, the same mix of colours everywhere. Binning also takes the 8-bit steps (values of 5 to 15 DN)
     down to a few per cent of the contrast.
     """
-    folder = shared_data / "multilight_raw_coin_italy"
-    if not folder.is_dir():
-        pytest.skip(f"no coin captures at {folder}")
+    folder = real_data("multilight_raw_coin_italy")
     cv2 = pytest.importorskip("cv2")
     raw = [cv2.imread(str(folder / f"I_0{n}.png"), cv2.IMREAD_UNCHANGED) for n in (1, 2, 4)]
     binned = np.stack([one.reshape(687, 4, 916, 4).mean(axis=(1, 3)) for one in raw])

@@ -162,6 +162,11 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["u_std"].startswith("mm | ")
     assert "by number or time: 2" in page.words
     assert "no image scale" not in page.words
+    methods = next(text for text in page.texts if text.startswith("The surface was patterned"))
+    assert '[camera] with 50 mm, "f/2" <script> recorded 120 x 80 px at 50000 frames per second' in methods
+    assert "exposure 1.5 µs" in methods
+    assert f"triangles of {stated.element_size:.4g} px ({0.05 * stated.element_size:.3g} mm)" in methods
+    assert "noise floor is [noise floor of static frames]" in methods
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -95,15 +95,14 @@ def test_crosstalk_from_spectra_is_the_sum_over_wavelengths():
         camera.response(LIGHTS)
 
 
-def test_camera_files_and_colour_science(shared_data):
-    folder = shared_data / "camera_sensitivities"
+def test_camera_files_and_colour_science(real_data):
+    folder = real_data("camera_sensitivities")
     leds = (Led(centre=630, width=18), Led(centre=525, width=30), Led(centre=465, width=20))
     for file in sorted(folder.glob("*.json")):
         response = spectral_response(Sensitivities.read(file), leds)
         assert response.argmax(axis=0).tolist() == [0, 1, 2], file.name
-    table = np.genfromtxt(
-        shared_data / "led_and_camera_spectra/colour_science_0.4.7_spectra.csv", delimiter=",", skip_header=1
-    )
+    spectra = real_data("led_and_camera_spectra") / "colour_science_0.4.7_spectra.csv"
+    table = np.genfromtxt(spectra, delimiter=",", skip_header=1)
     blue = Led(centre=465, width=HALF_MAXIMUM * 20).power(table[:, 0])
     assert np.allclose(blue / blue.max(), table[:, 7] / table[:, 7].max(), atol=1e-4)
     nikon = Sensitivities.from_colour("Nikon 5100 (NPL)")
