@@ -356,8 +356,10 @@ def correlate(
     >>> from scipy.ndimage import gaussian_filter
     >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(120, 160)), 1.5)
     >>> solution = correlate(speckle, np.roll(speckle, 2, axis=1), region=(20, 20, 140, 100))
-    >>> solution.status.name, solution.displacement[solution.measured].mean(axis=0).round(2) + 0
-    ('CONVERGED', array([2., 0.]))
+    >>> solution.status.name
+    'CONVERGED'
+    >>> np.allclose(solution.displacement, (2, 0), atol=0.01)
+    True
     """
     f, g = as_light_stack(reference, "reference"), as_light_stack(deformed, "deformed")
     if f.shape != g.shape:
