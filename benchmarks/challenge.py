@@ -157,3 +157,39 @@ def star(quick: bool) -> Iterator[Row]:
                 "MEI": scatter * longest,
                 **dict(stated_over_true(pair, field, size)),
             }
+
+
+BINS = ((3.0, 3.5), (3.5, 4.5), (4.5, 6.0), (6.0, 9.0), (9.0, 15.0))
+"""Periods, in elements, at which noise and discretisation error are compared with the true error."""
+
+
+@table("mesh_error", page="explanation/discretisation", cost=25, keys=3, own_quick=True)
+def mesh_error(quick: bool) -> Iterator[Row]:
+    """Star of the DIC Challenge 2.0: stated over true error (root mean squares over the nodes) of v and eyy, of the
+    noise that is stated without `mesh.error`, of the noise with it, and of noise and discretisation error together,
+    by the period of the waves in elements; at the edge over all waves from 3 elements on.
+    """
+    shared = os.environ.get("RGBMIDIC_SHARED_DATA", ROOT.parent / "shared" / "data")
+    pair = own_pair((181, 1001)) if quick else read_pair(Path(shared) / "dic_challenge2_wave")
+    for size in (16,) if quick else (16, 25, 40):
+        options = {"region": pair.region, "element_size": size, "initial": (0, 0)}
+        plain = correlate(pair.reference, pair.deformed, **options)
+        found = correlate(pair.reference, pair.deformed, mesh_error=True, **options)
+        x, y = found.nodes.T
+        edge, elements = Tri3Mesh(nodes=found.nodes, elements=found.elements).on_boundary, period(x) / size
+        wave = 2 * np.pi / period(x)
+        slope = -0.5 * wave * np.sin(wave * (y - pair.reference.shape[0] // 2))
+        errors = {"v": found.displacement[:, 1] - pair.star(x, y), "eyy": found.strain[:, 1] - slope}
+        places = [(f"{low:g} to {high:g}", ~edge & (elements >= low) & (elements < high)) for low, high in BINS]
+        for place, here in (*places, ("edge", edge & (elements >= BINS[0][0]))):
+            for name, error in errors.items():
+                known = here & np.isfinite(error)
+                if known.sum() <= 20:
+                    continue
+                kind = "displacement" if name == "v" else "strain"
+                before, noise = (getattr(one, f"{kind}_std")[known, 1] for one in (plain, found))
+                both = np.hypot(noise, getattr(found, f"{kind}_error")[known, 1])
+                true = float(np.sqrt(np.mean(error[known] ** 2)))
+                columns = {"without": before, "noise": noise, "noise and mesh": both}
+                ratios = {column: float(np.sqrt(np.mean(part**2))) / true for column, part in columns.items()}
+                yield {"elements [px]": size, "period [elements]": place, "of": name, "true error": true, **ratios}

@@ -25,7 +25,7 @@ extensions = [
 ]
 exclude_patterns = ["_ext", "tables"]
 default_role = "py:obj"
-suppress_warnings = ["toc.empty_glob"]
+smartquotes = False  # options begin with two dashes
 
 myst_enable_extensions = ["attrs_block", "colon_fence", "dollarmath"]
 myst_heading_anchors = 4
@@ -47,6 +47,7 @@ sphinx_gallery_conf = {
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
     "show_memory": False,
+    "write_computation_times": False,
     "show_signature": False,
     "min_reported_time": 1e9,
     "image_scrapers": ("matplotlib",),

@@ -57,7 +57,6 @@ print(f"rms error: {np.sqrt(np.mean(error**2)):.4f} px")
 
 # %%
 # A part of the second raw frame, as its camera wrote it, and the displacement measured from it with its uncertainty.
-
 figure, parts = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
 parts[0].imshow(frame.values[80:110, 80:110], cmap="gray")
 parts[0].set(title="raw samples", xticks=[], yticks=[])

@@ -59,7 +59,6 @@ print(f"error: {abs(speed - SPEED):.3f} px/s")
 
 # %%
 # Mean position over the camera's own times.
-
 figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
 axes.plot(1e3 * seconds, position, "o", label="measured")
 axes.plot(1e3 * seconds, SPEED * seconds, "-", label="true")

@@ -53,9 +53,8 @@ print(f"ratio: {scatter['reflection-aware'] / scatter['malvar']:.3f}")
 
 # %%
 # The green light as each method separates it, in a part of the reference.
-
 figure, parts = plt.subplots(1, len(pictures), figsize=(11, 3.6), layout="constrained")
 for axes, (method, image) in zip(parts, pictures.items(), strict=True):
-    axes.imshow(image, cmap="gray", vmin=0, vmax=pictures["malvar"].max())
+    axes.imshow(image, cmap="gray", vmin=0, vmax=np.nanpercentile(pictures["malvar"], 99))
     axes.set(title=f"{method}: {scatter[method]:.4f} px", xticks=[], yticks=[])
 plt.show()

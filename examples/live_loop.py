@@ -50,7 +50,6 @@ print(f"ratio: {left / free:.3f}")
 
 # %%
 # Where the stage is in each frame, along x.
-
 figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
 axes.plot(drift[:, 0], label="without correction")
 axes.plot(np.array(positions)[:, 0], label="with it")

@@ -51,7 +51,6 @@ print(f"ratio: {rms['with masks'] / rms['without weights']:.3f}")
 
 # %%
 # The two lights in the reference; the dotted lines enclose what their masks exclude.
-
 figure, parts = plt.subplots(1, 2, figsize=(8, 3.8), layout="constrained")
 for axes, image, spot in zip(parts, states[0], spots, strict=True):
     axes.imshow(image, cmap="gray")

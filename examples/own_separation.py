@@ -57,7 +57,6 @@ print(f"rms error: {np.sqrt(np.nanmean(error**2)):.4f} px")
 
 # %%
 # The reference's lights, as this separation gives them.
-
 images = separation((frames[0],))
 figure, parts = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
 for axes, image, name in zip(parts, images.values, images.names, strict=True):

@@ -44,7 +44,6 @@ print(f"rms error: {np.sqrt(np.mean(error**2)):.5f} px")
 
 # %%
 # Length of the measured displacement, and of its error, over the mesh.
-
 figure, parts = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 for axes, field, what in zip(parts, (solution.displacement, error), ("displacement", "error"), strict=True):
     axes.imshow(reference, cmap="gray")

@@ -50,7 +50,6 @@ print(f"largest error: {1e6 * error:.1f} (1e-6)")
 
 # %%
 # Mean strain, frame after frame.
-
 figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
 axes.plot(strain.frame, 100 * strain, "o", label="measured")
 axes.plot(strain.frame, 100 * STEP * strain.frame, "-", label="true")

@@ -53,7 +53,6 @@ print(f"ratio: {rms[1] / rms[0]:.3f}")
 
 # %%
 # What either lamp shows; the dotted lines enclose what its mask excludes.
-
 figure, parts = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
 for axes, image, mask, light in zip(parts, reference.values, masks[0], scene.lights, strict=True):
     axes.imshow(image, cmap="gray")

@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rgbmidic.correlation import NodeStatus, Solution, Status
+    from rgbmidic.correlation import NodeStatus, Solution, Status, discretisation_error
     from rgbmidic.errors import RgbmidicError
     from rgbmidic.fields import CameraCalibration
     from rgbmidic.frames import read_frame
@@ -39,6 +39,7 @@ __all__ = [
     "Tri3Mesh",
     "__version__",
     "correlate",
+    "discretisation_error",
     "inspect_frame",
     "measure",
     "measure_sequence",
@@ -62,6 +63,7 @@ _HOMES = {
     "TestSettings": "rgbmidic.settings",
     "Tri3Mesh": "rgbmidic.mesh",
     "correlate": "rgbmidic.pipeline",
+    "discretisation_error": "rgbmidic.correlation",
     "inspect_frame": "rgbmidic.lab.inspection",
     "measure": "rgbmidic.pipeline",
     "measure_sequence": "rgbmidic.pipeline",

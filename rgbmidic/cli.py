@@ -439,6 +439,53 @@ def inspect(
         print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")
 
 
+@app.command()
+def resolution(
+    test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Element sizes in px, such as 10,16,25,40; else those that suit the speckle.")
+    ] = "",
+    gauges: Annotated[
+        str, typer.Option("--gauges", help="Lengths of virtual strain gauges in px; else three elements of each size.")
+    ] = "",
+    frames: Annotated[
+        str,
+        typer.Option("--frames", help="Frames, such as 5,10, among which the key frame is; else five."),
+    ] = "",
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for resolution.csv, .json and .png.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Find the element size of a test: noise, discretisation error and strain resolution of several, on its frames."""
+    from rgbmidic.lab import check_folder
+    from rgbmidic.lab import resolution as report
+    from rgbmidic.pipeline.resolution import study_sizes
+    from rgbmidic.settings import read_test
+
+    if out is not None:
+        check_folder(out, report.FILES, overwrite=overwrite)
+    settings = read_test(test)
+    chosen = cli_results.frame_indices(frames) or []
+    lengths = command.read_lengths(gauges, "--gauges")
+    asked = command.read_lengths(sizes, "--sizes")
+    _explain_first_run()
+    with progress_of("resolution") as progress:
+        study = study_sizes(settings, asked, gauges=lengths or None, frames=chosen, progress=progress)
+    static = f"{study.static} static frames" if study.static else "no static frames: noise is as stated, not measured"
+    print(f"key frame {study.frame}: {study.name}; speckle {study.speckle:.1f} px; {static}\n")
+    print_table("elements, rms over the nodes of the key frame", *report.size_rows(study), report.SIZE_WORDS)
+    print_table("virtual strain gauges", *report.gauge_rows(study), report.GAUGE_WORDS)
+    for one in study.sizes:
+        if one.reason:
+            note(f"warning: elements of {one.element_size:g} px: {one.reason}")
+    if out is not None:
+        report.write_study(study, out, overwrite=overwrite)
+        print(
+            f"table: {out / 'resolution.csv'}   figures: {out / 'resolution.json'}   picture: {out / 'resolution.png'}"
+        )
+    choice = study.choice
+    print("no recommendation: nothing is known of the errors" if choice is None else f"recommended: {choice.reason}")
+
+
 def _explain_first_run() -> None:
     """Print why the first run takes longer."""
     from rgbmidic._kernels import are_compiled
@@ -461,6 +508,8 @@ def _print_summary(result: Result, seconds: float) -> None:
     rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}
     if measured:
         rows["nodes"] += f", {sum(measured) / len(measured):.1%} measured"
+    if chosen := result.provenance.get("element_size"):
+        rows["mesh"] = f"{chosen['element_size']:g} px: {chosen['reason']}"
     if (count := len(result.setting("frames", "reference", [0]))) > 1:
         gain = ((1 + 1 / count) / 2) ** 0.5
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"

@@ -32,6 +32,7 @@ __all__ = [
     "main",
     "optional",
     "picture_beside",
+    "read_lengths",
     "read_pair",
     "read_place",
     "read_shape",
@@ -195,6 +196,19 @@ def picture_beside(table: Path) -> Path:
     if table.suffix.lower() == ".png":
         raise InputError(f"--out is the table, such as {table.with_suffix('.csv').name}, not {table.name!r}")
     return table.with_suffix(".png")
+
+
+def read_lengths(text: str, option: str) -> tuple[float, ...]:
+    """Different positive lengths in px with commas between them; an `InputError` where it is something else."""
+    try:
+        values = tuple(float(part) for part in text.split(",")) if text.strip() else ()
+    except ValueError:
+        values = (math.nan,)
+    if len(set(values)) < len(values) or not all(math.isfinite(value) and value > 0 for value in values):
+        raise InputError(
+            f"{option} are different lengths in px with commas between them, such as 10,16,25, not {text!r}"
+        )
+    return values
 
 
 def read_pair(text: str, option: str) -> tuple[float, float]:

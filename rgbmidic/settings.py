@@ -26,6 +26,7 @@ __all__ = [
     "ELEMENT_SIZE",
     "LENGTH_UNITS",
     "PROBE_NAME",
+    "SMALLEST_HALVED",
     "WIDER_AT_CRACKS",
     "ChannelSettings",
     "FrameKind",
@@ -64,6 +65,10 @@ FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]
 
 ELEMENT_SIZE = 25.0
 """Side of the elements in px where nobody states another: the paper's (section 2.2)."""
+
+SMALLEST_HALVED = 8.0
+"""Side (px) of the smallest elements of which the discretisation error is known: their halves, of 4 px, have some eight
+samples for six unknowns."""
 
 LENGTH_UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
 """Millimetres in a length of 1 of a mesh's file."""
@@ -588,7 +593,8 @@ class TestSettings(_Checked):
         ``accept`` in ``[calibration]``: checks of the reference frame against the calibration whose contradictions are
         accepted (`rgbmidic.illumination.frame_check`).
     element_size
-        ``element_size`` in ``[mesh]``: side of the elements in px; None with `mesh_file`, which has its own.
+        ``element_size`` in ``[mesh]``: side of the elements in px; ``"auto"``: what a study of the test's own frames
+        recommends (`rgbmidic.pipeline.resolution`); None with `mesh_file`, which has its own.
     cracks
         ``cracks`` in ``[mesh]``: paths, each of corners (x, y) in px on the reference, along which the mesh is split.
     mesh_file
@@ -600,6 +606,9 @@ class TestSettings(_Checked):
         ``unit`` in ``[mesh]``: unit of length of the file; the points are in mm.
     mesh_part
         ``part`` in ``[mesh]``: set of its elements that is measured; None: all.
+    mesh_error
+        ``error`` in ``[mesh]``: whether the discretisation error is estimated (`rgbmidic.discretisation_error`), in
+        every frame, or in key frames (``"key"``): every 16th and the last.
     base
         Folder that relative paths start from.
     """
@@ -610,7 +619,9 @@ class TestSettings(_Checked):
     region: RegionSettings = field(default_factory=RegionSettings)
     calibration_file: Path | None = field(default=None, metadata={"key": "calibration.file"})
     accept: tuple[FrameCheck, ...] = field(default=(), metadata={"key": "calibration.accept"})
-    element_size: float | None = field(default=None, metadata={"key": "mesh.element_size", "bounds": {"above": 0}})
+    element_size: float | Literal["auto"] | None = field(
+        default=None, metadata={"key": "mesh.element_size", "bounds": {"above": 0}}
+    )
     cracks: tuple[tuple[tuple[float, float], ...], ...] = field(default=(), metadata={"key": "mesh.cracks"})
     mesh_file: Path | None = field(default=None, metadata={"key": "mesh.file"})
     mesh_points: tuple[tuple[float, float, float, float], ...] | None = field(
@@ -618,6 +629,7 @@ class TestSettings(_Checked):
     )
     mesh_unit: Literal["mm", "m", "um", "inch"] | None = field(default=None, metadata={"key": "mesh.unit"})
     mesh_part: str | None = field(default=None, metadata={"key": "mesh.part"})
+    mesh_error: bool | Literal["key"] = field(default=False, metadata={"key": "mesh.error"})
     illumination: IlluminationSettings = field(default_factory=IlluminationSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
@@ -628,6 +640,15 @@ class TestSettings(_Checked):
     base: Path = field(default_factory=Path, metadata={"key": ""})
 
     def _check(self) -> None:
+        _require(
+            not (self.mesh_error and self.frames.update_reference),
+            "mesh.error is for one reference, and frames.update_reference makes others: leave one of them out",
+        )
+        _require(
+            not self.mesh_error or self.mesh_file is not None or self.side >= SMALLEST_HALVED,
+            f"mesh.error halves the elements: mesh.element_size must be {SMALLEST_HALVED:g} px or more for it, not "
+            f"{self.side:g}",
+        )
         for number, crack in enumerate(self.cracks):
             _require_corners(f"mesh.cracks[{number}]", crack, 2, "two")
         if self.mesh_file is None:
@@ -655,8 +676,8 @@ class TestSettings(_Checked):
 
     @property
     def side(self) -> float:
-        """Side of the elements in px, where the mesh is made here; the default where it is not."""
-        return self.element_size or ELEMENT_SIZE
+        """Side of the elements in px, where it is stated; the default where it is not, or is found by the run."""
+        return self.element_size if isinstance(self.element_size, float) else ELEMENT_SIZE
 
     @classmethod
     def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:

@@ -43,6 +43,8 @@ def random_record(seed: int) -> FrameRecord:
     }
     for name in (name for name in values if name.endswith("_std")):
         values[name] = np.where(blank, np.nan, random.uniform(0.01, 0.02, NODES))
+    estimated = [name for name, quantity in QUANTITIES.items() if quantity.estimated]
+    values |= {name: random.uniform(0.01, 0.02, NODES * (seed % 2)) for name in estimated}
     pictures = random.integers(0, 256, (2, 3, 8, 12)).astype(np.uint8) if seed % 2 == 0 else (None, None)
     history = 0.5 * 0.1 ** np.arange(1 + seed % 5)
     values |= {

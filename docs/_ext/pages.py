@@ -17,11 +17,14 @@ logger = logging.getLogger(__name__)
 DOCS = Path(__file__).resolve().parents[1]
 ROOT = DOCS.parent
 OUTSIDE = {
-    "README.md": "tutorials/first-steps",
+    "README.md": "index",
     "calibration/README.md": "how-to/calibration",
     "CHANGELOG.md": "changelog",
+    "CONTRIBUTING.md": "contributing",
+    "CODE_OF_CONDUCT.md": "conduct",
+    "SECURITY.md": "security",
 }
-"""Pages that include a file from outside docs/."""
+"""Pages that include a file from outside docs/, and the one in place of the README."""
 
 
 def rewritten(text: str, folder: Path, page: Path) -> str:

@@ -271,7 +271,7 @@ def camera() -> str:
 # ---- results and formats
 
 _SIZES = {"node": "N", "light": "k", "element": "E", "function": "m", "row": "h", "column": "w", "iteration": "i"}
-_SIZES |= {"image row": "H", "image column": "W", "reference_update": "r"}
+_SIZES |= {"image row": "H", "image column": "W", "reference_update": "r", "estimated node": "N"}
 
 
 def quantities() -> str:
@@ -350,13 +350,14 @@ def expanded(text: str) -> str:
 
 
 def public() -> Iterator[tuple[str, str, Any]]:
-    """Module, name and object of every public name, once."""
+    """Module, name and object of every public name, once, aliases of classes left out."""
     seen: set[int] = set()
     for module in map(import_module, MODULES):
         for name in module.__all__:
             found = getattr(module, name)
-            described_alone = inspect.isclass(found) or inspect.isroutine(found)
-            if name != "__version__" and not (described_alone and id(found) in seen):
+            alone = inspect.isclass(found) or inspect.isroutine(found)
+            alias = inspect.isclass(found) and found.__name__ != name
+            if name != "__version__" and not alias and not (alone and id(found) in seen):
                 seen.add(id(found))
                 yield module.__name__, name, found
 

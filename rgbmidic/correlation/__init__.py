@@ -1,5 +1,6 @@
 """The MIDIC solve: one displacement field from k weighted image pairs (paper, section 3.2)."""
 
+from rgbmidic.correlation.discretisation import discretisation_error
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual
@@ -18,6 +19,7 @@ __all__ = [
     "Solution",
     "Start",
     "Status",
+    "discretisation_error",
     "fill",
     "find_start",
     "solve",

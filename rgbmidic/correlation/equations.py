@@ -20,7 +20,7 @@ from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["SEEN", "Equations", "Estimate", "Problem", "UnsolvableError", "compare", "iterate"]
+__all__ = ["SEEN", "Equations", "Estimate", "Problem", "UnsolvableError", "compare", "iterate", "stepped"]
 
 _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian. Chosen;
@@ -308,7 +308,7 @@ def iterate(
     """
     known: FloatImage | None = residual.difference_from(values)
     for turn in range(min(_PASS_ITERATIONS, problem.options.max_iterations - len(estimate.increments))):
-        estimate = _stepped(problem, equations, values, estimate, known)
+        estimate = stepped(problem, equations, values, estimate, known)
         known = None
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
@@ -319,7 +319,7 @@ def iterate(
     return estimate
 
 
-def _stepped(
+def stepped(
     problem: Problem,
     equations: Equations,
     values: FloatImage,

@@ -143,9 +143,17 @@ class Recovery:
     curvature: tuple[sp.csr_matrix, ...]
 
     @classmethod
-    def over(cls, mesh: Tri3Mesh, used: BoolArray, information: FloatArray, offset: FloatArray) -> Recovery:
-        """Over the elements `used` (E,); `information` (N,) and `offset` (N, 3) as in `quadratic_fit`."""
-        value, slope_x, slope_y, *curvature = quadratic_fit(mesh, used, information=information, offset=offset)
+    def over(
+        cls,
+        mesh: Tri3Mesh,
+        used: BoolArray,
+        information: FloatArray,
+        offset: FloatArray,
+        first: int | None = None,
+    ) -> Recovery:
+        """Over the elements `used` (E,); `information` (N,), `offset` (N, 3) and `first` as in `quadratic_fit`."""
+        operators = quadratic_fit(mesh, used, information=information, offset=offset, first=first)
+        value, slope_x, slope_y, *curvature = operators
         return cls(value=value, slope_x=slope_x, slope_y=slope_y, curvature=tuple(curvature))
 
     @property
@@ -171,7 +179,7 @@ class Recovery:
     def bend(self, fitted: FloatArray, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the linear fit has at the nodes beyond the field (N, 2), and its second derivatives (N, 2, 3)."""
         second = np.stack([operator @ fitted for operator in self.curvature], axis=-1)
-        return np.einsum("nt,nct->nc", offset, second), second
+        return np.einsum("nt,nct->nc", offset[: len(second)], second), second
 
 
 def linear_fit_offset(mesh: Tri3Mesh) -> FloatArray:

@@ -61,6 +61,9 @@ class Solution:
     strain, strain_std : ndarray, shape (N, 3), float64
         Small strain (exx, eyy, exy), tensor shear, and its standard uncertainty: slopes of the quadratic through the
         nodes around; NaN where the node or a neighbour is not measured.
+    displacement_error, strain_error : ndarray, shape (N, 2), (N, 3), float64
+        What mesh and recovery leave out of both, as standard deviations (`discretisation_error`); NaN where not asked
+        for or not known.
     node_status : ndarray, shape (N,), uint8
         See `NodeStatus`.
     light_fraction : ndarray, shape (N, k), float64
@@ -89,6 +92,8 @@ class Solution:
     displacement_std: FloatArray
     strain: FloatArray
     strain_std: FloatArray
+    displacement_error: FloatArray
+    strain_error: FloatArray
     node_status: npt.NDArray[np.uint8]
     light_fraction: FloatArray
     misfit: FloatArray
@@ -110,6 +115,8 @@ class Solution:
             displacement_std=np.full((count, 2), np.nan),
             strain=np.full((count, 3), np.nan),
             strain_std=np.full((count, 3), np.nan),
+            displacement_error=np.full((count, 2), np.nan),
+            strain_error=np.full((count, 3), np.nan),
             node_status=np.full(count, NodeStatus.NOT_SEEN, dtype=np.uint8),
             light_fraction=np.zeros((count, lights)),
             misfit=np.full(count, np.nan),

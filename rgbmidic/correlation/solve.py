@@ -383,6 +383,8 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
         strain=np.where(inner[:, None], recovery.strain(fitted), np.nan),
         strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
+        displacement_error=np.full((len(inner), 2), np.nan),
+        strain_error=np.full((len(inner), 3), np.nan),
         node_status=node_status,
         light_fraction=equations.light_fraction,
         misfit=np.where(measured, misfits, np.nan),

@@ -223,6 +223,7 @@ def quadratic_fit(
     *,
     information: FloatArray | None = None,
     offset: FloatArray | None = None,
+    first: int | None = None,
 ) -> tuple[sp.csr_matrix, ...]:
     """Linear operators (N, N), one for each of `TERMS`, from nodal values to those of the polynomial at each node.
 
@@ -239,21 +240,28 @@ def quadratic_fit(
         How well each node is known (inverse variance, any unit): one that is known badly counts little elsewhere.
     offset : ndarray, shape (N, 3), optional
         Excess of the given values over a field whose second derivative xx, xy or yy is 1, square px; 0 without.
+    first
+        Fit the polynomials of so many first nodes only; None: of all.
 
     Returns
     -------
-    tuple of csr_matrix, shape (N, N)
+    tuple of csr_matrix, shape (N, N) or (`first`, N)
         In the order of `TERMS`, per px and square px.
     """
     other, known, weight, structure = _window(mesh, used.tobytes())
     basis = _basis(mesh, used.tobytes(), None if offset is None else offset.tobytes())
+    if first is not None:
+        other, weight, basis, structure = other[:first], weight[:first], basis[:first], structure[:first]
+        known = known[: structure.nnz]
     if information is not None:
-        own, theirs = np.broadcast_to(information[:, None], other.shape), information[other]
+        own, theirs = np.broadcast_to(information[: len(other), None], other.shape), information[other]
         weight = weight * np.divide(theirs, own + theirs, out=np.full(other.shape, 0.5), where=own + theirs > 0)
     weighted = weight[:, None] * basis
     normal = weighted @ basis.transpose(0, 2, 1)
     normal[:, range(1, 6), range(1, 6)] += _RIDGE
-    fits = (np.linalg.inv(normal) / (mesh.sizes[:, None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]) @ weighted
+    fits = (
+        np.linalg.inv(normal) / (mesh.sizes[: len(other), None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]
+    ) @ weighted
     return tuple(with_data(structure, fits[:, term].ravel()[known]) for term in range(6))
 
 
@@ -281,7 +289,7 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
     return out
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)  # of a mesh and of its halves
 def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
     """Return the nodes that the polynomial of each node is fitted to.
 
@@ -316,7 +324,7 @@ def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
     return np.asarray(np.where(fraction > 0, fraction, 1.0))
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=4)  # with and without the offset
 def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
     """Evaluate 1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element: (N, 6, W)."""
     other = _window(mesh, used)[0]

@@ -50,6 +50,7 @@ from rgbmidic.weights import LightWeights, as_weights, prepare_weights
 
 __all__ = [
     "HARDLY_ENOUGH",
+    "Choice",
     "Plan",
     "UpdatedReferences",
     "check_texture",
@@ -99,6 +100,14 @@ _WORTH = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Element size that the frames of a test recommend (`rgbmidic.pipeline.resolution`), and why, in a sentence."""
+
+    element_size: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """What all frames of a test share; it can be pickled, so that any process can measure any frame.
 
@@ -128,6 +137,8 @@ class Plan:
         Part of the reference frames that is read; all positions (region, mesh, images) count from where it begins.
     finite_elements, placement
         The mesh of ``mesh.file``, the part that is measured, and where it lies in the frame; None: there is no file.
+    choice
+        Why the elements have their size, where ``mesh.element_size`` is ``"auto"``; else None.
     timings
         Whether to tell the time that each stage of a frame takes.
     updates
@@ -148,6 +159,7 @@ class Plan:
     element_size: float
     finite_elements: FiniteElementMesh | None = None
     placement: Placement | None = None
+    choice: Choice | None = None
     timings: bool = False
     updates: UpdatedReferences = field(default_factory=UpdatedReferences, repr=False, compare=False)
 
@@ -345,6 +357,11 @@ def _check_given(
         raise ConfigurationError(f"mesh.file names {settings.mesh_file}, and a mesh is given: leave one of them out")
     if mesh is not None and settings.cracks:
         raise ConfigurationError("mesh.cracks splits a mesh that is made here; the mesh that is given has its own")
+    if settings.element_size == "auto":
+        raise ConfigurationError(
+            'mesh.element_size = "auto" is found on the frames of a test by rgbmidic.measure, for a mesh that is made '
+            "there: state a number"
+        )
     kind = settings.frames.kind
     if kind in ("bayer", "rgb") and separation is None and settings.calibration_file is None:
         raise ConfigurationError(

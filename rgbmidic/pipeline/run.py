@@ -11,7 +11,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, cast
@@ -26,7 +26,8 @@ from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame, solver_settings
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import Choice, Plan
+from rgbmidic.pipeline.resolution import choose
 from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank_of
 from rgbmidic.pipeline.source import FrameSequence, LightSeparation, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
@@ -127,7 +128,13 @@ def measure(
     if retry_failed and not resume:
         raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
-    plan = replace(Plan.from_settings(settings, **given), timings=timings)
+    choice: Choice | None = None
+    if settings.element_size == "auto":
+        begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
+        kept = read_provenance(Path(out)).get("element_size") if begun else None
+        choice = choose(settings, **given) if kept is None else Choice(**kept)
+    sized = settings if choice is None else replace(settings, element_size=choice.element_size)
+    plan = replace(Plan.from_settings(sized, **given), settings=settings, choice=choice, timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
@@ -223,6 +230,7 @@ def _store(
         reference=plan.images.values,
         notes={
             **getattr(plan.weights, "notes", {}),
+            **({} if plan.choice is None else {"element_size": asdict(plan.choice)}),
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
             "lost_frames": series.lost,

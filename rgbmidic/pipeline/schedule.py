@@ -22,7 +22,7 @@ from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.frame import failed_frame
+from rgbmidic.pipeline.frame import STRIDE, failed_frame
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
 from rgbmidic.results import QUANTITIES, FrameRecord, ResultStore
@@ -244,10 +244,6 @@ def rank_of(record: FrameRecord | Solution) -> tuple[bool, float]:
 def loses(record: FrameRecord | Solution, start: Start) -> bool:
     """Whether a key frame is measured worse than the one it starts from."""
     return record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + _LOSS
-
-
-STRIDE = 16
-"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
 
 
 def parent(position: int) -> int | None:

@@ -277,6 +277,10 @@ class _Report:
         maps = {f"{name} ({length})": (values[name], values[name] * 0) for name in ("u_std", "v_std")}
         figure = self.maps.fields(frame, maps, positive=True)
         _show(page, figure, f"standard uncertainty, {self._when(frame)}")
+        both = self.maps.discretisation(frame)
+        if both is not None:
+            caption = "noise and discretisation error together; above 1 on the right a finer mesh is needed"
+            _show(page, both, f"{caption}, {self._when(frame)}")
 
     def _lights(self, page: Page) -> None:
         result, frame = self.physical.result, self.shown[-1]

@@ -300,6 +300,18 @@ class MapDrawer:
             maps[label] = values[name], values.get(f"{name}_std", nothing)
         return self.fields(frame, maps, positive=kind in _POSITIVE)
 
+    def discretisation(self, frame: int, maps: Maps | None = None) -> Figure | None:
+        """Draw both errors together, and where a finer mesh is needed; None for a frame without the second one."""
+        maps = maps or Maps.of(self.result)
+        names = ("u_total", "v_total", "finer_mesh")
+        if "finer_mesh" not in maps.all:
+            return None
+        values = {name: maps.read(name, frame).values for name in names}
+        if not np.isfinite(values["u_total"]).any():
+            return None
+        shown = {maps.field(name).label: (values[name], values[name] * 0) for name in names}
+        return self.fields(frame, shown, positive=True)
+
     def fields(
         self, frame: int, fields: Mapping[str, tuple[FloatArray, FloatArray]], *, positive: bool = False
     ) -> Figure:

@@ -35,6 +35,7 @@ _OF_FRAME: Mapping[str, Callable[[figures.MapDrawer, int], Figure | None]] = {
     **{kind: partial(figures.MapDrawer.of_kind, kind=kind) for kind in figures.MAPS},
     "fractions": lambda maps, frame: maps.fractions(frame) if len(maps.result.lights) > 1 else None,
     "masks": lambda maps, frame: figures.mask_figure(maps.result, frame),
+    "discretisation": lambda maps, frame: maps.discretisation(frame),
     "reflections": lambda maps, frame: figures.reflection_figure(maps.result, frame),
 }
 _NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)}|map_.+)_[0-9]{{6,}})\.png")

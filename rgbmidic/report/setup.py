@@ -72,11 +72,18 @@ def _missing(key: str) -> str:
     return f"not stated (`{key}`)"
 
 
+_FINEST = (2.2, 2.6)
+"""Spatial resolution of the displacement at the nodes, in elements, and of a virtual strain gauge's strain, in its
+lengths (`rgbmidic.lab.resolution.cut_offs`)."""
+
+
 def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
     """Yield the parameters of the analysis, in the order of the guide; settings that were not kept are left out."""
     result, set_, mesh = physical.result, physical.result.setting, physical.mesh
     demosaic, normalise = set_("illumination", "demosaic"), set_("illumination", "normalise")
-    size = set_("mesh", "element_size")
+    chosen = result.provenance.get("element_size")  # of element_size = "auto"
+    stated = set_("mesh", "element_size") if chosen is None else chosen["element_size"]
+    size = float(mesh.size if stated is None else stated)
     separation = f"demosaicing `{demosaic}`, crosstalk unmixed by calibration"
     separated = len(result.lights) > 1 and demosaic is not None
     strain = "plane fitted to the displacements of the nodes in a virtual strain gauge"
@@ -85,7 +92,8 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         cracked = len(mesh.crack_edges) > 0
         levels = f"divided by their local mean, σ = {normalise * (WIDER_AT_CRACKS if cracked else 1):g} px"
         correction = "mean" if cracked and correction != "local" else correction
-    side = physical.in_units(mesh.size if size is None else size)
+    side, gauge = physical.in_units(size), physical.gauges.length
+    finest = (("displacement", _FINEST[0] * size), ("strain", _FINEST[1] * gauge))
     rows = (
         ("software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"),
         ("reference", reference_text(physical)),
@@ -94,14 +102,21 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         ("image filter", _PREFILTERS.get(set_("solver", "prefilter"))),
         ("weights of the lights", _WEIGHTS.get(set_("weights", "method"))),
         ("elements", f"{len(mesh.elements)} triangles of three nodes, {len(mesh.nodes)} nodes; side {side}"),
+        ("data point spacing", f"{side}, at the nodes"),
+        ("choice of the elements", None if chosen is None else f"by the run: {chosen['reason']}"),
         ("shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"),
         ("matching criterion", "weighted sum of squared differences over all lights at once"),
         ("interpolant", "cubic B-spline"),
         ("grey-level correction", correction),
         ("rigid motion between lights", set_("solver", "rigid")),
         ("strain", f"{physical.measure_name}: {strain}"),
-        ("virtual strain gauge", f"{physical.in_units(physical.gauges.length)}, at every node"),
+        ("virtual strain gauge", f"{physical.in_units(gauge)}, at every node"),
         ("smoothing afterwards", "none"),
+        (
+            "spatial resolution",
+            ", ".join(f"{name} {physical.in_units(float(f'{period:.2g}'))}" for name, period in finest)
+            + ": the period of a wave of which a tenth of the amplitude is lost",
+        ),
         ("noise floor", noise_text(physical, floor)),
     )
     yield from ((name, text) for name, text in rows if text is not None)

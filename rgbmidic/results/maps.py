@@ -83,8 +83,19 @@ _SYMBOLS = {
     "exx": "εxx", "eyy": "εyy", "exy": "εxy", "e1": "ε₁", "e2": "ε₂", "direction": "θ₁", "shear": "γmax",
     "equivalent": "εeq",
 }  # fmt: skip
+_COMPONENTS = ("u", "v", "exx", "eyy", "exy")
+_FINER = "finer_mesh"
+_WITH_ERROR = {
+    **{
+        f"{name}_mesh_error": f"discretisation error of {name}: what mesh and recovery leave out"
+        for name in _COMPONENTS
+    },
+    **{f"{name}_total": f"noise and discretisation error of {name} together" for name in _COMPONENTS},
+    _FINER: "largest discretisation error over the noise of u, v, exx, eyy, exy: above 1 a finer mesh is needed here",
+}
+"""Fields of results whose ``mesh.error`` asks for the discretisation error."""
 _GROUPS = ("Displacement", "Strain", "Rates", "Quality", "Uncertainty")
-_POSITIVE = ("magnitude", "velocity", "acceleration", "equivalent", "shear", "misfit")
+_POSITIVE = (_FINER, "magnitude", "velocity", "acceleration", "equivalent", "shear", "misfit")
 _KINDS: dict[str, Kind] = {"direction": "angle", "node_status": "codes", **dict.fromkeys(_POSITIVE, "positive")}
 """Kinds of fields; other lengths and their rates are displacements, uncertainties positive, all others strains."""
 _OTHERS: dict[bool, Kind] = {True: "displacement", False: "strain"}
@@ -288,6 +299,9 @@ class Maps:
         for name, quantity in quantities.items():
             if quantity.axes == ("node",) and name not in (*found, *spread):
                 add(name, name, quantity.unit, ", ".join(quantity.codes) or quantity.meaning, "Quality", quantity.codes)
+        for name, meaning in _WITH_ERROR.items() if self.result.setting("mesh", "error") else ():
+            unit = units.length if name[:2] in ("u_", "v_") else ""
+            add(name, name, unit, meaning, "Quality" if name == _FINER else "Uncertainty")
         for light in self.result.lights:
             add(name := f"fraction of {light}", name, "", quantities["light_fraction"].meaning, "Quality")
         for each in uncertain:
@@ -339,11 +353,13 @@ class Maps:
         if not 0 <= frame < len(self.result):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
-        derived = base in _DERIVED or base in _SYMBOLS
+        derived = base in _DERIVED or base in _SYMBOLS or name in _WITH_ERROR
         stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
         read = next(self.result.table.each([*_MOVED, "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
-        if derived:
+        if name in _WITH_ERROR:
+            values, std = self._with_error(name, frame), nothing
+        elif derived:
             values, std = self._derived(base, frame)
             values, std = (std, nothing) if base != name else (values, std)
         elif kind == "fraction":
@@ -357,6 +373,28 @@ class Maps:
             moved=self.result.nodes + np.stack([read["u"], read["v"]], axis=1),
             status=read["node_status"],
         )
+
+    def _with_error(self, name: str, frame: int) -> FloatArray:
+        """Compute a field of `_WITH_ERROR` (N,) against the test's reference; NaN in frames without."""
+        read = next(
+            self.result.table.each(
+                [f"{one}{end}" for one in _COMPONENTS for end in ("_std", "_mesh_error")] + ["u", "v"], [frame]
+            )
+        )
+        if not read["u_mesh_error"].size:
+            return np.full(len(self.result.nodes), np.nan)
+        double = {key: np.asarray(values, dtype=np.float64) for key, values in read.items()}
+        if name == _FINER:
+            ratios = [double[f"{one}_mesh_error"] / double[f"{one}_std"] for one in _COMPONENTS]
+            return np.asarray(np.fmax.reduce(ratios))
+        one = name.removesuffix("_total").removesuffix("_mesh_error")
+        if one in _UV:
+            for end in ("_std", "_mesh_error"):
+                parts = (double[key] for key in ("u", "v", f"u{end}", f"v{end}"))
+                moved = self.physical.rectified.displacement(*parts)[2:]
+                double[f"{one}{end}"] = self._units.lengths(*[moved[_UV.index(one)]] * 2)[0]
+        error = double[f"{one}_mesh_error"]
+        return error if name.endswith("_error") else np.hypot(error, double[f"{one}_std"])
 
     def _derived(self, name: str, frame: int) -> tuple[FloatArray, FloatArray]:
         """Compute a field of `_DERIVED`, or a strain, and its uncertainty, each (N,)."""

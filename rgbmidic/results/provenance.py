@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"

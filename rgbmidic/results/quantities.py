@@ -67,6 +67,11 @@ class ResultQuantity:
         return None not in self.shape({"node": 0, "light": 0}) and self.dtype is not np.str_
 
     @property
+    def estimated(self) -> bool:
+        """Whether it is of the nodes, but only in frames of which it is asked for."""
+        return self.axes == _ESTIMATED
+
+    @property
     def attributes(self) -> dict[str, Any]:
         """Description by the CF conventions: units ("1" where there is none), long_name, and what a status means."""
         about: dict[str, Any] = {"units": self.unit or "1", "long_name": self.meaning}
@@ -97,6 +102,7 @@ class ResultQuantity:
 UNKNOWN_TIME = np.iinfo(np.int64).min
 """`time_ns` of a frame whose time is not known."""
 
+_ESTIMATED = ("estimated node",)
 _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
@@ -135,6 +141,9 @@ _UNREAD = "1 where the frame failed because it could not be read, which `--resum
 _TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
 _REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not give it"
 _SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
+_LEFT_OUT = (
+    "discretisation error of {}: what mesh and recovery leave out, one sigma; empty unless `mesh.error` asks for it"
+)
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
@@ -159,6 +168,16 @@ _TABLE = (
     ResultQuantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx"),
     ResultQuantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy"),
     ResultQuantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
+    *(
+        ResultQuantity(f"{name}_mesh_error", _ESTIMATED, unit, source, _LEFT_OUT.format(name))
+        for name, unit, source in (
+            ("u", "px", "displacement_error.0"),
+            ("v", "px", "displacement_error.1"),
+            ("exx", "", "strain_error.0"),
+            ("eyy", "", "strain_error.1"),
+            ("exy", "", "strain_error.2"),
+        )
+    ),
     ResultQuantity("match", (), "", "", _MATCH),
     ResultQuantity("best_match", (), "", "", _BEST, blank=0),
     ResultQuantity("reference_updates", ("reference_update",), "", "", _UPDATES, dtype=np.int64, blank=0),
@@ -252,7 +271,10 @@ class FrameRecord:
             The others, such as `number`, `time_ns`, `brightness` and `weights_thumbnail`; None where not known.
         """
         nodes, lights = np.shape(solution.light_fraction)
-        solved = {name: entry.of(solution) for name, entry in QUANTITIES.items() if entry.source}
+        known = [name for name, entry in QUANTITIES.items() if entry.source]
+        if not np.isfinite(solution.displacement_error).any():
+            known = [name for name in known if not QUANTITIES[name].estimated]
+        solved = {name: QUANTITIES[name].of(solution) for name in known}
         return cls.of(nodes=nodes, lights=lights, inputs=_pairs(inputs), **solved, **given)
 
     @classmethod

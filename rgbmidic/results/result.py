@@ -173,10 +173,12 @@ class Result:
 
     def stack(self, name: str) -> AnyArray:
         """Read one quantity of all frames into one array, the frames as first axis."""
-        one = QUANTITIES[name].unmeasured(self.table.layout.sizes)
-        stacked = np.empty((len(self), *one.shape), dtype=one.dtype)
+        entry = QUANTITIES[name]
+        shape = (len(self.nodes),) if entry.estimated else entry.unmeasured(self.table.layout.sizes).shape
+        stacked = np.full((len(self), *shape), entry.blank, dtype=entry.dtype)
         for index, value in enumerate(self.each(name)):
-            stacked[index] = value
+            if np.size(value) or not entry.estimated:
+                stacked[index] = value
         return stacked
 
     def to_xarray(self, scale: ScaleSettings | None = None) -> xr.Dataset:
@@ -215,14 +217,14 @@ class Result:
 
     def __getattr__(self, name: str) -> AnyArray:
         """Read a stackable quantity of the table, and keep it."""
-        if name not in QUANTITIES or not QUANTITIES[name].stackable:
+        if name not in QUANTITIES or not (QUANTITIES[name].stackable or QUANTITIES[name].estimated):
             raise AttributeError(f"a result has no attribute {name!r}")
         stacked = self.__dict__[name] = self.stack(name)
         return stacked
 
     def __dir__(self) -> list[str]:
         """List the attributes, quantities included."""
-        return [*super().__dir__(), *(name for name, quantity in QUANTITIES.items() if quantity.stackable)]
+        return [*super().__dir__(), *(name for name, one in QUANTITIES.items() if one.stackable or one.estimated)]
 
     @property
     def strain(self) -> FloatArray:

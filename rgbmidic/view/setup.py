@@ -21,7 +21,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
-from rgbmidic.settings import RegionSettings, TestSettings, read_section
+from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
 from rgbmidic.view.canvas import Canvas, Tiles
 from rgbmidic.view.draft import (
     HOLES,
@@ -233,8 +233,9 @@ class SetupPage:
         if int(p.reference.value) != self.draft.frames.reference[0]:
             frames["reference"] = [int(p.reference.value)]
         changes: dict[str, dict[str, Any]] = {"frames": frames}
-        if not self.draft.section("mesh").get("file"):
-            changes["mesh"] = {"element_size": float(p.size.value)}
+        mesh, size = self.draft.section("mesh"), float(p.size.value)
+        if not mesh.get("file") and not (mesh.get("element_size") == "auto" and size == ELEMENT_SIZE):
+            changes["mesh"] = {"element_size": size}
         if p.calibration.value:
             changes["calibration"] = {"file": p.calibration.value}
         if content is not None:

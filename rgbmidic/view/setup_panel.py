@@ -249,6 +249,7 @@ class SetupControls(Controls):
         super().__init__(last, reference, dark=dark)
         wide, number = self.wide, {"low": 0, "high": last, "step": 1, **self.wide}
         size = draft.section("mesh").get("element_size", ELEMENT_SIZE)
+        size = ELEMENT_SIZE if size == "auto" else size
         calibration = str(draft.section("calibration").get("file", ""))
         self.head.text = f"<b>{html.escape(str(draft.file))}</b> &nbsp; a test to set up"
         self.picture = bk.Select(title="Picture", name="picture", options=[RAW], value=RAW, **wide)

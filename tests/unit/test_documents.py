@@ -147,11 +147,10 @@ def test_the_page_of_the_test_file_has_the_code_s_types_and_defaults():
 @pytest.mark.parametrize("program", [cli.app, calibrate.app])
 def test_every_option_of_every_command_is_on_its_page(program, capsys):
     page = reference.commands(program.info.name)
-    for name in (group := typer.main.get_command(program)).commands:
+    for name in typer.main.get_command(program).commands:
         execute(program, [name, "--help"])
         part = page.split(f"\n## {program.info.name} {name}\n")[1].split("\n## ")[0]
         options = set(re.findall(r"^ +(--[a-z][a-z-]*)", capsys.readouterr().out, re.MULTILINE)) - {"--help"}
-        assert len(options) >= min(1, len(group.commands[name].params) - 1)
         assert options == set(re.findall(r"^\| `(--[a-z][a-z-]*)", part, re.MULTILINE))
 
 

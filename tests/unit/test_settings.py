@@ -206,7 +206,7 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST + "[probes]\npoissons_ratio = 0.6", r"probes\.poissons_ratio must be .* 0\.5, not 0\.6"),
         (LEAST + "[mesh]\ncracks = [[[0, 5], [nan, 5]]]", r"mesh\.cracks must be finite, not nan"),
         (LEAST + "[mesh]\nelement_size = true", r"mesh\.element_size must be a number, not True"),
-        (LEAST + "[mesh]\nelement_size = '25'", r'mesh\.element_size must be a number, not "25"'),
+        (LEAST + "[mesh]\nelement_size = '25'", r'mesh\.element_size must be a number or "auto", not "25"'),
         (LEAST + "[weights]\nthreshold = 1.5", r"weights\.threshold must be at most 1, not 1.5"),
         (LEAST + "[weights]\nmethod = 'magic'", r'weights\.method must be one of .*not "magic"'),
         (LEAST + "[solver]\nmax_iterations = 5.5", r"solver\.max_iterations must be a whole number, not 5.5"),
@@ -401,7 +401,7 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
     prefix = "" if section == "test" else rf"{section}\."
     key = {"calibration_file": r"calibration\.file", "element_size": r"mesh\.element_size", "cracks": r"mesh\.cracks"}
     key |= {"accept": r"calibration\.accept"}
-    key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part")}
+    key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part", "error")}
     key = key if isinstance(built, TestSettings) else {}
     for instead in wrong:
         with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:

@@ -74,7 +74,7 @@ def inspect_files(
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     known = known and known.cropped(stated.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
-    sides = None if test is None else test.element_size
+    sides = None if test is None else test.side
     if place is None and test is not None:
         if test.mesh_file is None:
             place = read_region(test.region, shape)
@@ -83,7 +83,7 @@ def inspect_files(
             sides = mesh.size
     how: dict[str, Any] = {"name": " + ".join(legible(path.name) for path in paths)}
     if test is not None:
-        how |= {"element_size": sides or test.side, "accept": test.accept}
+        how |= {"element_size": sides, "accept": test.accept}
         how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
     how |= {key: value for key, value in options.items() if value is not None}
     try:

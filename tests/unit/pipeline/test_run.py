@@ -28,7 +28,7 @@ from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import measure, run, schedule, workers
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import UpdatedReferences
-from rgbmidic.results import Result, finish_result, scale_of
+from rgbmidic.results import Maps, Result, finish_result, scale_of
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
 
@@ -497,3 +497,37 @@ def test_paint_that_wears_off_is_followed_by_renewed_references_to_the_same_bits
     with pytest.raises(KeyboardInterrupt):
         measure(chosen, tmp_path / "resumed", progress=interrupt)
     same(measure(chosen, tmp_path / "resumed", resume=True), renewing)
+
+
+def test_the_discretisation_error_is_kept_where_it_is_asked_for(movie: Path, tmp_path: Path) -> None:
+    document = settings(movie, first=0, last=17).to_mapping()
+    kept = {}
+    for asked in (False, "key", True):
+        document["mesh"]["error"] = asked
+        result = kept[asked] = measure(TestSettings.from_mapping(document, movie), tmp_path / str(asked))
+        known = [bool(values.size) for values in result.each("u_mesh_error")]
+        assert known == [asked is True or (asked == "key" and frame in (0, 16, 17)) for frame in range(18)]
+    assert np.array_equal(kept[True].u, kept[False].u, equal_nan=True)
+    assert kept["key"].exx_mesh_error.shape == kept["key"].u.shape
+    maps, plain = Maps.of(kept[True]), Maps.of(kept[False])
+    assert "finer_mesh" not in plain.all
+    total, error = (maps.read(f"u_{name}", 17).values for name in ("total", "mesh_error"))
+    assert np.allclose(total, np.hypot(error, kept[True].u_std[17]), equal_nan=True)
+    assert np.isfinite(maps.read("finer_mesh", 17).values).any()
+
+
+@pytest.mark.parametrize(
+    ("mesh", "frames", "message"),
+    [
+        ({"error": "all"}, {}, "mesh.error"),
+        ({"error": True, "element_size": 6}, {}, "mesh.element_size must be 8 px or more for it, not 6"),
+        ({"error": True}, {"update_reference": True}, "frames.update_reference makes others"),
+    ],
+)
+def test_a_discretisation_error_that_cannot_be_known_is_refused(
+    movie: Path, mesh: dict[str, Any], frames: dict[str, Any], message: str
+) -> None:
+    document = settings(movie, **frames).to_mapping()
+    document["mesh"] |= mesh
+    with pytest.raises(ConfigurationError, match=message):
+        TestSettings.from_mapping(document, movie)

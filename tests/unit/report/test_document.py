@@ -157,6 +157,8 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["frame rate"].startswith("50000 frames per second")
     assert page.rows["exposure"] == "1.5 µs"
     assert page.rows["virtual strain gauge"] == f"{3 * MESH.size:.4g} px ({0.15 * MESH.size:.3g} mm), at every node"
+    assert page.rows["data point spacing"].endswith("at the nodes")
+    assert page.rows["spatial resolution"].startswith(f"displacement {2.2 * stated.element_size:.2g} px (")
     assert page.rows["elements"].endswith(f"side {stated.element_size:.4g} px ({0.05 * stated.element_size:.3g} mm)")
     assert page.rows["image filter"].startswith("[1 2 1]")
     assert page.rows["u_std"].startswith("mm | ")

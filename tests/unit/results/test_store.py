@@ -238,7 +238,7 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "not a result folder" in damaged("provenance.json", None)
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
-    assert "schema version 9" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 9}')
+    assert "schema version 10" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 10}')
     assert "schema version 3" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 3}')
     whole = make_result(tmp_path / "whole").provenance
     for part, odd in {"frames": [1], "lights": [1], "settings": {"a": 1}, "references": ["a"], "inputs": None}.items():
@@ -298,6 +298,8 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
         displacement_std=values.random((nodes, 2)),
         strain=values.random((nodes, 3)),
         strain_std=values.random((nodes, 3)),
+        displacement_error=values.random((nodes, 2)),
+        strain_error=values.random((nodes, 3)),
         node_status=np.arange(nodes).astype(np.uint8),
         light_fraction=values.random((nodes, 2)),
         misfit=values.random(nodes),
@@ -315,6 +317,8 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
     np.testing.assert_array_equal(np.stack([record.u_std, record.v_std], axis=1), single["displacement_std"])
     np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), single["strain"])
     np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), single["strain_std"])
+    np.testing.assert_array_equal(record.v_mesh_error, solution.displacement_error[:, 1].astype(np.float32))
+    np.testing.assert_array_equal(record.exy_mesh_error, solution.strain_error[:, 2].astype(np.float32))
     for name in ("node_status", "light_fraction", "misfit", "rigid", "residual", "weight_fraction", "history"):
         single = np.asarray(getattr(solution, name), dtype=QUANTITIES[name].dtype)
         np.testing.assert_array_equal(getattr(record, name), single, err_msg=name)

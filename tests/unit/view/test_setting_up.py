@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from rgbmidic.view.draft import (
     region_of,
     scale_section,
 )
+from rgbmidic.view.setup import SetupPage
+from rgbmidic.view.setup_panel import SetupControls
 
 TEXT = """# a test of the plate
 [frames]  # as recorded
@@ -56,6 +59,18 @@ def test_a_file_keeps_its_comments_and_what_was_not_changed(tmp_path):
         "mesh": {"element_size": 30.0},
     }
     assert read_test(file).element_size == 30
+
+
+def test_a_size_that_the_run_finds_is_kept_unless_it_is_changed(tmp_path):
+    file = tmp_path / "TEST.toml"
+    file.write_text(TEXT.replace("= 20", '= "auto"'), encoding="utf-8")
+    controls = SetupControls(Draft.of(file), 4, tmp_path / "out", dark=False)
+    page = SimpleNamespace(parts=controls, draft=Draft.of(file), drawing=SimpleNamespace(marks=[]))
+    page.source = SimpleNamespace(series=range(5))
+    assert controls.size.value == 25
+    assert SetupPage._changed(page).section("mesh")["element_size"] == "auto"
+    controls.size.value = 30
+    assert SetupPage._changed(page).section("mesh")["element_size"] == 30
 
 
 def test_nothing_is_changed_by_no_change(tmp_path):

@@ -1,0 +1,441 @@
+"""The discretisation error: what mesh and recovery leave out of the field, estimated from the images themselves.
+
+The stated uncertainty is that of noise. What the elements cannot follow is estimated by halving them: Gauss-Newton
+steps from the recovered field on triangles of half the side give a second, finer field (the hierarchical estimator of
+Bank and Weiser, Math. Comp. 44, 1985), and what both differ by beyond noise is the error of the coarser one. The
+variance of that difference over that of the field is a property of the two meshes and the texture alone, found once
+from random scores. Recovered slopes of a smooth field are smoothed by the mass matrix M over the lumped one L (Lele,
+J. Comput. Phys. 103, 1992): undoing that shows the error of strain where waves are long and noise hides the difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from rgbmidic._kernels.correlation import interpolate_nodal
+from rgbmidic._kernels.illumination import scores
+from rgbmidic._kernels.threads import one_blas_thread
+from rgbmidic.correlation.assembly import SCORE_RANGE, block_side, rigid_functions
+from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
+from rgbmidic.correlation.images import apply_prefilter
+from rgbmidic.correlation.recovery import Recovery, mass_matrix
+from rgbmidic.correlation.reference import Deformed, Reference, ReferenceGeometry
+from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
+from rgbmidic.correlation.solution import Solution
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh.pixel_map import quadratic_fit
+from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+__all__ = ["discretisation_error"]
+
+
+_DRAWS = 16
+"""Random scores from which the variance of the difference is found: averaged over a window to 6 % (derived)."""
+_NOISES = 2
+"""Images of noise from which is found what both fits leave of it: 800 blocks of 13 px in 380 px, to 5 % (derived)."""
+_SPREAD = 4
+"""Times that squares are averaged with those of the nodes beside: a window of standard deviation 1.5 elements."""
+_OF_DIFFERENCE = np.array([1.3, 1.3, 1.25, 1.25, 1.25])
+"""Error over the difference. Of what the mesh loses the halved one loses 1/16 for displacement and 1/4 for strain where
+waves are long, next to nothing at 3 elements: 1.07 and 4/3 to 1.1 (derived; 1.1 to 1.2 on the DIC Challenge star)."""
+_UNSMOOTHED = 0.72
+"""Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates."""
+_EDGE = 1.8
+"""Error of one-sided slopes over that of central ones: 2.5 across the edge, 1 along it (DIC Challenge star)."""
+_SURE, _SURE_SMOOTH = np.array([1.2, 1.2, 4.0, 4.0, 4.0]), 2.0
+"""Standard deviations of the mean square of noise alone by which the difference must exceed it. Strain's is 3 to 4
+times its noise, so that what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at
+most."""
+_UNEVEN = np.array([1.15, 1.15, 1.4, 1.4, 1.4])
+"""Variance of the difference, and of what is unsmoothed, over that with equal weights: a robust loss weighs pixels
+unevenly (measured on affine fields)."""
+_CHANCE = 0.8
+"""Noise by what the finer mesh leaves, over the stated one, from which it is less by chance: both are known to 6 to
+12 % (67 blocks, `SCORE_RANGE`), and nothing is taken off. Of values below it the mean is too small by about half of
+what is missing (measured: .9)."""
+_HELD = 1e-6
+"""Fraction of the mean texture that is added to that of an element, so that its square root exists (derived)."""
+
+
+def discretisation_error(
+    reference: Reference,
+    deformed: Deformed,
+    solution: Solution,
+    options: SolverSettings,
+    method: PrecisionMethod | None,
+) -> Solution:
+    """Estimate what mesh and recovery leave out of a solution.
+
+    It takes about as long as the solve; what depends on the reference alone is prepared with its first frame.
+
+    Parameters
+    ----------
+    reference, deformed, options, method
+        As `solve` was given them.
+    solution
+        What it returned.
+
+    Returns
+    -------
+    Solution
+        With `displacement_error` (N, 2) in px and `strain_error` (N, 3), as standard deviations: NaN at nodes that are
+        not measured, and everywhere on elements under 8 px. `displacement_std` and `strain_std` are then those of noise
+        alone: the misfit of the elements, which the residual holds, is taken out. ``hypot(std, error)`` is the standard
+        uncertainty with both.
+    """
+    mesh, measured = reference.mesh, solution.measured
+    if not measured.any() or mesh.size < SMALLEST_HALVED:
+        return solution
+    halves = _halves(reference)
+    with one_blas_thread():
+        values, variance = _finer_field(halves, deformed, solution, options, method)
+        std = np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
+        noise = np.sqrt(halves.own_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
+        less = noise < _CHANCE * std
+        own = np.concatenate([solution.displacement, solution.strain], axis=1)
+        error = halves.error(own - values, solution.strain, np.where(less, noise, std))
+        std = np.where(less, noise / np.sqrt(_CHANCE), std)
+    return replace(
+        solution,
+        displacement_std=std[:, :2],
+        strain_std=std[:, 2:],
+        displacement_error=np.where(np.isfinite(solution.displacement), error[:, :2], np.nan),
+        strain_error=np.where(np.isfinite(solution.strain), error[:, 2:], np.nan),
+    )
+
+
+def _finer_field(
+    halves: _Halves,
+    deformed: Deformed,
+    solution: Solution,
+    options: SolverSettings,
+    method: PrecisionMethod | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Take Gauss-Newton steps on the halved mesh from the recovered field.
+
+    Returns
+    -------
+    tuple
+        u, v, exx, eyy, exy (N, 5) at the nodes of the solution, NaN where the finer mesh sees too little; and the
+        variance of the scores in x and y that it leaves, (N, 2), as `_score_variance`.
+    """
+    mesh, fine, count = halves.mesh, halves.fine, len(halves.mesh.nodes)
+    used = np.asarray(solution.measured[mesh.elements].all(axis=1))
+    start = halves.interpolated(solution.displacement[mesh.nearest(solution.measured)[1]], used)
+    functions = rigid_functions(mesh.nodes, options.rigid).reshape(count, -1)
+    functions = halves.prolonged(functions).reshape(2 * len(start), -1)
+    problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
+    estimate = Estimate(displacement=start, rigid=np.nan_to_num(solution.rigid))
+    first = compare(problem, fine.values, estimate)
+    values = corrected_values(first, options.brightness)
+    first = replace(first, values=values, difference=first.difference_from(values))
+    children = np.repeat(used, len(_CHILDREN))
+    given = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
+    weights, _ = _weighed(method, first, given)
+    equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
+    estimate = stepped(problem, equations, values, estimate, first.difference)
+    last = compare(problem, values, estimate)
+    weights, loss = _weighed(method, last, given)
+    equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
+    lights = zip(weights, last.difference, fine.gradient.swapaxes(0, 1), strict=True)
+    side = fine.assembly.vector(np.sum([fine.projected(*light) for light in lights], axis=0))
+    # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
+    rest = loss[:, None] * equations.solve(side).reshape(-1, 2)
+    last = replace(last, difference=_left(fine, last.difference, rest).difference)
+    found = estimate.displacement + np.einsum("nij,nj->ni", equations.rotation, rest)
+    recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
+    variance = _score_variance(halves.straightened(last, recovery, found), weights) * (loss[:, None] ** 2)
+    known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
+    found_here = np.concatenate([recovery.displacement(found), recovery.strain(found)], axis=1)
+    return np.where(known[:, None], found_here, np.nan), variance[:count]
+
+
+def _weighed(method: PrecisionMethod | None, residual: Residual, given: FloatImage) -> tuple[FloatImage, FloatArray]:
+    """Weights (k, P) by the residual's precision, and the factor (N,) by which the robust loss bends less than they."""
+    precision = None if method is None else method.precision(residual)
+    if precision is None:
+        return given, np.ones(len(residual.reference.mesh.nodes))
+    weights = given * precision.factor
+    return weights, precision.robust_loss(residual.reference, weights)
+
+
+def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
+    """Variance of the scores in x and y (N, 2) over the square of their information, per pixel, around each node."""
+    pixels, mesh = residual.reference.pixels, residual.reference.mesh
+    side = block_side(pixels, mesh.size)
+    sums = np.empty((4, weights.shape[1]), dtype=np.float32)
+    scores(residual.difference, weights, *residual.reference.gradient, sums)
+    x, y, information, count = pixels.block_sums(sums, side).astype(np.float64)
+    xx, yy, information, count = (
+        cv2.GaussianBlur(grid, (0, 0), SCORE_RANGE / side, borderType=cv2.BORDER_CONSTANT)
+        for grid in (x * x, y * y, information, count)
+    )
+    scale = np.divide(count, information**2, out=np.zeros_like(count), where=information > 0)
+    place = mesh.nodes[:, ::-1] - pixels.bounds[:2]
+    row, column = np.clip(np.round(place / side - 0.5).astype(int), 0, np.array(count.shape) - 1).T
+    return np.stack([(xx * scale)[row, column], (yy * scale)[row, column]], axis=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Gains:
+    """What noise does, by draws of it.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (N, 8)
+        Variance of the difference of both fields over that of the coarse one (5), and of `_Halves.unsmoothed` strain
+        over that of strain (3).
+    scatter : ndarray, shape (N, 8)
+        Relative standard deviation of their mean square over a window.
+    """
+
+    variance: FloatArray
+    scatter: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Halves:
+    """The mesh of a reference with each element in four, and what follows for all its frames.
+
+    Attributes
+    ----------
+    mesh
+        The reference's own.
+    fine
+        The reference on the finer mesh, whose first nodes are those of `mesh`.
+    ends : ndarray, shape (M, 2)
+        The two nodes that each other node of the finer mesh is between.
+    around : csr_matrix, shape (N, N)
+        Mean over each node and those beside it, boundary and interior apart.
+    unsmooth
+        Takes strain (N, C) to ``(M^-1 L - 1) s``, 0 at the boundary: what recovered slopes of a smooth field have lost.
+    gains
+        Of noise; None before they are found.
+    own_variance : ndarray, shape (N, 5)
+        Variance of u, v, exx, eyy, exy over that of the scores in their direction which the finer mesh leaves.
+    """
+
+    mesh: Tri3Mesh
+    fine: Reference
+    ends: npt.NDArray[np.int64]
+    around: sp.csr_matrix
+    unsmooth: Callable[[FloatArray], FloatArray]
+    gains: _Gains | None = None
+    own_variance: FloatArray = field(default_factory=lambda: np.zeros((0, 5)))
+
+    def prolonged(self, nodal: FloatArray) -> FloatArray:
+        """Interpolate linearly at the nodes of the finer mesh."""
+        return np.concatenate([nodal, nodal[self.ends].mean(axis=1)])
+
+    def restricted(self, sums: FloatArray) -> FloatArray:
+        """Sum right-hand sides (2 M, R) of the finer mesh to those (2 N, R) of the coarse one."""
+        parts, count = sums.reshape(-1, 2, *sums.shape[1:]), len(self.mesh.nodes)
+        total = parts[:count].copy()
+        for end in self.ends.T:
+            np.add.at(total, end, parts[count:] / 2)
+        return total.reshape(2 * count, *sums.shape[1:])
+
+    def interpolated(self, nodal: FloatArray, used: BoolArray) -> FloatArray:
+        """Interpolate a displacement (N, 2) between nodes with its second derivatives there."""
+        second = self.prolonged(np.stack([curved @ nodal for curved in quadratic_fit(self.mesh, used)[3:]], axis=-1))
+        x, y = (self.mesh.nodes[self.ends[:, 1]] - self.mesh.nodes[self.ends[:, 0]]).T
+        squares = np.stack([x * x, 2 * x * y, y * y], axis=1)
+        fine = self.prolonged(nodal)
+        fine[len(nodal) :] -= np.einsum("nct,nt->nc", second[len(nodal) :], squares) / 8
+        return fine
+
+    def recovery(self, used: BoolArray, equations: Equations) -> Recovery:
+        """Recover the field on the finer mesh, at the nodes of the coarse one."""
+        geometry, information = self.fine.geometry, equations.information(self.fine)
+        return Recovery.over(geometry.material, used, information, geometry.linear_offset, len(self.mesh.nodes))
+
+    def straightened(self, residual: Residual, recovery: Recovery, found: FloatArray) -> Residual:
+        """Take out what the recovered field (its fit on the finer mesh is `found`) has over that fit."""
+        carried, second = recovery.bend(found, self.fine.geometry.linear_offset)
+        return residual.without(self.prolonged(carried), self.prolonged(second))
+
+    def averaged(self, values: FloatArray) -> FloatArray:
+        """Mean (N, C) over a window of some 1.5 elements; NaN takes no part."""
+        known = np.isfinite(values)
+        total, number = np.where(known, values, 0), known.astype(np.float64)
+        for _ in range(_SPREAD):
+            total, number = self.around @ total, self.around @ number
+        return np.asarray(np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0))
+
+    def error(self, difference: FloatArray, strain: FloatArray, std: FloatArray) -> FloatArray:
+        """Error (N, 5) from the difference of the two fields (N, 5), strain (N, 3) and noise (N, 5)."""
+        assert self.gains is not None
+        noise = np.concatenate([_UNEVEN, _UNEVEN[2:]]) * self.gains.variance * std[:, _OF] ** 2
+        edge = self.mesh.on_boundary[:, None]
+        sure = np.append(_SURE, [_SURE_SMOOTH] * 3) * self.gains.scatter * (1 + 2 * edge)
+        unsmoothed = np.where(edge, np.nan, self.unsmooth(np.nan_to_num(strain)))
+        square = self._beyond(np.concatenate([difference, unsmoothed], axis=1), noise, sure)
+        square *= np.append(_OF_DIFFERENCE, [_UNSMOOTHED] * 3) ** 2
+        smooth = np.where(edge, _EDGE**2 * self._inside(square[:, 5:]), square[:, 5:])
+        return np.asarray(np.sqrt(np.concatenate([square[:, :2], np.fmax(square[:, 2:5], smooth)], axis=1)))
+
+    def _beyond(self, values: FloatArray, variance: FloatArray, sure: FloatArray) -> FloatArray:
+        """Mean square around each node beyond the noise, 0 where it may be noise; nodes count by their precision."""
+        known = np.isfinite(values) & (variance > 0)
+        weight = np.divide(1, variance, out=np.full_like(variance, np.nan), where=known)
+        noise = 1 / self.averaged(weight)
+        square = noise * self.averaged(weight * np.where(known, values, 0) ** 2)
+        return np.where(square > noise * (1 + sure), square - noise, np.where(np.isnan(square), np.nan, 0))
+
+    def _inside(self, values: FloatArray) -> FloatArray:
+        """Mean (N, C) of interior values over the nodes beside each."""
+        inner = ~self.mesh.on_boundary[:, None] & np.isfinite(values)
+        (i, j), total, number = self.mesh.neighbours.T, np.zeros_like(values), np.zeros_like(values)
+        for one, other in ((i, j), (j, i)):
+            np.add.at(total, one, np.where(inner, values, 0)[other])
+            np.add.at(number, one, inner[other])
+        return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
+
+
+_OF = [0, 1, 2, 3, 4, 2, 3, 4]
+"""Field to whose noise that of each of the eight quantities is compared."""
+_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+"""Corners of the four parts of an element, 3 to 5 being the middles of its edges 01, 12 and 20."""
+
+
+@lru_cache(maxsize=1)
+def _halves(reference: Reference) -> _Halves:
+    """Halve the elements of a reference; the last result is kept."""
+    mesh, count = reference.mesh, len(reference.mesh.nodes)
+    corners = mesh.elements.astype(np.int64)
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    keys, place = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
+    ends = np.stack(np.divmod(keys, count), axis=1)
+    six = np.concatenate([corners, count + place.reshape(3, -1).T], axis=1)
+    nodes = np.concatenate([mesh.nodes, mesh.nodes[ends].mean(axis=1)])
+    fine_mesh = Tri3Mesh(nodes=nodes, elements=six[:, _CHILDREN].reshape(-1, 3))
+    edge = mesh.on_boundary
+    i, j = mesh.neighbours[edge[mesh.neighbours[:, 0]] == edge[mesh.neighbours[:, 1]]].T
+    itself = np.arange(count)
+    row, column = np.concatenate([i, j, itself]), np.concatenate([j, i, itself])
+    number = np.bincount(row, minlength=count)
+    halves = _Halves(
+        mesh=mesh,
+        fine=_on_mesh(reference, fine_mesh),
+        ends=ends,
+        around=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
+        unsmooth=_unsmoothing(mesh),
+    )
+    return _with_noise(halves, reference)
+
+
+def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
+    """Return a reference on another mesh of the same pixels."""
+    old = reference.pixels
+    region = Region.from_mask(old.scatter(np.ones(old.local_x.size, dtype=np.float32)) > 0)
+    geometry = ReferenceGeometry.of(mesh, region, reference.origin, None)
+
+    def moved(values: FloatImage) -> FloatImage:
+        out = np.empty((*values.shape[:-1], geometry.pixels.local_x.size), dtype=np.float32)
+        for row, place in zip(values.reshape(-1, values.shape[-1]), out.reshape(-1, out.shape[-1]), strict=True):
+            place[:] = geometry.pixels.gather(old.scatter(row))
+        return out
+
+    return replace(
+        reference,
+        geometry=geometry,
+        values=moved(reference.values),
+        gradient=moved(reference.gradient),
+        pixel_weights=moved(reference.pixel_weights),
+        texture=moved(reference.texture),
+        channel_specific=moved(reference.channel_specific),
+    )
+
+
+def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
+    """See `_Halves.unsmooth`."""
+    mass, edge = mass_matrix(mesh).tocsr(), mesh.on_boundary
+    lumped = np.asarray(mass.sum(axis=1)).ravel()
+    inner, outer = np.flatnonzero(~edge), np.flatnonzero(edge)
+    solve = splu(mass[inner][:, inner].tocsc()).solve if inner.size else None
+
+    def unsmooth(strain: FloatArray) -> FloatArray:
+        out = np.zeros_like(strain)
+        if solve is not None:
+            right = lumped[inner, None] * strain[inner] - mass[inner][:, outer] @ strain[outer]
+            out[inner] = solve(right) - strain[inner]
+        return out
+
+    return unsmooth
+
+
+def _with_noise(halves: _Halves, reference: Reference) -> _Halves:
+    """Find what noise alone does, from draws: nothing else about it is assumed."""
+    mesh, fine, count, random = halves.mesh, halves.fine, len(halves.mesh.nodes), np.random.default_rng(0)
+    finer, coarse = (
+        Equations.build(one, one.pixel_weights, np.zeros((one.assembly.size, 0)), np.zeros_like(one.mesh.nodes))
+        for one in (fine, reference)
+    )
+    geometry = reference.geometry
+    everywhere, information = np.ones(len(mesh.elements), dtype=bool), coarse.information(reference)
+    recovery = Recovery.over(geometry.material, everywhere, information, geometry.linear_offset)
+    fine_recovery = halves.recovery(np.repeat(everywhere, len(_CHILDREN)), finer)
+    drawn = _scores(finer, random)
+    right = np.stack([fine.assembly.vector(one) for one in drawn], axis=1)
+    fields = _fields(recovery, coarse.solve(halves.restricted(right)))
+    strain = np.ascontiguousarray(fields[..., 2:])
+    unsmoothed = halves.unsmooth(strain.reshape(count, -1)).reshape(strain.shape)
+    unsmoothed[mesh.on_boundary] = np.nan
+    difference = fields - _fields(fine_recovery, finer.solve(right))
+    squares = np.concatenate([difference, unsmoothed], axis=2) ** 2
+    means = halves.averaged(squares.reshape(count, -1)).reshape(squares.shape)
+    typical = means.mean(axis=1)
+    own = halves.averaged((fields**2).mean(axis=1))
+    scatter = np.sqrt(halves.averaged(means.var(axis=1) / typical**2))
+    left, energy = np.zeros((count, 2)), 0.0
+    for _ in range(_NOISES):
+        white = random.standard_normal((len(fine.values), *fine.pixels.shape), dtype=np.float32)
+        noise = fine.pixels.gather(np.stack([apply_prefilter(image, fine.prefilter) for image in white]))
+        lights = zip(fine.pixel_weights, noise, fine.gradient.swapaxes(0, 1), strict=True)
+        side = fine.assembly.vector(np.sum([fine.projected(*light) for light in lights], axis=0))
+        found = finer.solve(side).reshape(-1, 2)
+        residual = halves.straightened(_left(fine, noise, found), fine_recovery, found)
+        left += _score_variance(residual, fine.pixel_weights)[:count] / _NOISES
+        energy += float(side @ side) / float((right**2).sum()) * _DRAWS / _NOISES
+    if not mesh.is_graded:
+        left[:] = left.mean(axis=0)
+    own_variance = energy * own / np.column_stack([left, left, left.mean(axis=1)])
+    gains = _Gains(variance=typical / own[:, _OF], scatter=scatter)
+    return replace(halves, gains=gains, own_variance=own_variance)
+
+
+def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:
+    """Element vectors (draws, E, 3, 2) of random scores with the covariance of the Hessian."""
+    blocks = equations.blocks
+    covariance = np.empty((len(blocks), 6, 6))
+    for a in range(2):
+        for b in range(2):
+            covariance[:, a::2, b::2] = blocks[..., a + b]
+    covariance += _HELD * np.trace(covariance.mean(axis=0)) * np.eye(6)
+    drawn = np.linalg.cholesky(covariance) @ random.standard_normal((len(blocks), 6, _DRAWS))
+    return np.moveaxis(drawn, 2, 0).reshape(_DRAWS, -1, 3, 2)
+
+
+def _fields(recovery: Recovery, fitted: FloatArray) -> FloatArray:
+    """u, v, exx, eyy, exy (N, R, 5) for nodal values (2 N, R) of the linear fit."""
+    u, v = fitted[::2], fitted[1::2]
+    (xu, xv), (yu, yv) = ((slope @ u, slope @ v) for slope in (recovery.slope_x, recovery.slope_y))
+    return np.stack([recovery.value @ u, recovery.value @ v, xu, yv, (yu + xv) / 2], axis=-1)
+
+
+def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residual:
+    """Residual that a displacement (N, 2) leaves of noise (k, P)."""
+    shown = np.empty((2, noise.shape[1]), dtype=np.float32)
+    interpolate_nodal(field, reference.mesh.elements, *reference.pixels.positions, shown)
+    left = noise - reference.gradient[0] * shown[0] - reference.gradient[1] * shown[1]
+    weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
+    return Residual(reference=reference, values=reference.values, weights=weights, difference=left, moments=moments)

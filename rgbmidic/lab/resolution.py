@@ -1,0 +1,304 @@
+"""A resolution study on paper: rows of its tables, resolution.csv, resolution.json and resolution.png.
+
+Noise floor, discretisation error, strain resolution and spatial resolution of several element sizes and virtual strain
+gauges, as the iDICs Good Practices Guide asks for. The spatial resolution is the period of a wave of which a tenth of
+the amplitude is lost (DIC Challenge 2.0: Reu et al., Exp Mech 62, 2022): what the best linear fit, the recovery and the
+gauge make of a wave along the mesh, which depends on nothing but the elements.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from rgbmidic._version import __version__
+from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
+from rgbmidic.errors import ResultError
+from rgbmidic.fields import NodalCovariance, StrainGauges
+from rgbmidic.lab import check_folder, number_or_none, write_findings
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.resolution import SPECKLES, ResolutionStudy, SizeFigures
+from rgbmidic.typing import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["FILES", "GAUGE_WORDS", "SIZE_WORDS", "cut_offs", "gauge_rows", "size_rows", "write_study"]
+
+FILES = ("resolution.csv", "resolution.json", "resolution.png")
+"""What `write_study` writes."""
+_KEPT = 0.9
+"""Fraction of a wave's amplitude at the spatial resolution (DIC Challenge 2.0)."""
+_PERIODS = np.geomspace(2, 40, 48)
+"""Periods that are tried, in elements: from the shortest that a mesh can hold to that of the longest gauge below."""
+_LONGEST_GAUGE = 12.0
+"""Elements; the cut-off of a longer gauge, a disc on a fine grid, is in proportion to its length."""
+_PARTS = 6
+"""Parts of an element's side that integrals of a wave are summed over: 1e-3 of its amplitude at a period of 2."""
+
+
+def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
+    """Evaluate the spatial resolution of displacement and strain at the nodes, and of virtual strain gauges.
+
+    Parameters
+    ----------
+    gauges : length G
+        Lengths in elements, three at least.
+
+    Returns
+    -------
+    displacement, strain : float
+        Period of a wave along the mesh at which a tenth of its amplitude is lost, in elements.
+    gauges : ndarray, shape (G,)
+        The same of the strain of each gauge.
+    """
+    lengths = np.minimum(np.asarray(gauges, dtype=np.float64), _LONGEST_GAUGE)
+    count = int(np.ceil(max(lengths, default=0.0))) + 14  # half a gauge and the reach of the recovery on either side
+    mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 8 * count, 8 * count), (8 * count + 1,) * 2), 8.0)
+    number = 2 * np.pi / (8.0 * _PERIODS)
+    fitted = splu(mass_matrix(mesh)).solve(_integrals(mesh, number))
+    recovery = Recovery.over(mesh, np.ones(len(mesh.elements), bool), np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
+    field = recovery.value @ fitted
+    shown = [_cut_off(mesh, number, field, 3.0), _cut_off(mesh, number, recovery.slope_x @ fitted, 3.0, slope=True)]
+    covariance = NodalCovariance.from_mesh(mesh)
+    for length in lengths:
+        gauge = StrainGauges.at_nodes(covariance, 8 * length)
+        slope = sp.csr_matrix((gauge.whole[0], (gauge.rows, gauge.nodes)), shape=(len(mesh.nodes),) * 2)
+        shown.append(_cut_off(mesh, number, slope @ field, length / 2 + 2, slope=True))
+    scale = np.asarray(gauges, dtype=np.float64) / lengths
+    return shown[0], shown[1], scale * np.asarray(shown[2:])
+
+
+def _integrals(mesh: Tri3Mesh, number: FloatArray) -> FloatArray:
+    """Integrals (N, 2 P) of each shape function times cosine and sine of wave numbers (P,) along x."""
+    i, j = np.indices((_PARTS, _PARTS)).reshape(2, -1)
+    low, high = i + j < _PARTS, i + j < _PARTS - 1  # the parts as the element lies, and those upside down between them
+    b, c = (np.concatenate([one[low] + 1 / 3, one[high] + 2 / 3]) / _PARTS for one in (i, j))
+    shape = np.stack([1 - b - c, b, c], axis=1)
+    x = mesh.nodes[mesh.elements, 0] @ shape.T
+    phase = x[..., None] * number
+    wave = np.concatenate([np.cos(phase), np.sin(phase)], axis=-1)
+    parts = np.einsum("qa,eqp->eap", shape, wave) * (mesh.areas / len(b))[:, None, None]
+    rows = sp.csr_matrix((np.ones(mesh.elements.size), (mesh.elements.ravel(), np.arange(mesh.elements.size))))
+    return np.asarray(rows @ parts.reshape(mesh.elements.size, -1))
+
+
+def _cut_off(mesh: Tri3Mesh, number: FloatArray, found: FloatArray, rim: float, *, slope: bool = False) -> float:
+    """Period, in elements, below which less than `_KEPT` is found of cosine and sine (N, 2 P) inside the `rim`."""
+    low, high = mesh.nodes.min(axis=0) + 8 * rim, mesh.nodes.max(axis=0) - 8 * rim
+    inner = ((mesh.nodes >= low - 1e-9) & (mesh.nodes <= high + 1e-9)).all(axis=1)
+    phase = mesh.nodes[inner, :1] * number
+    cosine, sine = np.split(found[inner], 2, axis=1)
+    if slope:
+        cosine, sine = sine / number, -cosine / number
+    gain = (cosine * np.cos(phase) + sine * np.sin(phase)).mean(axis=0)
+    below = np.flatnonzero(gain < _KEPT)
+    if not below.size:
+        return float(_PERIODS[0])
+    last = below[-1]
+    if last + 1 == len(gain):
+        return float("nan")
+    return float(np.interp(_KEPT, gain[last : last + 2], _PERIODS[last : last + 2]))
+
+
+SIZE_WORDS = {
+    "bias, scatter": "noise floor of the displacement in static frames, px; - where the test has a single one",
+    "noise": "standard uncertainty of u and v in the key frame, px; the noise floor where that is more",
+    "mesh": "discretisation error in the key frame, what the elements cannot follow, px",
+    "total": "both, px",
+    "strain": "the same three of exx, eyy and exy at the nodes, 1e-6",
+    "cut-off": "period of a wave of which a tenth is lost, displacement / strain at the nodes, px",
+    "CPU s": "of the solve of a frame",
+}
+"""What the headings of `size_rows` mean."""
+GAUGE_WORDS = {
+    "resolution": "noise of the strain, 1e-6",
+    "largest": "99 % of the strains in the key frame are smaller, 1e-6: longer gauges level peaks",
+    "cut-off": "period of a wave of which a tenth of the strain is lost, px",
+}
+"""What the headings of `gauge_rows` mean."""
+
+
+def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
+    """Headings and one row per element size."""
+    rows = []
+    for one in map(_plain, study.sizes, _gauge_cut_offs(study)):
+        micro = [1e6 * one[f"strain_{key}"] for key in ("noise", "discretisation", "total")]
+        cells = [_text(one["speckles"]), f"{one['nodes']}", f"{one['measured']:.0%}"]
+        cells += [", ".join(_text(one[key]) for key in ("bias_px", "scatter_px"))]
+        cells += [_text(one[key]) for key in ("noise_px", "discretisation_px", "total_px")]
+        cells += [", ".join(map(_text, micro)), f"{one['cut_off_px']:.0f}, {one['strain_cut_off_px']:.0f}"]
+        rows.append([f"{one['element_size_px']:g} px", *cells, _text(one["solve_cpu_s"])])
+    headings = ["elements", "speckles", "nodes", "measured", "bias, scatter", "noise", "mesh", "total"]
+    return [*headings, "strain: noise, mesh, total", "cut-off", "CPU s"], rows
+
+
+def gauge_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
+    """Headings and one row per element size and virtual strain gauge."""
+    rows = []
+    for one in map(_plain, study.sizes, _gauge_cut_offs(study)):
+        for gauge in one["gauges"]:
+            length, noise, largest, at = gauge.values()
+            cells = [f"{length:g} px", _text(1e6 * noise), _text(1e6 * largest), f"{at:.0f}"]
+            rows.append([f"{one['element_size_px']:g} px", *cells])
+    return ["elements", "gauge", "resolution", "largest", "cut-off"], rows
+
+
+def _text(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "-"
+
+
+def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -> None:
+    """Write resolution.csv, resolution.json and resolution.png into a folder, which is made where it does not exist.
+
+    Raises
+    ------
+    ResultError
+        A study is already there, or the folder cannot be written.
+    """
+    check_folder(out, FILES, overwrite=overwrite)
+    sizes = [_plain(one, lengths) for one, lengths in zip(study.sizes, _gauge_cut_offs(study), strict=True)]
+    choice = study.choice
+    document = {
+        "schema": "rgbmidic-resolution",
+        "rgbmidic": __version__,
+        "key_frame": {"index": study.frame, "name": study.name},
+        "static_frames": study.static,
+        "speckle_px": study.speckle,
+        "preparation_cpu_s": study.preparation,
+        "recommendation": None if choice is None else asdict(choice),
+        "sizes": sizes,
+    }
+    write_findings(out, "resolution", _without_nan(document), _figure(study))
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    headings = [key for key, value in sizes[0].items() if not isinstance(value, str | list)]
+    lines.writerow([*headings, *(f"gauge_{key}" for key in _NO_GAUGE)])
+    for one in sizes:
+        for gauge in one["gauges"] or [_NO_GAUGE]:
+            lines.writerow([f"{value:.6g}" for value in (*(one[key] for key in headings), *gauge.values())])
+    try:
+        (out / "resolution.csv").write_text(text.getvalue(), encoding="utf-8")
+    except OSError as error:
+        raise ResultError(f"{out / 'resolution.csv'} cannot be written: {error.strerror or error}") from None
+
+
+_NO_GAUGE = dict.fromkeys(("length_px", "noise", "largest", "cut_off_px"), float("nan"))
+
+
+@lru_cache(maxsize=1)
+def _gauge_cut_offs(study: ResolutionStudy) -> list[FloatArray]:
+    """Cut-off in px of the displacement, of the strain at the nodes, and of each gauge, of every element size."""
+    ratios = [[gauge.length / one.element_size for gauge in one.gauges] for one in study.sizes]
+    asked = sorted({ratio for some in ratios for ratio in some})
+    moved, strain, found = cut_offs(asked)
+    at = dict(zip(asked, found.tolist(), strict=True))
+    return [
+        one.element_size * np.array([moved, strain, *(at[ratio] for ratio in some)])
+        for one, some in zip(study.sizes, ratios, strict=True)
+    ]
+
+
+def _plain(one: SizeFigures, lengths: FloatArray) -> dict[str, Any]:
+    """Figures of a size with their units in their names."""
+    return {
+        "element_size_px": one.element_size,
+        "speckles": one.speckles,
+        "nodes": one.nodes,
+        "measured": one.measured,
+        "bias_px": one.bias,
+        "scatter_px": one.scatter,
+        "stated_px": one.stated,
+        "noise_px": one.noise,
+        "discretisation_px": one.discretisation,
+        "total_px": one.total,
+        "strain_bias": one.strain_bias,
+        "strain_scatter": one.strain_scatter,
+        "strain_stated": one.strain_stated,
+        "strain_noise": one.strain_noise,
+        "strain_discretisation": one.strain_discretisation,
+        "strain_total": one.strain_total,
+        "cut_off_px": float(lengths[0]),
+        "strain_cut_off_px": float(lengths[1]),
+        "solve_cpu_s": one.seconds,
+        "reason": one.reason,
+        "gauges": [
+            dict(zip(_NO_GAUGE, (gauge.length, gauge.noise, gauge.largest, float(at)), strict=True))
+            for gauge, at in zip(one.gauges, lengths[2:], strict=True)
+        ],
+    }
+
+
+def _without_nan(value: Any) -> Any:
+    """Return a value as JSON holds it: None for a number that is not known."""
+    if isinstance(value, dict):
+        return {key: _without_nan(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(part) for part in value]
+    return number_or_none(value) if isinstance(value, float) else value
+
+
+def _figure(study: ResolutionStudy) -> Figure:
+    """Draw errors over the element size and, over the gauges' length, strain resolution and largest strain."""
+    from rgbmidic.report.style import NUMBERS, draw_figure
+
+    panels = (("noise", 1e6, "strain resolution (1e-6)"), ("largest", 1e3, "strain, 99 % quantile (1e-3)"))
+
+    def draw(axes: list[Axes]) -> None:
+        _draw_errors(axes[0], study)
+        for axis, (key, unit, label) in zip(axes[1:], panels, strict=False):
+            for one in (one for one in study.sizes if one.gauges):
+                values = [unit * getattr(gauge, key) for gauge in one.gauges]
+                axis.plot([gauge.length for gauge in one.gauges], values, "o-", label=f"{one.element_size:g} px")
+            axis.set_yscale("log" if key == "noise" else "linear")
+            lengths = [gauge.length for one in study.sizes for gauge in one.gauges]
+            _finish(axis, lengths, "virtual strain gauge (px)", label)
+        if len(axes) > 1:
+            axes[-1].legend(title="elements", loc="best")
+
+    count = 3 if any(one.gauges for one in study.sizes) else 1
+    return draw_figure(draw, count=count, aspect=1.4, beside=NUMBERS)
+
+
+def _draw_errors(axis: Axes, study: ResolutionStudy) -> None:
+    sizes = [one.element_size for one in study.sizes]
+    for key, label in (("noise", "noise"), ("discretisation", "discretisation error"), ("total", "both")):
+        axis.plot(sizes, [getattr(one, key) for one in study.sizes], "o-", label=label)
+    axis.set_yscale("log")
+    if study.choice is not None:
+        axis.axvline(study.choice.element_size, color="0.5", linestyle="--", zorder=0)
+    if np.isfinite(study.speckle):
+        axis.axvspan(0.7 * min(sizes), SPECKLES * study.speckle, color="0.93", zorder=0)
+    axis.set_xlim(0.85 * min(sizes), 1.18 * max(sizes))
+    shown = [one.total for one in study.sizes if np.isfinite(one.total)]
+    axis.set_ylim(top=3 * max(shown, default=1 / 3))  # room for the legend
+    axis.legend(loc="upper center")
+    _finish(axis, sizes, "element size (px)", "displacement, rms over the nodes (px)")
+
+
+def _finish(axis: Axes, lengths: Sequence[float], x: str, y: str) -> None:
+    """Label the axes: lengths along x, on a logarithmic scale, and plain numbers along y."""
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    shown = sorted(set(lengths))
+    axis.set_xscale("log")
+    if axis.get_yscale() == "log":
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_xticks(shown, [f"{length:g}" for length in shown])
+    axis.set_xticks([], minor=True)
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    axis.grid(linewidth=0.4, color="0.88")
+    axis.spines[["top", "right"]].set_visible(False)
