@@ -88,7 +88,8 @@ def measure(
     separation
         Function from a raw frame to one image per light, instead of the package's (`LightSeparation`).
     weights
-        Weights of the lights at each pixel (`rgbmidic.weights.LightWeights`), instead of those of ``[weights]``. With ``weights.method = "statistics"`` they are multiplied by those, with ``"none"`` they are used alone.
+        Weights of the lights at each pixel (`rgbmidic.weights.LightWeights`), instead of those of ``[weights]``. With
+        ``weights.method = "statistics"`` they are multiplied by those, with ``"none"`` they are used alone.
     mesh
         Mesh in px of the frame, instead of the one made from region and ``[mesh]``.
     overwrite
