@@ -199,7 +199,7 @@ _LIGHT = {
 }  # fmt: skip
 _CAMERA = {
     "shape": ("[whole number, whole number]", "`[640, 640]`", "Rows and columns of the frame."),
-    "mm_per_pixel": ("number > 0", "`0.055`", "Scale at the body's front point; gives `focal_px` if that is not stated."),
+    "mm_per_pixel": ("number > 0", "`0.055`", "Scale at the body's front point; gives `focal_px` if not stated."),
     "focal_px": ("number", "-", "Focal length in px: distance / (mm per px at that distance)."),
     "crosstalk": ("list of lists of numbers", "-", "A in channels = A · lights: a row for each channel. Not stated: "
                   "from the spectra if there are any, else that of the reference camera."),
