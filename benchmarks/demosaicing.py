@@ -238,7 +238,9 @@ def independent_scenes() -> Path:
     given = os.environ.get("RGBMIDIC_SHARED_DATA")
     folder = Path(given or "") / "independent_scenes"
     if not given or not folder.is_dir():
-        raise FileNotFoundError("the independent scenes: RGBMIDIC_SHARED_DATA is the folder that holds independent_scenes")
+        raise FileNotFoundError(
+            "the independent scenes: RGBMIDIC_SHARED_DATA is the folder that holds independent_scenes"
+        )
     return folder
 
 

@@ -107,10 +107,16 @@ def prediction(quick: bool) -> Iterator[dict[str, object]]:
     """Rms error at inner nodes, and what `rgbmidic inspect` predicts from the first frame and `rgbmidic plan` from the
     scene over it: frames of 256 px, plates that shift by .25 px, two paints with two pairs of shots each."""
     for name in ("mat plate with speckle 4.2 px",) if quick else SCENES:
-        for camera, side in (("Bayer", 25), ("Bayer", 16), ("3-CCD", 25), ("lights in succession", 25))[: 1 if quick else 4]:
+        for camera, side in (("Bayer", 25), ("Bayer", 16), ("3-CCD", 25), ("lights in succession", 25))[
+            : 1 if quick else 4
+        ]:
             rms = [float(np.sqrt(np.nanmean(squares))) for squares in predicted(name, camera, side)]
             names = {"scene": name, "camera": camera, "elements [px]": str(side)}
-            yield names | {"observed [px]": rms[0], "inspect/observed": rms[1] / rms[0], "plan/observed": rms[2] / rms[0]}
+            yield names | {
+                "observed [px]": rms[0],
+                "inspect/observed": rms[1] / rms[0],
+                "plan/observed": rms[2] / rms[0],
+            }
 
 
 @table("border", page="how-to/planning", cost=8, seed=5)
@@ -181,7 +187,7 @@ def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("fine_speckle", page="how-to/inspect", cost=60, seed=21,
        scatter={"bias x [px]": "scatter [px]", "bias x in a reflection [px]": "scatter in a reflection [px]",
-                "bias x of Malvar [px]": "scatter [px]"})  # fmt: skip
+                "bias x of Malvar [px]": "scatter [px]", "bias x of 3-CCD [px]": "scatter [px]"})  # fmt: skip
 def fine_speckle(quick: bool) -> Iterator[dict[str, object]]:
     """Plates that shift by .25 px, default method: speckle size and agreement of neighbouring colours that the frame
     shows, bias along x and scatter; the scatter of an ideal 3-CCD camera; the bias of Malvar's filters."""
@@ -203,6 +209,7 @@ def fine_speckle(quick: bool) -> Iterator[dict[str, object]]:
             "bias x [px]": found["default"].bias,
             "scatter [px]": found["default"].scatter,
             "3-CCD [px]": found["3-CCD"].scatter,
+            "bias x of 3-CCD [px]": found["3-CCD"].bias,
             "bias x of Malvar [px]": found["Malvar"].bias,
             "bias x in a reflection [px]": shining["default"].bias,
             "scatter in a reflection [px]": shining["default"].scatter,

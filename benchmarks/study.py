@@ -47,7 +47,11 @@ def perturbation(quick: bool) -> Iterator[dict[str, object]]:
             for angle, row in zip(scene.angles, scene.perturbation(method), strict=True):
                 areas = {f"{area.name} [1e-3 px]": 1e3 * p for area, p in zip(scene.bench.areas, row, strict=True)}
                 ratios = {"A3/A0": row[3] / row[0], "A4/A0": row[4] / row[0]}
-                yield {"scene": scene.bench.name, "method": _text(settings.title), "angle [deg]": f"{angle:g}"} | areas | ratios
+                yield (
+                    {"scene": scene.bench.name, "method": _text(settings.title), "angle [deg]": f"{angle:g}"}
+                    | areas
+                    | ratios
+                )
 
 
 @table("study_ratios", page="explanation/study", cost=0.5, own_quick=True)
