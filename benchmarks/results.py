@@ -1,4 +1,4 @@
-"""What follows from a result, with exact truth: jumps and stress intensity at cracks, and the comparison with a simulation."""
+"""What follows from a result, with exact truth: jumps and stress intensity at cracks, strain over gauges, and the comparison with a simulation."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from crack_scene import (
     reference_image,
 )
 from plate_fe import compared_plates
+from textures import Texture
 
-from rgbmidic import Region, Tri3Mesh, measure_sequence
-from rgbmidic.fields import crack_jump, stress_intensity
+from rgbmidic import Region, Tri3Mesh, correlate, measure_sequence
+from rgbmidic.fields import crack_jump, strain_of, stress_intensity
 
 from .tables import table
 
@@ -96,6 +97,47 @@ def tip(quick: bool) -> Iterator[dict[str, object]]:
             "tip fitted: K_I": float(free[0]),
             "tip fitted: K_II": float(free[1]),
             "chi-square": float(found.chi_square.mean()),
+        }
+
+
+WAVE, HEIGHT = 120.0, 0.1
+"""Length and height (px) of a wave of the displacement u along x."""
+
+
+@table("gauge", page="how-to/results", cost=6, seed=2)
+def gauge(quick: bool) -> Iterator[dict[str, object]]:
+    """Strain exx of a rendered wave of 120 px (elements of 25 px, noise of 4 % of the contrast, 4 pairs) over gauges of three
+    lengths: height of the wave, what the gauge leaves of the true one, error to that and over stated uncertainty."""
+    texture, shape = Texture.random(2), (200, 360)
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
+    material = x
+    for _ in range(5):  # the strain is .005: each step gains two digits
+        material = x - HEIGHT * np.sin(2 * np.pi * material / WAVE)
+    pair = texture.image(shape), texture.at(material, y)
+    region, random, found = (12, 12, 347, 187), np.random.default_rng(2), []
+    for _ in range(1 if quick else 4):
+        noisy_pair = (image + random.normal(scale=NOISE, size=shape) for image in pair)
+        found.append(correlate(*noisy_pair, region=region, initial=(0.0, 0.0)))
+    nodes, elements = found[0].nodes, found[0].elements
+    true = HEIGHT * np.sin(2 * np.pi * nodes[:, 0] / WAVE)
+    inner = (np.abs(nodes - (shape[1] / 2, shape[0] / 2)) < (130, 60)).all(axis=1)
+    phase = np.cos(2 * np.pi * nodes[inner, 0] / WAVE)
+    for length in (75, 100, 150):
+        exact = strain_of(nodes, elements, true, 0 * true, 0 * true + 1, 0 * true + 1, gauge=length).components[
+            inner, 0
+        ]
+        strains = [
+            strain_of(nodes, elements, *one.displacement.T, *one.displacement_std.T, gauge=length) for one in found
+        ]
+        values = np.array([strain.components[inner, 0] for strain in strains])
+        stated = np.array([strain.components_std[inner, 0] for strain in strains])
+        height = 2 * np.pi * HEIGHT / WAVE * (phase @ phase)
+        yield {
+            "gauge [px]": str(length),
+            "height [%]": 100 * float((values @ phase).mean() / height),
+            "of the true wave [%]": 100 * float(exact @ phase / height),
+            "error [1e-4]": 1e4 * float(np.sqrt(np.mean((values - exact) ** 2))),
+            "error/stated": float(np.sqrt(np.mean(((values - exact) / stated) ** 2))),
         }
 
 
