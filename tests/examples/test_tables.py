@@ -11,7 +11,7 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 from benchmarks import ROOT
-from benchmarks.tables import FOLDER, TABLES, Entry, Table, disagreements, load, table, written
+from benchmarks.tables import FOLDER, TABLES, Entry, MissingDataError, Table, disagreements, load, table, written
 
 BROKEN = load()
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -60,7 +60,10 @@ def test_each_file_is_of_a_table():
 @pytest.mark.parametrize("name", TABLES)
 def test_quick_rows_are_those_of_the_page(name):
     entry = TABLES[name]
-    made = Table.of(entry, entry.measure(True))
+    try:
+        made = Table.of(entry, entry.measure(True))
+    except MissingDataError as error:
+        pytest.skip(str(error))
     if not entry.timing:
         assert not disagreements(entry, made, Table.read(entry.committed()))
 
@@ -121,7 +124,16 @@ def test_what_is_wrong_is_said(tmp_path, ask, message):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.012249, "0.0122"), (1.0, "1.00"), (123456.0, "123000"), (float("nan"), "nan"), (0.0, "0"), (3, "3")],
+    [
+        (0.012249, "0.0122"),
+        (-0.0219961, "-0.0220"),
+        (9.999, "10.0"),
+        (1.0, "1.00"),
+        (123456.0, "123000"),
+        (float("nan"), "nan"),
+        (0.0, "0"),
+        (3, "3"),
+    ],
 )
 def test_three_digits(value, text):
     assert written(value) == text
