@@ -3,13 +3,13 @@
     python -m benchmarks.camera FOLDER
 
 Every draw is another virtual camera: distortion of -2 to 2 % in the frame's corners, a plane tilted by 0 to 5 degrees
-about any axis, 20 views of a chessboard under up to 25 degrees, corners with noise of .01 px. A true 95 % interval gives
+about any axis, 20 views of a chessboard under up to 25 degrees, corners with noise of .01 px. A true 95 % interval has
 90.6 to 99.4 % of 100 draws (2 sigma of the binomial law), and all lines together, were they independent, 94 to 96 %. A
 distortion term that the F test did not take up states no uncertainty and does not count.
 
-FOLDER holds left01.jpg to left14.jpg of OpenCV (samples/data: 13 views of a chessboard of 9 x 6 corners, 25 mm): printed
-are residual and parameters by the corners of OpenCV's own sample (`findChessboardCorners`, `cornerSubPix` with 11 px), by
-what `find_view` finds, and as published in samples/data/left_intrinsics.yml; the same of right*.jpg.
+FOLDER holds left01.jpg to left14.jpg of OpenCV (samples/data: 13 views of a chessboard of 9 x 6 corners, 25 mm).
+Printed are residual and parameters by the corners of OpenCV's own sample (`findChessboardCorners`, `cornerSubPix` with
+11 px), by what `find_view` finds, and as published in samples/data/left_intrinsics.yml; the same of right*.jpg.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -134,15 +135,15 @@ def coverage(quick: bool) -> Iterator[dict[str, object]]:
     """100 virtual cameras: draws whose error is within 1.96 stated standard uncertainties, and rms(error / stated)."""
     off = draws(QUICK if quick else FULL)[0]
     some = ("f", "cx", "cy", "k1", "tilt", "length along x", "length along y", "diagonal")
-    for name, values in {**{name: off[name] for name in some}, "all": sum(off.values(), [])}.items():
+    for name, values in {**{name: off[name] for name in some}, "all": [*chain(*off.values())]}.items():
         within = 100 * float((np.abs(values) < 1.96).mean())
         yield {"parameter": name, "within 95 % [%]": within, "error/stated": float(np.sqrt(np.mean(np.square(values))))}
 
 
 @table("camera_strain", page="../calibration/README", cost=40, own_quick=True)
 def strain_left(quick: bool) -> Iterator[dict[str, object]]:
-    """Largest strain error (1e-6) over the field of a specimen that only moves, turns or stretches, images without noise:
-    median and largest of the draws, in pixels with one scale and by lens and plane."""
+    """Largest strain error (1e-6) over the field of a specimen that only moves, turns or stretches, images without
+    noise: median and largest of the draws, in pixels with one scale and by lens and plane."""
     for name in MOTIONS:
         values = 1e6 * np.array([strains[name] for strains in draws(QUICK if quick else FULL)[1]])
         middle, largest = np.median(values, axis=0), values.max(axis=0)

@@ -1,7 +1,7 @@
 """What each way from a raw frame to the lights costs in displacement error, on scenes with exact truth.
 
-Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, specular peak 1.5 times an ideal white, speckle
-4.2 px. Three lights are solved together with the true crosstalk, TRI3 of 25 px started within half a pixel of the
+Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, specular peak 1.5 times an ideal white, a
+speckle of 4.2 px. Three lights are solved together with the true crosstalk, TRI3 of 25 px started within half a pixel of the
 truth; errors over the pixels of the field without its border element. Wrinkles of the paint 25 um apart give a smooth
 reflection, 100 um one that sparkles in spots. Each is traced with as many rays as its reflection needs.
 
@@ -34,7 +34,7 @@ from rgbmidic.scene.camera import PIXEL
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import threshold_weights
 
-from .tables import table
+from .tables import MissingDataError, table
 
 TILT = (float(-np.degrees(0.15)), 0.0)
 """The plate leans towards green's lamp."""
@@ -215,8 +215,9 @@ BIAS = {f"bias of {name} [px]": f"{name} [px]" for name in ("Malvar", "default")
 
 @table("demosaicing", page="explanation/demosaicing", cost=120, seed=41, scatter=BIAS)
 def demosaicing(quick: bool) -> Iterator[dict[str, object]]:
-    """Error over the field of the project's own scenes (scatter of plates, rms of spheres) by the way from the raw frame
-    to the solve; crosstalk as assumed (.10 to .16) or as measured cameras have it (.28 to .33 between green and blue)."""
+    """Error over the field of the project's own scenes (scatter of plates, rms of spheres) by the way from the raw
+    frame to the solve; crosstalk as assumed (.10 to .16) or as measured cameras have it (.28 to .33 between green and
+    blue)."""
     cases = [(25, "assumed", name) for name in (*SCENES, *SPHERES)]
     cases += [(25, "measured", name) for name in (*SCENES[3:], *SPHERES[1:])]
     cases += [(100, "assumed", name) for name in (*SCENES[2:], *SPHERES)]
@@ -232,15 +233,12 @@ def independent_scenes() -> Path:
 
     Raises
     ------
-    FileNotFoundError
+    MissingDataError
         They are not at hand.
     """
-    given = os.environ.get("RGBMIDIC_SHARED_DATA")
-    folder = Path(given or "") / "independent_scenes"
-    if not given or not folder.is_dir():
-        raise FileNotFoundError(
-            "the independent scenes: RGBMIDIC_SHARED_DATA is the folder that holds independent_scenes"
-        )
+    folder = Path(os.environ.get("RGBMIDIC_SHARED_DATA", "")) / "independent_scenes"
+    if not (folder / "sphere").is_dir():
+        raise MissingDataError(f"there are no independent scenes in {folder}: set RGBMIDIC_SHARED_DATA")
     return folder
 
 
@@ -274,8 +272,8 @@ def independent(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("demosaicing_coloured", page="explanation/demosaicing", cost=15, seed=11)
 def coloured_specimen(quick: bool) -> Iterator[dict[str, object]]:
-    """A mat plate of which a fraction of each light's variance is a texture of its own: scatter of the displacement over
-    .25 px, error of the lights' images over their mean, error over stated uncertainty."""
+    """A mat plate of which a fraction of each light's variance is a texture of its own: scatter of the displacement
+    over .25 px, error of the lights' images over their mean, error over stated uncertainty."""
     for fraction in (0.1,) if quick else (0.1, 0.3, 0.6, 1.0):
         case = replace(Case.of("mat plate .25 px", size=256, seed=11), coloured=fraction)
         found = errors(case, [NAMED["Malvar"], NAMED["default"]])

@@ -14,8 +14,8 @@ from rgbmidic import Calibration, correlate
 from rgbmidic.fields import at_nodes
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination import IlluminationImages
-from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.crosstalk import unmix
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.lab.virtual import Camera, State, record, truth, turned
@@ -121,8 +121,8 @@ def prediction(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("border", page="how-to/planning", cost=8, seed=5)
 def border(quick: bool) -> Iterator[dict[str, object]]:
-    """Nodes of a mesh (elements of 25 px, one light, noise of 10 grey levels on paint from 100 to 800, 16 draws): rms error and stated uncertainty,
-    and the error over that of inner nodes."""
+    """Nodes of a mesh (elements of 25 px, one light, noise of 10 grey levels on paint from 100 to 800, 16 draws): rms
+    error and stated uncertainty, and the error over that of inner nodes."""
     shape, draws = (224, 224), 16
     texture = 1000 * speckle(shape, diameter=4.2, seed=5)
     random = np.random.default_rng(5)

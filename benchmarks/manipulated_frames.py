@@ -180,9 +180,9 @@ def calibrations(matrix: FloatArray) -> tuple[Calibration, Calibration]:
 
 @table("manipulated_frames", page="how-to/inspect", cost=90, own_quick=True)
 def manipulated(quick: bool) -> Iterator[dict[str, object]]:
-    """Frames (%) that the check against the calibration refuses and warns of, and by what: spheres, plates of gloss 0 to
-    3 with speckle of 2.5 and 8 px, coarse paint and discs, two crosstalks; with the whole calibration, with a second
-    frame of the state as well, and with the crosstalk alone."""
+    """Frames (%) that the check against the calibration refuses and warns of, and by what: spheres, plates of gloss 0
+    to 3 with speckle of 2.5 and 8 px, coarse paint and discs, two crosstalks; with the whole calibration, with a
+    second frame of the state as well, and with the crosstalk alone."""
     cases = [(name, lights, matrix) for name, lights in scenes(quick) for matrix in (A, MEASURED)]
     good = [("a good frame", f"light x {factor:g}", {"light": factor}) for factor in (1.0, 0.5, 0.1, 2.2)]
     for name, strength, options in [*good[:1], *list(manipulations())[4::12]] if quick else [*good, *manipulations()]:

@@ -183,9 +183,9 @@ GROUPS = {
 
 @table("rates", page="how-to/results", cost=10, seed=20261)
 def rates_of_known_motion(quick: bool) -> Iterator[dict[str, object]]:
-    """Velocity and acceleration over 7 frames of motions with noise of .005 and .015 px, 61 frames, 200 draws: rms(error /
-    stated) of the worst frame and of all, frames where it is over 1.3; largest estimate over stated of a body at rest
-    within 7 frames of an onset, the same by one parabola, and further away."""
+    """Velocity and acceleration over 7 frames of motions with noise of .005 and .015 px, 61 frames, 200 draws:
+    rms(error / stated) of the worst frame and of all, frames where it is over 1.3; largest estimate over stated of a
+    body at rest within 7 frames of an onset, the same by one parabola, and further away."""
     for group, names in GROUPS.items():
         if quick and not group.startswith("pulse"):
             continue
@@ -211,8 +211,8 @@ def rates_of_known_motion(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("rates_noise", page="how-to/results", cost=1, seed=20261)
 def rates_of_noise(quick: bool) -> Iterator[dict[str, object]]:
-    """A body at rest whose noise is a multiple of the stated uncertainty of its displacement: rms(error / stated) of its
-    rates, and their noise over that of one parabola over 7 frames."""
+    """A body at rest whose noise is a multiple of the stated uncertainty of its displacement: rms(error / stated) of
+    its rates, and their noise over that of one parabola over 7 frames."""
     rest = dict(signals())["rest"]
     for factor in (1.0, 1.2, 1.5, 2.0):
         velocity, acceleration = judge(rest, 0.01 * factor, 200, 20261, stated=0.01)

@@ -1,4 +1,5 @@
-"""What follows from a result, with exact truth: jumps and stress intensity at cracks, strain over gauges, and the comparison with a simulation."""
+"""What follows from a result, with exact truth: jumps and stress intensity at cracks, strain over gauges, and the
+comparison with a simulation."""
 
 from __future__ import annotations
 
@@ -37,8 +38,9 @@ LIGHTS = (1.0, 0.7, 1.2)
 
 @table("crack_jump", page="how-to/results", cost=60, own_quick=True)
 def jump(quick: bool) -> Iterator[dict[str, object]]:
-    """Rendered cracks that open by 1, 2.5 and 5 px, gap dark or twice as bright as the paint, noise of 4 % of the contrast,
-    three textures, all pairs but the tip's: rms(error / stated) of opening and sliding, pairs that are measured."""
+    """Rendered cracks that open by 1, 2.5 and 5 px, gap dark or twice as bright as the paint, noise of 4 % of the
+    contrast, three textures, all pairs but the tip's: rms(error / stated) of opening and sliding, pairs that are
+    measured."""
     region = Region.from_rectangle(REGION, SHAPE)
     cases = [(size, lights, True) for size in (12, 16, 25) for lights in (1, 3)]
     cases += [(size, 1, False) for size in (12, 25)]
@@ -52,7 +54,7 @@ def jump(quick: bool) -> Iterator[dict[str, object]]:
                         np.stack([level * noisy(image, 10 * n + light) for light, level in enumerate(LIGHTS[:lights])])
                         for n, image in enumerate(states)
                     )
-                    options = {} if normalised else {"normalise": None}
+                    options = {} if normalised else {"normalise": 0.0}
                     found = as_nodal(
                         [*measure_sequence([deformed], reference=reference, region=region, mesh=mesh, **options)]
                     )
@@ -74,9 +76,9 @@ def jump(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("crack_tip", page="how-to/results", cost=35)
 def tip(quick: bool) -> Iterator[dict[str, object]]:
-    """Stress intensity of a rendered tip with K_I = 20 and K_II = -6 MPa√m (E = 70 GPa, .05 mm/px), noise of 4 % of the
-    contrast, 16 draws, radii of 34 and 118 px: uncertainty stated (MPa√m), rms(error / stated), the same where the tip is
-    fitted, chi-square over degrees of freedom."""
+    """Stress intensity of a rendered tip with K_I = 20 and K_II = -6 MPa√m (E = 70 GPa, .05 mm/px), noise of 4 % of
+    the contrast, 16 draws, radii of 34 and 118 px: uncertainty stated (MPa√m), rms(error / stated), the same where the
+    tip is fitted, chi-square over degrees of freedom."""
     for size in (20,) if quick else (10, 14, 20):
         solutions = [cracked(NOISE, seed, 10.0, size) for seed in range(16)]
         mesh, nodal, radii = (solutions[0].nodes, solutions[0].elements), as_nodal(solutions), (34, 118)
@@ -106,8 +108,9 @@ WAVE, HEIGHT = 120.0, 0.1
 
 @table("gauge", page="how-to/results", cost=6, seed=2)
 def gauge(quick: bool) -> Iterator[dict[str, object]]:
-    """Strain exx of a rendered wave of 120 px (elements of 25 px, noise of 4 % of the contrast, 4 pairs) over gauges of three
-    lengths: height of the wave, what the gauge leaves of the true one, error to that and over stated uncertainty."""
+    """Strain exx of a rendered wave of 120 px (elements of 25 px, noise of 4 % of the contrast, 4 pairs) over gauges
+    of three lengths: height of the wave, what the gauge leaves of the true one, error to that and over stated
+    uncertainty."""
     texture, shape = Texture.random(2), (200, 360)
     y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
     material = x
@@ -147,8 +150,8 @@ STIFF = 1.03
 
 @table("comparison", page="how-to/compare", cost=12, seed=1)
 def comparison(quick: bool) -> Iterator[dict[str, object]]:
-    """A plate with a hole in tension: measured (elements of 30 px, 8 pairs, noise of 8 % of the contrast) minus simulated,
-    rms over stated uncertainty and chi-square, at the simulation's nodes and levelled."""
+    """A plate with a hole in tension: measured (elements of 30 px, 8 pairs, noise of 8 % of the contrast) minus
+    simulated, rms over stated uncertainty and chi-square, at the simulation's nodes and levelled."""
     with tempfile.TemporaryDirectory() as folder:
         made = compared_plates(Path(folder), draws=4 if quick else 8, moduli=(1.0,))[1.0]
     for way, text in (("nodes", "at the nodes"), ("levelled", "levelled")):
@@ -159,8 +162,9 @@ def comparison(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("comparison_scale", page="how-to/compare", cost=30, seed=1)
 def comparison_scale(quick: bool) -> Iterator[dict[str, object]]:
-    """The same with a modulus 3 % too large, four textures: scale that fits best, mean of the pairs, its stated uncertainty
-    for one pair, rms((found - 1.03) / stated), chi-square of the rest; rms over stated of the levelled displacement."""
+    """The same with a modulus 3 % too large, four textures: scale that fits best, mean of the pairs, its stated
+    uncertainty for one pair, rms((found - 1.03) / stated), chi-square of the rest; rms over stated of the levelled
+    displacement."""
     for texture in (3,) if quick else (3, 4, 5, 6):
         with tempfile.TemporaryDirectory() as folder:
             made = compared_plates(Path(folder), draws=8, moduli=(1.0, STIFF), texture=texture)

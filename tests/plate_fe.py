@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import spsolve
 from results import make_result
+from scipy.sparse.linalg import spsolve
 from textures import Texture
 
 from rgbmidic import correlate
