@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 from benchmarks import ROOT
+from benchmarks import __main__ as driver
 from benchmarks.tables import FOLDER, TABLES, Entry, MissingDataError, Table, disagreements, load, table, written
 
 BROKEN = load()
@@ -137,3 +139,43 @@ def test_what_is_wrong_is_said(tmp_path, ask, message):
 )
 def test_three_digits(value, text):
     assert written(value) == text
+
+
+def run(monkeypatch, *arguments: str) -> int:
+    """Status of the driver, whose two tables are a good one and one that fails."""
+
+    def made(name: str, quick: bool, header: dict[str, str]) -> tuple[Table, float]:
+        if name == "broken":
+            raise RuntimeError("no camera")
+        return Table.of(ENTRY, ROWS, header), 0.1
+
+    monkeypatch.setattr(sys, "argv", ["benchmarks", *arguments])
+    monkeypatch.setattr(driver, "TABLES", {"sphere": ENTRY, "broken": replace(ENTRY, name="broken")})
+    monkeypatch.setattr(driver, "isolated", made)
+    monkeypatch.setattr(driver, "load", dict)
+    return driver.main()
+
+
+def test_a_table_that_fails_does_not_stop_the_others(monkeypatch, tmp_path, capsys):
+    assert run(monkeypatch, "--out", str(tmp_path)) == 1
+    assert "broken: failed, RuntimeError: no camera" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["sphere.csv"]
+    header = Table.read(tmp_path / "sphere.csv").header
+    assert {"commit", "date", "machine", "versions", "command"} <= set(header)
+    assert header["command"] == "python -m benchmarks sphere"
+    assert run(monkeypatch, "sphere", "--quick") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("cube",), "tables are: broken, sphere; given was cube"),
+        (("--processes", "0"), "--processes is a whole number from 1, not 0"),
+        (("--out", __file__), "--out is a folder"),
+    ],
+)
+def test_what_the_driver_cannot_do_is_said_in_one_line(monkeypatch, capsys, arguments, message):
+    assert run(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
