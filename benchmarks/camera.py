@@ -130,7 +130,7 @@ QUICK, FULL = 6, 100
 """Draws of the tables."""
 
 
-@table("camera_coverage", page="../calibration/README", cost=40, own_quick=True)
+@table("camera_coverage", page="../calibration/README", cost=13, own_quick=True)
 def coverage(quick: bool) -> Iterator[dict[str, object]]:
     """100 virtual cameras: draws whose error is within 1.96 stated standard uncertainties, and rms(error / stated)."""
     off = draws(QUICK if quick else FULL)[0]
@@ -140,7 +140,7 @@ def coverage(quick: bool) -> Iterator[dict[str, object]]:
         yield {"parameter": name, "within 95 % [%]": within, "error/stated": float(np.sqrt(np.mean(np.square(values))))}
 
 
-@table("camera_strain", page="../calibration/README", cost=40, own_quick=True)
+@table("camera_strain", page="../calibration/README", cost=13, own_quick=True)
 def strain_left(quick: bool) -> Iterator[dict[str, object]]:
     """Largest strain error (1e-6) over the field of a specimen that only moves, turns or stretches, images without
     noise: median and largest of the draws, in pixels with one scale and by lens and plane."""

@@ -1,7 +1,7 @@
 """What each way from a raw frame to the lights costs in displacement error, on scenes with exact truth.
 
 Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, specular peak 1.5 times an ideal white, a
-speckle of 4.2 px. Three lights are solved together with the true crosstalk, TRI3 of 25 px started within half a pixel of the
+speckle of 4.2 px. Three lights are solved together with the true crosstalk, TRI3 of 25 px started near the
 truth; errors over the pixels of the field without its border element. Wrinkles of the paint 25 um apart give a smooth
 reflection, 100 um one that sparkles in spots. Each is traced with as many rays as its reflection needs.
 
@@ -213,7 +213,7 @@ SPHERES = ("sphere .33 deg", "sphere 1 deg", "sphere 8 deg")
 BIAS = {f"bias of {name} [px]": f"{name} [px]" for name in ("Malvar", "default")}
 
 
-@table("demosaicing", page="explanation/demosaicing", cost=120, seed=41, scatter=BIAS)
+@table("demosaicing", page="explanation/demosaicing", cost=20, seed=41, scatter=BIAS)
 def demosaicing(quick: bool) -> Iterator[dict[str, object]]:
     """Error over the field of the project's own scenes (scatter of plates, rms of spheres) by the way from the raw
     frame to the solve; crosstalk as assumed (.10 to .16) or as measured cameras have it (.28 to .33 between green and
@@ -242,7 +242,7 @@ def independent_scenes() -> Path:
     return folder
 
 
-@table("demosaicing_independent", page="explanation/demosaicing", cost=45, scatter=BIAS)
+@table("demosaicing_independent", page="explanation/demosaicing", cost=8, scatter=BIAS)
 def independent(quick: bool) -> Iterator[dict[str, object]]:
     """Rms error over the field of scenes of a renderer that has no code in common with the project (256 rays a pixel,
     wrinkles 50 um apart)."""
@@ -270,7 +270,7 @@ def independent(quick: bool) -> Iterator[dict[str, object]]:
         yield {"scene": name} | row(found, plate=False)
 
 
-@table("demosaicing_coloured", page="explanation/demosaicing", cost=15, seed=11)
+@table("demosaicing_coloured", page="explanation/demosaicing", cost=2, seed=11)
 def coloured_specimen(quick: bool) -> Iterator[dict[str, object]]:
     """A mat plate of which a fraction of each light's variance is a texture of its own: scatter of the displacement
     over .25 px, error of the lights' images over their mean, error over stated uncertainty."""
@@ -283,7 +283,7 @@ def coloured_specimen(quick: bool) -> Iterator[dict[str, object]]:
         yield row | {f"{name}: error/stated": error.ratio for name, error in found.items()}
 
 
-@table("demosaicing_speed", page="explanation/demosaicing", cost=20, timing=True)
+@table("demosaicing_speed", page="explanation/demosaicing", cost=4, timing=True)
 def speed(quick: bool) -> Iterator[dict[str, object]]:
     """Processor time from a linearised frame to the lights on one thread, least of three runs."""
     patch = plate_scene(size=256, seed=3, samples=2)

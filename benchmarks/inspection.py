@@ -102,7 +102,7 @@ def predicted(name: str, camera: str, side: float) -> tuple[FloatArray, FloatArr
     return np.concatenate(observed), np.concatenate(by_frame), np.concatenate(by_plan)
 
 
-@table("prediction", page="how-to/inspect", cost=90, seed=41)
+@table("prediction", page="how-to/inspect", cost=45, seed=41)
 def prediction(quick: bool) -> Iterator[dict[str, object]]:
     """Rms error at inner nodes, and what `rgbmidic inspect` predicts from the first frame and `rgbmidic plan` from the
     scene over it: frames of 256 px, plates that shift by .25 px, two paints with two pairs of shots each."""
@@ -119,7 +119,7 @@ def prediction(quick: bool) -> Iterator[dict[str, object]]:
             }
 
 
-@table("border", page="how-to/planning", cost=8, seed=5)
+@table("border", page="how-to/planning", cost=1, seed=5)
 def border(quick: bool) -> Iterator[dict[str, object]]:
     """Nodes of a mesh (elements of 25 px, one light, noise of 10 grey levels on paint from 100 to 800, 16 draws): rms
     error and stated uncertainty, and the error over that of inner nodes."""
@@ -140,7 +140,7 @@ def border(quick: bool) -> Iterator[dict[str, object]]:
         yield {"nodes": name, "error [px]": error, "error/stated": error / stated, "over inner nodes": error / inner}
 
 
-@table("geometry_weights", page="how-to/planning", cost=35, seed=41)
+@table("geometry_weights", page="how-to/planning", cost=8, seed=41)
 def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
     """Rms error (px) on the sphere before a 3-CCD camera by the weights of the lights, all else by default."""
     for height, text in ((0.0, "flat"), (0.004, "4 um high")):
@@ -185,7 +185,7 @@ def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
             yield {"droplets": text, "angle [deg]": f"{angle:g}"} | cells
 
 
-@table("fine_speckle", page="how-to/inspect", cost=60, seed=21,
+@table("fine_speckle", page="how-to/inspect", cost=11, seed=21,
        scatter={"bias x [px]": "scatter [px]", "bias x in a reflection [px]": "scatter in a reflection [px]",
                 "bias x of Malvar [px]": "scatter [px]", "bias x of 3-CCD [px]": "scatter [px]"})  # fmt: skip
 def fine_speckle(quick: bool) -> Iterator[dict[str, object]]:

@@ -178,7 +178,7 @@ def calibrations(matrix: FloatArray) -> tuple[Calibration, Calibration]:
     )
 
 
-@table("manipulated_frames", page="how-to/inspect", cost=90, own_quick=True)
+@table("manipulated_frames", page="how-to/inspect", cost=65, own_quick=True)
 def manipulated(quick: bool) -> Iterator[dict[str, object]]:
     """Frames (%) that the check against the calibration refuses and warns of, and by what: spheres, plates of gloss 0
     to 3 with speckle of 2.5 and 8 px, coarse paint and discs, two crosstalks; with the whole calibration, with a

@@ -3,8 +3,8 @@
 Every contender is a process of its own that lives as long as a case; in each round they take their turns, so that what
 else the machine does meets all of them, and the best time counts: processor time, on one thread. All get the same
 images, place their nodes or subset centres 25 px apart over the same region (pyALDIC 32: a power of two), and start
-from zero. ``al-dic local`` is pyALDIC without its global step. The peers are installed in a Python of their own (they bring
-opencv-python and PySide6): PEERS_PYTHON names it, `pip install ".[bench]"` fills it.
+from zero. ``al-dic local`` is pyALDIC without its global step. The peers are installed in a Python of their own (they
+bring opencv-python and PySide6): PEERS_PYTHON names it, `pip install ".[bench]"` fills it.
 
 Grey pairs, for all contenders:
 
@@ -13,7 +13,8 @@ Grey pairs, for all contenders:
 
 Our own, beside three pairs of pyvale: ``raw``, the second frame of a raw Bayer series under three lights, from file to
 record, with noise and crosstalk calibrated; ``calibrated``, with the registration of the lights besides, which the
-frames then need; ``small``, 256 x 128 px of ``raw``. ``compiling``: what a first `rgbmidic run` takes more than a second one.
+frames then need; ``small``, 256 x 128 px of ``raw``. ``compiling``: what a first
+`rgbmidic run` takes more than a second one.
 
 Accuracy is over the points away from the edge.
 """

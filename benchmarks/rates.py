@@ -181,7 +181,7 @@ GROUPS = {
 """Signals by the first words of their names."""
 
 
-@table("rates", page="how-to/results", cost=10, seed=20261)
+@table("rates", page="how-to/results", cost=5, seed=20261)
 def rates_of_known_motion(quick: bool) -> Iterator[dict[str, object]]:
     """Velocity and acceleration over 7 frames of motions with noise of .005 and .015 px, 61 frames, 200 draws:
     rms(error / stated) of the worst frame and of all, frames where it is over 1.3; largest estimate over stated of a
@@ -225,7 +225,7 @@ def rates_of_noise(quick: bool) -> Iterator[dict[str, object]]:
         }
 
 
-@table("rates_speed", page="how-to/results", cost=12, timing=True)
+@table("rates_speed", page="how-to/results", cost=10, timing=True)
 def rates_speed(quick: bool) -> Iterator[dict[str, object]]:
     """Processor time of the rates of 500 frames on one thread, by motion."""
     t, nodes = np.arange(500.0), 20 if quick else 1000

@@ -36,7 +36,7 @@ LIGHTS = (1.0, 0.7, 1.2)
 """Brightness of three lights on one paint."""
 
 
-@table("crack_jump", page="how-to/results", cost=60, own_quick=True)
+@table("crack_jump", page="how-to/results", cost=45, own_quick=True)
 def jump(quick: bool) -> Iterator[dict[str, object]]:
     """Rendered cracks that open by 1, 2.5 and 5 px, gap dark or twice as bright as the paint, noise of 4 % of the
     contrast, three textures, all pairs but the tip's: rms(error / stated) of opening and sliding, pairs that are
@@ -74,7 +74,7 @@ def jump(quick: bool) -> Iterator[dict[str, object]]:
         }
 
 
-@table("crack_tip", page="how-to/results", cost=35)
+@table("crack_tip", page="how-to/results", cost=6)
 def tip(quick: bool) -> Iterator[dict[str, object]]:
     """Stress intensity of a rendered tip with K_I = 20 and K_II = -6 MPa√m (E = 70 GPa, .05 mm/px), noise of 4 % of
     the contrast, 16 draws, radii of 34 and 118 px: uncertainty stated (MPa√m), rms(error / stated), the same where the
@@ -106,7 +106,7 @@ WAVE, HEIGHT = 120.0, 0.1
 """Length and height (px) of a wave of the displacement u along x."""
 
 
-@table("gauge", page="how-to/results", cost=6, seed=2)
+@table("gauge", page="how-to/results", cost=1, seed=2)
 def gauge(quick: bool) -> Iterator[dict[str, object]]:
     """Strain exx of a rendered wave of 120 px (elements of 25 px, noise of 4 % of the contrast, 4 pairs) over gauges
     of three lengths: height of the wave, what the gauge leaves of the true one, error to that and over stated
@@ -148,7 +148,7 @@ STIFF = 1.03
 """Modulus of a simulation over the true one."""
 
 
-@table("comparison", page="how-to/compare", cost=12, seed=1)
+@table("comparison", page="how-to/compare", cost=2, seed=1)
 def comparison(quick: bool) -> Iterator[dict[str, object]]:
     """A plate with a hole in tension: measured (elements of 30 px, 8 pairs, noise of 8 % of the contrast) minus
     simulated, rms over stated uncertainty and chi-square, at the simulation's nodes and levelled."""
@@ -160,7 +160,7 @@ def comparison(quick: bool) -> Iterator[dict[str, object]]:
             yield {"simulation": text, "quantity": name, "rms/stated": chi**0.5, "chi-square": chi}
 
 
-@table("comparison_scale", page="how-to/compare", cost=30, seed=1)
+@table("comparison_scale", page="how-to/compare", cost=7, seed=1)
 def comparison_scale(quick: bool) -> Iterator[dict[str, object]]:
     """The same with a modulus 3 % too large, four textures: scale that fits best, mean of the pairs, its stated
     uncertainty for one pair, rms((found - 1.03) / stated), chi-square of the rest; rms over stated of the levelled

@@ -36,7 +36,7 @@ def _text(words: str) -> str:
     return words.replace(", ", " – ").replace("; ", " – ")
 
 
-@table("study", page="explanation/study", cost=200, own_quick=True)
+@table("study", page="explanation/study", cost=190, own_quick=True)
 def perturbation(quick: bool) -> Iterator[dict[str, object]]:
     """Perturbation P of the five areas: the paper's methods as in the paper, two of them in our solver, our default."""
     for scene in _study(quick).scenes:

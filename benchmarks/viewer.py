@@ -20,7 +20,7 @@ FRAMES, SIDE = 12, 1200
 """Frames of the result, and side of the region, px."""
 
 
-@table("viewer", page="how-to/view", cost=10, timing=True)
+@table("viewer", page="how-to/view", cost=3, timing=True)
 def viewer(quick: bool) -> Iterator[dict[str, object]]:
     """Processor time of the viewer's server for a frame that was not shown before: reading a field with its
     uncertainty, and painting it on 1100 x 700 pixels of the screen; median of ten frames."""
