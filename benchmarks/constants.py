@@ -29,7 +29,7 @@ CONSTANTS = {
     "nodes": ("_WORSE", "_MISFIT", "_ONE_SIDED", "_NOISY"),
     "solve": ("_STARTED", "_WANDERING", "_SWINGING", "_SETTLED", "_LOOKED_AT"),
     "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT"),
-    "statistics": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING"),
+    "light_weights": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING"),
 }
 TENFOLD = ("_SMOOTHNESS", "_ROUNDING", "_ANCHOR")
 """Constants of `equations` and `assembly` of which only the order of magnitude counts."""
@@ -67,11 +67,15 @@ def constants(quick: bool) -> Iterator[Row]:
     uncertainty, and of the fraction of nodes measured; the worst of the part's constants.
     """
     usual = scenes()
+    rooms = {name: "weights" if name == "light_weights" else "correlation" for name in CONSTANTS}
+    modules = {name: importlib.import_module(f"rgbmidic.{room}.{name}") for name, room in rooms.items()}
+    stale = [(name, one) for name, names in CONSTANTS.items() for one in names if not hasattr(modules[name], one)]
+    if stale:
+        raise AttributeError(f"constants that are not there: {stale}")
     for name, names in CONSTANTS.items():
         if quick and name != "images":
             continue
-        room = "weights" if name == "statistics" else "correlation"
-        module = importlib.import_module(f"rgbmidic.{room}.{name}")
+        room, module = rooms[name], modules[name]
         worst = (0.0, 0.0, 0.0)
         for constant in names:
             value = getattr(module, constant)

@@ -142,8 +142,8 @@ def overlaps(quick: bool) -> Iterator[Row]:
         }
 
 
-BANDS = ((0, 30), (30, 60), (60, 100), (100, 150))
-"""Distances from a crack (px)."""
+BANDS = ((1, 30), (30, 60), (60, 100), (100, 150))
+"""Distances from a crack (px); a node nearer than 1 px belongs to either side."""
 
 
 @table("crack", page="explanation/uncertainty", cost=10, keys=2, seed=1)

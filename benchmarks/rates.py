@@ -228,7 +228,7 @@ def rates_of_noise(quick: bool) -> Iterator[dict[str, object]]:
 @table("rates_speed", page="how-to/results", cost=10, timing=True)
 def rates_speed(quick: bool) -> Iterator[dict[str, object]]:
     """Processor time of the rates of 500 frames on one thread, by motion."""
-    t, nodes = np.arange(500.0), 20 if quick else 1000
+    t, nodes = np.arange(500.0), 20 if quick else 300
     still: BoolArray = t < 0
     noise = 0.01 * np.random.default_rng(0).normal(size=(len(t), nodes))
     std = np.full(noise.shape, 0.01)

@@ -21,7 +21,7 @@ SMALL, FEW = 448, (1.0, 8.0)
 """Frames (px) and angles (degrees) of the tables, and of `--quick`."""
 
 
-def _study(quick: bool) -> Any:
+def bench_study(quick: bool) -> Any:
     """The study, kept beside the renders for the tables that are made of it."""
     path = renders() / f"study_{quick:d}.pickle"
     if not path.exists():
@@ -39,7 +39,7 @@ def _text(words: str) -> str:
 @table("study", page="explanation/study", cost=190, own_quick=True)
 def perturbation(quick: bool) -> Iterator[dict[str, object]]:
     """Perturbation P of the five areas: the paper's methods as in the paper, two of them in our solver, our default."""
-    for scene in _study(quick).scenes:
+    for scene in bench_study(quick).scenes:
         for method, settings in METHODS.items():
             for angle, row in zip(scene.angles, scene.perturbation(method), strict=True):
                 areas = {f"{area.name} [1e-3 px]": 1e3 * p for area, p in zip(scene.bench.areas, row, strict=True)}
@@ -55,7 +55,7 @@ def ratios(quick: bool) -> Iterator[dict[str, object]]:
     """P in A1 to A4 at all angles over that of A0: fraction within 1.3, median, largest; P of all areas over that of
     the paper's plain DIC, median over angles up to 2 and from 6 degrees; P within an element of the masks' frontiers
     over P beside them, median."""
-    for scene in _study(quick).scenes:
+    for scene in bench_study(quick).scenes:
         angles = np.array(scene.angles)
         plain = scene.perturbation("dic")
         for method, settings in METHODS.items():
@@ -81,7 +81,7 @@ def ratios(quick: bool) -> Iterator[dict[str, object]]:
 @table("study_claims", page="explanation/study", cost=0.5, own_quick=True, keys=3)
 def claims(quick: bool) -> Iterator[dict[str, object]]:
     """The paper's statements on the virtual bench, judged with the paper's methods as they are."""
-    for claim in judge(_study(quick)):
+    for claim in judge(bench_study(quick)):
         names = {"scene": claim.scene or "flat specimen", "paper": _text(claim.figure)}
         yield names | {"statement": _text(claim.statement), "verdict": claim.verdict}
 
