@@ -44,9 +44,7 @@ def perturbation(quick: bool) -> Iterator[dict[str, object]]:
             for angle, row in zip(scene.angles, scene.perturbation(method), strict=True):
                 areas = {f"{area.name} [1e-3 px]": 1e3 * p for area, p in zip(scene.bench.areas, row, strict=True)}
                 yield (
-                    {"scene": scene.bench.name, "method": _text(settings.title), "angle [deg]": f"{angle:g}"}
-                    | areas
-                    | ratios
+                    {"scene": scene.bench.name, "method": _text(settings.title), "angle [deg]": f"{angle:g}"} | areas
                 )
 
 
