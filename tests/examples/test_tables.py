@@ -44,7 +44,7 @@ def test_each_table_is_committed_and_shown_by_its_page(name):
 def test_each_table_and_figure_of_a_page_resolves(page):
     for name, given in shown(page):
         found, chosen = Table.read(FOLDER / f"{name}.csv"), options(given)
-        assert set(chosen) <= {"columns", "rows"}
+        assert set(chosen) <= {"columns", "rows", "caption"}
         for column in chosen.get("columns", "").split(",") if "columns" in chosen else ():
             found.column(column.strip())
         for row in chosen.get("rows", "").split(";") if "rows" in chosen else ():
