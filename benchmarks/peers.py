@@ -363,7 +363,7 @@ def peers_python() -> tuple[str, list[str]]:
     return python, ["rgbmidic", *(name for name, module in CONTENDERS.items() if module in done.stdout.split())]
 
 
-@table("speed_peers", page="explanation/speed", cost=120, timing=True)
+@table("speed_peers", page="explanation/speed", cost=130, timing=True)
 def speed_peers(quick: bool) -> Iterator[dict[str, object]]:
     """Beside other programs in one run, processor seconds on one thread, best of three alternating runs, 1024 x 1024
     px."""
@@ -405,7 +405,7 @@ def speed_peers(quick: bool) -> Iterator[dict[str, object]]:
                 }
 
 
-@table("speed_compiling", page="explanation/speed", cost=60, timing=True)
+@table("speed_compiling", page="explanation/speed", cost=30, timing=True)
 def speed_compiling(quick: bool) -> Iterator[dict[str, object]]:
     """Processor seconds that a first `rgbmidic run`, whose cache of kernels is empty, takes more than a second one."""
     if quick:  # what it takes does not depend on the size

@@ -68,7 +68,7 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     ]
 
 
-@table("speed_kernels", page="explanation/speed", cost=15, timing=True)
+@table("speed_kernels", page="explanation/speed", cost=2, timing=True)
 def speed_kernels(quick: bool) -> Iterator[dict[str, object]]:
     """Time per pixel of the kernels on one thread, and over the time in which the memory moves their arrays once."""
     speed = bandwidth()

@@ -46,7 +46,7 @@ def stages(work: Callable[[], object], repeats: int) -> tuple[dict[str, float], 
     return taken, inside
 
 
-@table("speed_stages", page="explanation/speed", cost=40, timing=True)
+@table("speed_stages", page="explanation/speed", cost=30, timing=True)
 def speed_stages(quick: bool) -> Iterator[dict[str, object]]:
     """Processor time (ms) of the stages of a frame of 1024 x 1024 px on one thread, the fastest of three runs; how
     much of it threads share, and how many times as fast two of them are at most."""
