@@ -242,7 +242,8 @@ VARIANTS: dict[str, dict[str, float]] = {
 @table("scenes", page="explanation/uncertainty", cost=100, keys=2, seed=11)
 def scenes(quick: bool) -> Iterator[Row]:
     """Other bodies, gloss and speckle, everything at its default: rms error of the displacement over the field, error
-    over stated uncertainty of displacement and strain, and the largest single ratio, with a 3-CCD and a Bayer camera.
+    over stated uncertainty of displacement and of strain, and nodes that are not measured, with a 3-CCD and a Bayer
+    camera.
     """
     for body, angle in BODIES.items():
         for title, options in VARIANTS.items():
@@ -253,12 +254,11 @@ def scenes(quick: bool) -> Iterator[Row]:
             cells: dict[str, object] = {}
             for camera, kind in KINDS.items():
                 verdict = Verdict.of(solve_pair(pair, both(pair, kind)), pair)
-                assert verdict.unmeasured == 0, "the page says that all nodes are measured"
                 cells |= {
                     f"{camera} error [px]": verdict.rms,
                     f"{camera} error/stated": rms(verdict.ratio),
                     f"{camera} strain": rms(verdict.strain_ratio),
-                    f"{camera} largest": largest(verdict.ratio),
+                    f"{camera} lost [%]": 100 * verdict.unmeasured,
                 }
             yield {"body": body, "paint": title, **cells}
 
