@@ -43,6 +43,11 @@ RENDERS = "RGBMIDIC_RENDERS"
 _OWN_RENDERS = tempfile.TemporaryDirectory(prefix="rgbmidic-renders-")
 
 
+def renders() -> Path:
+    """Folder of what tables of one run share."""
+    return Path(os.environ.get(RENDERS, _OWN_RENDERS.name))
+
+
 def turn(angle: float) -> State:
     """Turned about the vertical through the front point."""
     return State(angle_deg=angle)
@@ -99,7 +104,7 @@ class Pair:
 def stored_render(scene: Scene, state: State | None) -> FloatImage:
     """`render`, kept on disk while tables are measured: rendering is the slow part."""
     key = hashlib.sha1(repr((scene, state)).encode()).hexdigest()[:20]
-    path = Path(os.environ.get(RENDERS, _OWN_RENDERS.name)) / f"render_{key}.npy"
+    path = renders() / f"render_{key}.npy"
     if not path.exists():
         temporary = path.with_suffix(f".{os.getpid()}.npy")
         np.save(temporary, render(scene, state))
