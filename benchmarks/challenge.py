@@ -23,12 +23,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from peers import speckle
 
 from rgbmidic import Tri3Mesh, correlate, read_frame
 from rgbmidic.correlation import Solution
 from rgbmidic.fields import at_pixels
 from rgbmidic.typing import BoolArray, FloatArray
+
+from .peers import speckle
 
 MARGIN = 20
 BAND = 0.08

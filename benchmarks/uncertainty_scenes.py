@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from demosaicing import TILT, painted
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.crosstalk import unmix
@@ -25,6 +24,8 @@ from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
 from rgbmidic.scene.camera import PIXEL
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+from .demosaicing import TILT, painted
 
 Kind = Literal["rgb", "bayer"]
 
