@@ -18,9 +18,11 @@ import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from . import ROOT
 from .tables import FOLDER, TABLES, Table, load, measured
+from .uncertainty_scenes import RENDERS
 
 ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rgbmidic")
@@ -91,7 +93,8 @@ def main() -> int:
     folder = options.out or (None if options.quick else FOLDER)
     failed = {f"module {name}": reason for name, reason in broken.items()}
     start = time.perf_counter()
-    with ThreadPoolExecutor(options.processes) as pool:
+    with TemporaryDirectory(prefix="rgbmidic-renders-") as renders, ThreadPoolExecutor(options.processes) as pool:
+        os.environ[RENDERS] = renders
         mode = " --quick" if options.quick else ""
         header = provenance("")
         work = {}

@@ -126,7 +126,8 @@ def written(value: object, *, key: bool = False) -> str:
     elif key or not np.isfinite(value) or value == 0:
         text = f"{value:g}"
     else:
-        text = np.format_float_positional(value, DIGITS, unique=False, fractional=False, trim="k").rstrip(".")
+        rounded, exponent = f"{value:.{DIGITS - 1}e}".split("e")
+        text = f"{float(rounded + 'e' + exponent):.{max(DIGITS - 1 - int(exponent), 0)}f}"
     if re.search(r"[,;|\n]", text):
         raise ValueError(f"a cell has no comma, semicolon, bar or line break: {text!r}")
     return text

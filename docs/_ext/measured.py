@@ -59,7 +59,7 @@ class MeasuredTable(SphinxDirective):
         group = nodes.tgroup(cols=len(columns))
         made += group
         group += [nodes.colspec(colwidth=1) for _ in columns]
-        right = [all(_number(row[i]) for row in rows) and i >= table.keys for i in columns]
+        right = [all(_number(row[i]) for row in rows) for i in columns]
         head, body = nodes.thead(), nodes.tbody()
         group += [head, body]
         for part, lines in ((head, [table.columns]), (body, rows)):

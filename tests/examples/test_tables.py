@@ -121,7 +121,16 @@ def test_what_is_wrong_is_said(tmp_path, ask, message):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.012249, "0.0122"), (1.0, "1.00"), (123456.0, "123000"), (float("nan"), "nan"), (0.0, "0"), (3, "3")],
+    [
+        (0.012249, "0.0122"),
+        (-0.0219961, "-0.0220"),
+        (9.999, "10.0"),
+        (1.0, "1.00"),
+        (123456.0, "123000"),
+        (float("nan"), "nan"),
+        (0.0, "0"),
+        (3, "3"),
+    ],
 )
 def test_three_digits(value, text):
     assert written(value) == text
