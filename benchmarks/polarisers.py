@@ -11,14 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import cv2
 import numpy as np
 
 from rgbmidic import correlate
 from rgbmidic.fields import at_nodes, at_pixels
-from rgbmidic.lab.virtual import Finish, Polarisers, Scene, record, render, sphere_scene, truth, turned
+from rgbmidic.lab.virtual import Polarisers, Scene, record, render, sphere_scene, truth, turned
 from rgbmidic.lab.virtual.dataset import true_calibration
 from rgbmidic.lab.virtual.rendering import samples_needed
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -27,6 +26,8 @@ from rgbmidic.scene.camera import PIXEL
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 from .tables import Row, table
+from .uncertainty import rms
+from .uncertainty_scenes import blurred
 
 SIZE, FIRST, LAST, ELEMENT = 398, 11, 386, 25
 """Frame, first and last pixel of the measured square (15 elements wide), and side of an element, px."""
@@ -73,8 +74,7 @@ class Shots:
         y, x = np.mgrid[:SIZE, :SIZE].astype(np.float32)
         zone, (u, v) = np.zeros((SIZE, SIZE), dtype=bool), np.nan_to_num(self.exact).astype(np.float32)
         for number, (seen, mat) in enumerate(zip(self.seen, self.diffuse, strict=True)):
-            means = [cv2.GaussianBlur(image[1], (0, 0), 10) for image in (mat, seen)]
-            glare = (1 - means[0] / np.maximum(means[1], 1)).astype(np.float32)
+            glare = (1 - blurred(mat)[1] / np.maximum(blurred(seen)[1], 1)).astype(np.float32)
             zone |= (cv2.remap(glare, x + u, y + v, cv2.INTER_LINEAR) if number else glare) > REFLECTION
         return zone & inner()
 
@@ -93,7 +93,7 @@ def shots(paint: str, angle: float) -> Shots:
     scene = with_finish(scene, **PAINTS[paint])
     scene = replace(scene, camera=replace(scene.camera, samples=samples_needed(scene)))
     states, mat = (None, turned(angle)), with_finish(scene, gloss=0.0)
-    seen, diffuse = ([rendered(one, state) for state in states] for one in (scene, mat))
+    seen, diffuse = ([render(one, state) for state in states] for one in (scene, mat))
     return Shots(scene, (seen[0], seen[1]), (diffuse[0], diffuse[1]), truth(scene, states[1]))
 
 
@@ -101,11 +101,6 @@ def with_finish(scene: Scene, **changes: float) -> Scene:
     """The scene with both paints changed."""
     white, black = (replace(finish, **changes) for finish in (scene.surface.white, scene.surface.black))
     return replace(scene, surface=replace(scene.surface, white=white, black=black))
-
-
-def rendered(scene: Scene, state: Any) -> FloatImage:
-    """Images of the lamps without noise."""
-    return render(scene, state)
 
 
 @dataclass(frozen=True)
@@ -166,12 +161,6 @@ class Contender:
         }
 
 
-def rms(values: FloatArray) -> float:
-    """Root mean square of what is measured; NaN where nothing is."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
-
-
 @table("polarisers", page="explanation/polarisers", cost=60, keys=4, seed=SEED)
 def polarisers(quick: bool) -> Iterator[Row]:
     """One lamp or three colours, without polarisers and with crossed ones of an extinction of 0.01 or 0.0001."""
@@ -206,12 +195,14 @@ ALUMINIUM = 1.373 + 7.618j
 
 @table("polarisers_oblique", page="explanation/polarisers", cost=0, keys=2)
 def polarisers_oblique(quick: bool) -> Iterator[Row]:
-    """What of a single reflection passes ideal crossed polarisers, as a fraction of it over that of the diffuse light."""
+    """What of a single reflection passes ideal crossed polarisers, over what of the diffuse light does."""
     for surface, index in (("paint", 1.5), ("aluminium", ALUMINIUM)):
         for apart in (20, 45, 90, 140):
             diagonal, darkest = crossed(index, np.radians(apart / 2))
             names = "both axes at 45 deg to the plane of incidence", "lamp's axis turned to the darkest"
-            yield {"surface": surface, "lamp to camera [deg]": apart} | dict(zip(names, (diagonal, darkest), strict=True))
+            yield {"surface": surface, "lamp to camera [deg]": apart} | dict(
+                zip(names, (diagonal, darkest), strict=True)
+            )
 
 
 def crossed(index: complex, incidence: float) -> tuple[float, float]:

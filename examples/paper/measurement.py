@@ -138,6 +138,7 @@ class Measurement:
 
     perturbation: np.ndarray  # P of U_y in A0 to A4, px
     error: np.ndarray  # standard deviation of the measured minus the true U_y in the areas, high-passed alike, px
+    rms: np.ndarray  # root mean square error of U_x and U_y together in the areas, nothing taken off, px
     mean: np.ndarray  # mean of (U_x, U_y) in the areas, (2, 5), px
     residual: float  # % of the effective dynamic range, mean of the lights
     measured: float  # fraction of the nodes that were measured
@@ -162,6 +163,7 @@ def measure_state(
     measurement = Measurement(
         perturbation=nothing,
         error=nothing,
+        rms=np.sqrt(area_means((np.asarray(field - truth) ** 2).mean(axis=0), bench.areas)),
         mean=np.stack([area_means(part, bench.areas) for part in field]),
         residual=float("nan"),
         measured=float(solution.measured.mean()),

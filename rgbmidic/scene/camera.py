@@ -95,14 +95,14 @@ class Polarisers:
     Attributes
     ----------
     extinction
-        Light that passes the pair crossed, over parallel: 1e-2 of common film, 1e-4 of the best sheets.
+        Light that the pair lets pass crossed, over parallel: 1e-2 of common film, 1e-4 of the best.
     transmission
-        Fraction of the depolarised light that both let pass. 0.25 is what two ideal polarisers absorb nothing more of;
-        film has 0.14 to 0.2, and above 0.25 lamps must return the other polarisation (reflective polarisers).
+        Fraction of the depolarised light that both let pass: 0.25 of ideal polarisers, some 0.15 of film (30 % of an
+        unpolarised lamp through a parallel pair). More than 0.25 needs lamps that are polarised themselves.
     depolarised
         Fraction of the reflection that has lost its polarisation. One reflection, however the facet is tilted, keeps
-        it; 0.01 bounds what the relief of a dielectric paint reflects twice, since the second time some 5 % return
-        (Fresnel, refractive index 1.5, 45 degrees) and a fifth at most of the light meets a second facet.
+        it; 0.01 bounds what the relief of a dielectric paint reflects twice: the second time some 5 % return (Fresnel,
+        refractive index 1.5, 45 degrees), and a fifth of the light at most meets a second facet.
     """
 
     extinction: float = 1e-2

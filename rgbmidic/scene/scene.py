@@ -279,8 +279,8 @@ def read_scene(path: Path | str) -> Experiment:
     """Read a SCENE.toml.
 
     Sections: ``[body]``, ``[surface]`` with ``[surface.white]`` and ``[surface.black]``, ``[[lights]]``, ``[camera]``,
-    ``[polarisers]``, ``[[states]]`` and ``[output]``. Every one may be left out: the reference sphere, paint, lights and
-    camera stand in; polarisers are there where their section is, even an empty one.
+    ``[polarisers]``, ``[[states]]`` and ``[output]``. Every one may be left out: the reference sphere, paint, lights
+    and camera stand in; polarisers are there where their section is, even an empty one.
 
     Raises
     ------
