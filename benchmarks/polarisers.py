@@ -8,9 +8,10 @@ the diffuse light, twice what film does.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -31,7 +32,8 @@ from .uncertainty_scenes import blurred
 
 SIZE, FIRST, LAST, ELEMENT = 398, 11, 386, 25
 """Frame, first and last pixel of the measured square (15 elements wide), and side of an element, px."""
-SEED, DRAWS = 11, 2
+SEEDS, DRAWS = (11, 12), 2
+"""Sprays of paint, and noises of the camera for each."""
 PAINTS: dict[str, dict[str, float]] = {
     "painted": {},
     "varnished": {"gloss": 12.0, "lobe_deg": 1.5, "slope_deg": 3.0, "spacing": 0.05},
@@ -41,12 +43,7 @@ EXTINCTIONS = (None, 1e-2, 1e-4)
 """Without polarisers, with common film, and with the best."""
 BRIGHTEST = 0.97
 """Fraction of full scale of the brightest sample; in trials a longer exposure, the glare saturated, gained nothing."""
-LIGHTS = {
-    "full well": None,
-    "same": 1.0,
-    "same / 10": 10.0,
-    "same / 30": 30.0,
-}
+LIGHTS = {"full well": 0.0, "same": 1.0, "same / 10": 10.0, "same / 30": 30.0}
 """Exposure: each contender's own to the full well, or the same for all, that of the brightest without polarisers, and
 parts of it."""
 REFLECTION = 1 / 3
@@ -69,6 +66,7 @@ class Shots:
         pairs = zip(self.seen, self.diffuse, strict=True)
         return [polarisers.transmission * (mat + polarisers.glare * (all_ - mat)) for all_, mat in pairs]
 
+    @cached_property
     def reflection(self) -> BoolArray:
         """Pixels of the reference, inside the border element, with green's reflection in one of the states."""
         y, x = np.mgrid[:SIZE, :SIZE].astype(np.float32)
@@ -87,9 +85,9 @@ def inner() -> BoolArray:
 
 
 @cache
-def shots(paint: str, angle: float) -> Shots:
+def shots(paint: str, angle: float, seed: int) -> Shots:
     """Render the sphere at rest and turned, and its mat twin with as many rays."""
-    scene = sphere_scene(size=SIZE, seed=SEED, droplet=4.2 * PIXEL)
+    scene = sphere_scene(size=SIZE, seed=seed, droplet=4.2 * PIXEL)
     scene = with_finish(scene, **PAINTS[paint])
     scene = replace(scene, camera=replace(scene.camera, samples=samples_needed(scene)))
     states, mat = (None, turned(angle)), with_finish(scene, gloss=0.0)
@@ -132,53 +130,64 @@ class Contender:
         brightest = max(float(np.einsum("cl,lyx->cyx", mixing, image).max()) for image in images)
         return BRIGHTEST * scene.camera.full_scale / brightest
 
-    def measured(self, taken: Shots, gain: float, zone: BoolArray) -> dict[str, float]:
-        """What it is worth at an exposure, over the draws of the camera's noise."""
+    def measured(self, taken: Shots, gain: float, draw: int) -> dict[str, FloatArray]:
+        """Errors in the reflection and elsewhere, errors over stated uncertainties, and signal, at an exposure."""
         scene, images = self.set_up(taken)
         separation = Separation(calibration=true_calibration(scene))
         region = Region.from_rectangle((FIRST, FIRST, LAST, LAST), (SIZE, SIZE))
         start = at_nodes(taken.exact, Tri3Mesh.from_region(region, ELEMENT).nodes) + 0.2
-        errors, ratios, elsewhere = [], [], inner() & ~zone
-        for draw in range(DRAWS):
-            frames = [
-                record(image * np.float32(gain), scene.camera, scene.lights, seed=1000 * SEED + 10 * draw + number)
-                for number, image in enumerate(images)
-            ]
-            f, g = (separation((frame,)) for frame in frames)
-            first, second = (np.where(image.valid, image.values, np.nan) for image in (f, g))
-            found = correlate(first, second, region=region, initial=start, normalise=10.0)
-            mesh = Tri3Mesh(nodes=found.nodes, elements=found.elements)
-            errors.append(at_pixels(mesh, found.displacement, (SIZE, SIZE)) - taken.exact)
-            inside = inner()[tuple(np.round(found.nodes).astype(int).T[::-1])]
-            ratios.append(((found.displacement - at_nodes(taken.exact, found.nodes)) / found.displacement_std)[inside])
-        error = np.stack(errors)
+        seed = 1000 * scene.surface.seed + 10 * draw
+        seen = [
+            separation((record(image * np.float32(gain), scene.camera, scene.lights, seed=seed + number),))
+            for number, image in enumerate(images)
+        ]
+        first, second = (np.where(image.valid, image.values, np.nan) for image in seen)
+        found = correlate(first, second, region=region, initial=start, normalise=10.0)
+        mesh, zone = Tri3Mesh(nodes=found.nodes, elements=found.elements), taken.reflection
+        error = at_pixels(mesh, found.displacement, (SIZE, SIZE)) - taken.exact
+        ratio = (found.displacement - at_nodes(taken.exact, found.nodes)) / found.displacement_std
+        column, row = np.round(found.nodes).astype(int).T
         return {
-            "error in the reflection [px]": rms(error[..., zone]),
-            "error elsewhere [px]": rms(error[..., elsewhere]),
-            "reflection not measured [%]": 100 * float(np.isnan(error[..., zone]).mean()),
-            "error/stated": rms(np.stack(ratios)),
-            "electrons per pixel": gain * scene.camera.gain * float(np.median(images[0][-1])),
+            "reflection": error[:, zone],
+            "elsewhere": error[:, inner() & ~zone],
+            "ratio": ratio[inner()[row, column]].T,
+            "electrons": np.full((1, 1), gain * scene.camera.gain * float(np.median(images[0][-1]))),
         }
 
 
-@table("polarisers", page="explanation/polarisers", cost=60, keys=4, seed=SEED)
+@table("polarisers", page="explanation/polarisers", cost=100, keys=4, seed=SEEDS[0], own_quick=True)
 def polarisers(quick: bool) -> Iterator[Row]:
     """One lamp or three colours, without polarisers and with crossed ones of an extinction of 0.01 or 0.0001."""
     contenders = [Contender(lamps, extinction) for lamps in (1, 3) for extinction in EXTINCTIONS]
     rows: dict[str, list[Row]] = {}
     for paint, angle, light in cases(quick):
-        taken = shots(paint, angle)
-        zone = taken.reflection()
-        same = min(one.gain(taken) for one in contenders if one.extinction is None)
-        found = {}
-        for one in contenders:
-            part = LIGHTS[light]
-            found[one.name] = one.measured(taken, one.gain(taken) if part is None else same / part, zone)
-        for figure in next(iter(found.values())):
+        found: dict[str, list[dict[str, FloatArray]]] = {one.name: [] for one in contenders}
+        for seed, draw in [(SEEDS[0], 0)] if quick else itertools.product(SEEDS, range(DRAWS)):
+            taken = shots(paint, angle, seed)
+            same = min(one.gain(taken) for one in contenders if one.extinction is None)
+            for one in contenders:
+                gain = same / LIGHTS[light] if LIGHTS[light] else one.gain(taken)
+                found[one.name].append(one.measured(taken, gain, draw))
+        figures = {
+            name: summary({part: np.hstack([one[part] for one in draws]) for part in draws[0]})
+            for name, draws in found.items()
+        }
+        for figure in figures[contenders[0].name]:
             row: Row = {"figure": figure, "paint": paint, "angle [deg]": angle, "exposure": light}
-            rows.setdefault(figure, []).append(row | {name: figures[figure] for name, figures in found.items()})
+            rows.setdefault(figure, []).append(row | {name: figures[name][figure] for name in figures})
     for figure in rows:
         yield from rows[figure]
+
+
+def summary(parts: dict[str, FloatArray]) -> dict[str, float]:
+    """Figures of one contender over all paints and draws."""
+    return {
+        "error in the reflection [px]": rms(parts["reflection"]),
+        "error elsewhere [px]": rms(parts["elsewhere"]),
+        "reflection not measured [%]": 100 * float(np.isnan(parts["reflection"]).mean()),
+        "error/stated": rms(parts["ratio"]),
+        "electrons per pixel": rms(parts["electrons"]),
+    }
 
 
 def cases(quick: bool) -> list[tuple[str, float, str]]:
@@ -200,9 +209,8 @@ def polarisers_oblique(quick: bool) -> Iterator[Row]:
         for apart in (20, 45, 90, 140):
             diagonal, darkest = crossed(index, np.radians(apart / 2))
             names = "both axes at 45 deg to the plane of incidence", "lamp's axis turned to the darkest"
-            yield {"surface": surface, "lamp to camera [deg]": apart} | dict(
-                zip(names, (diagonal, darkest), strict=True)
-            )
+            row: Row = {"surface": surface, "lamp to camera [deg]": apart}
+            yield row | dict(zip(names, (diagonal, darkest), strict=True))
 
 
 def crossed(index: complex, incidence: float) -> tuple[float, float]:

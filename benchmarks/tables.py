@@ -25,6 +25,12 @@ import numpy as np
 from . import ROOT
 
 Row = dict[str, object]
+
+
+class MissingDataError(Exception):
+    """The files that a table is measured on are not here."""
+
+
 FOLDER = ROOT / "docs" / "tables"
 README = ROOT / "README.md"
 """Shows tables as markdown, which a repository's page renders: see `Table.shown_in`."""
