@@ -3,7 +3,7 @@
 The sphere of `sphere_scene` under one lamp (the green one, before a monochrome camera) or all three (before a Bayer
 camera of the same pixels), each lamp of the same power. Every contender has the default settings of rgbmidic and is
 started within half a pixel of the truth. The polarisers are ideal but for their extinction: they let pass a quarter of
-the diffuse light, twice what film does.
+the diffuse light, film some 15 %.
 """
 
 from __future__ import annotations
