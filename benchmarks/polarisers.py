@@ -36,9 +36,11 @@ SEEDS, DRAWS = (11, 12), 2
 """Sprays of paint, and noises of the camera for each."""
 PAINTS: dict[str, dict[str, float]] = {
     "painted": {},
+    "raised droplets": {"dome": 0.004},
     "varnished": {"gloss": 12.0, "lobe_deg": 1.5, "slope_deg": 3.0, "spacing": 0.05},
 }
-"""The paint of the other tables, and one as smooth as a clear coat leaves it; both reflect some 6 % (Fresnel: 4 %)."""
+"""The paint of the other tables, the paper's with droplets 4 um high (its Fig. 10), and one as smooth as a clear coat
+leaves it; all reflect some 6 % (Fresnel: 4 %)."""
 EXTINCTIONS = (None, 1e-2, 1e-4)
 """Without polarisers, with common film, and with the best."""
 BRIGHTEST = 0.97
@@ -87,8 +89,9 @@ def inner() -> BoolArray:
 @cache
 def shots(paint: str, angle: float, seed: int) -> Shots:
     """Render the sphere at rest and turned, and its mat twin with as many rays."""
-    scene = sphere_scene(size=SIZE, seed=seed, droplet=4.2 * PIXEL)
-    scene = with_finish(scene, **PAINTS[paint])
+    scene, changes = sphere_scene(size=SIZE, seed=seed, droplet=4.2 * PIXEL), dict(PAINTS[paint])
+    scene = replace(scene, surface=replace(scene.surface, dome=changes.pop("dome", 0.0)))
+    scene = with_finish(scene, **changes)
     scene = replace(scene, camera=replace(scene.camera, samples=samples_needed(scene)))
     states, mat = (None, turned(angle)), with_finish(scene, gloss=0.0)
     seen, diffuse = ([render(one, state) for state in states] for one in (scene, mat))
@@ -155,7 +158,7 @@ class Contender:
         }
 
 
-@table("polarisers", page="explanation/polarisers", cost=100, keys=4, seed=SEEDS[0], own_quick=True)
+@table("polarisers", page="explanation/polarisers", cost=140, keys=4, seed=SEEDS[0], own_quick=True)
 def polarisers(quick: bool) -> Iterator[Row]:
     """One lamp or three colours, without polarisers and with crossed ones of an extinction of 0.01 or 0.0001."""
     contenders = [Contender(lamps, extinction) for lamps in (1, 3) for extinction in EXTINCTIONS]
@@ -191,7 +194,7 @@ def summary(parts: dict[str, FloatArray]) -> dict[str, float]:
 
 
 def cases(quick: bool) -> list[tuple[str, float, str]]:
-    """Paint, angle and exposure; a clear coat under a thirtieth leaves 10 electrons, which nobody would measure."""
+    """Paint, angle and exposure; a clear coat under a thirtieth leaves 10 electrons, which nobody could measure with."""
     if quick:
         return [("painted", 2.0, "same / 10")]
     every = [(paint, angle, light) for paint in PAINTS for angle in (2.0, 8.0) for light in LIGHTS]
