@@ -194,7 +194,7 @@ def summary(parts: dict[str, FloatArray]) -> dict[str, float]:
 
 
 def cases(quick: bool) -> list[tuple[str, float, str]]:
-    """Paint, angle and exposure; a clear coat under a thirtieth leaves 10 electrons, which nobody could measure with."""
+    """Paint, angle and exposure; a clear coat under a thirtieth leaves 10 electrons, too few to measure."""
     if quick:
         return [("painted", 2.0, "same / 10")]
     every = [(paint, angle, light) for paint in PAINTS for angle in (2.0, 8.0) for light in LIGHTS]
