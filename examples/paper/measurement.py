@@ -21,7 +21,7 @@ from bench import Bench, Topography
 from rgbmidic import Region, Solution, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference, Residual, find_start, solve
 from rgbmidic.errors import InputError
-from rgbmidic.fields import at_pixels, high_pass
+from rgbmidic.fields import at_nodes, at_pixels, high_pass
 from rgbmidic.illumination import IlluminationImages
 from rgbmidic.lab.measures import Goniometry, area_means, area_stds, residual_percent
 from rgbmidic.pipeline import correlated
@@ -189,6 +189,8 @@ class Measurement:
 
     perturbation: np.ndarray  # P of U_y in A0 to A4, px
     error: np.ndarray  # standard deviation of the measured minus the true U_y in the areas, high-passed alike, px
+    rms: np.ndarray  # root mean square error of U_x and U_y together in the areas, nothing taken off, px
+    ratio: np.ndarray  # root mean square of error over stated uncertainty at the nodes in the areas
     mean: np.ndarray  # mean of (U_x, U_y) in the areas, (2, 5), px
     residual: float  # % of the effective dynamic range, mean of the lights
     measured: float  # fraction of the nodes that were measured
@@ -213,6 +215,8 @@ def measure_state(
     measurement = Measurement(
         perturbation=nothing,
         error=nothing,
+        rms=np.sqrt(area_means((np.asarray(field - truth) ** 2).mean(axis=0), bench.areas)),
+        ratio=_over_stated(solution, truth, bench),
         mean=np.stack([area_means(part, bench.areas) for part in field]),
         residual=float("nan"),
         measured=float(solution.measured.mean()),
@@ -234,6 +238,18 @@ def measure_state(
         frontier=_frontier(ripple, competitor, images),
     )
     return measurement, field
+
+
+def _over_stated(solution: Solution, truth: np.ndarray, bench: Bench) -> np.ndarray:
+    """Root mean square of error over stated uncertainty at the nodes in each area; NaN where none is measured."""
+    ratio = (solution.displacement - at_nodes(truth, solution.nodes)) / solution.displacement_std
+    found = []
+    for area in bench.areas:
+        x0, y0, x1, y1 = area.rectangle
+        inside = ((solution.nodes >= (x0, y0)) & (solution.nodes <= (x1, y1))).all(axis=1)
+        known = ratio[inside & solution.measured]
+        found.append(float(np.sqrt(np.mean(known**2))) if known.size else float("nan"))
+    return np.array(found)
 
 
 def _frontier(ripple: np.ndarray, competitor: Competitor, images: IlluminationImages) -> float:

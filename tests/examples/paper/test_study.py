@@ -53,6 +53,19 @@ def test_p_is_error_and_not_the_motion_of_the_sphere(study):
         assert one.perturbation == pytest.approx(one.error, rel=0.05, nan_ok=True)
 
 
+def test_rms_is_of_both_components_with_all_their_waves(study):
+    scene = study.scenes[0]
+    for angle, shot in scene.snapshots.items():
+        for method, field in shot.displacement.items():
+            error = (field - scene.bench.truth(angle)) ** 2
+            expected = [np.sqrt(np.nanmean(area.cut(error))) for area in scene.bench.areas]
+            found = scene.measurements[method, angle]
+            known = np.isfinite(found.rms)
+            assert known.any()
+            assert found.rms[known] == pytest.approx(np.array(expected)[known], rel=1e-6)
+            assert (found.ratio[known] > 0.2).all()
+
+
 def test_threshold_is_found_where_the_disturbance_ends(study):
     found = study.scenes[0].threshold
     assert 100 < found.zone.radius < 300
