@@ -1,27 +1,23 @@
-"""How much the chosen constants of the solve matter: each is halved and doubled; prints what changes.
-
-    python benchmarks/constants.py
+"""How much the chosen constants of the solve matter: each is halved and doubled.
 
 Three scenes with exact speckle, noise of 3 grey levels, a motion with strain and rotation, and reflections of up to 60
-grey levels in the deformed state: "lights" (three lights, a reflection in each), "gap" (the same with a part left out,
-rigid motions), and "one" (one light, whose reflection decorrelates nodes). Printed are the largest change of a measured
-displacement (px), the median change of its standard uncertainty, and how many nodes more are measured.
+grey levels in the deformed state: three lights with a reflection in each, the same with a part left out and rigid
+motions, and one light whose reflection decorrelates nodes.
 """
 
 from __future__ import annotations
 
 import importlib
-import sys
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
 import numpy as np
+from textures import Affine, Texture
 
 from rgbmidic import Solution, correlate
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from textures import Affine, Texture
+from .tables import Row, table
 
 SHAPE, REGION = (200, 240), (15, 15, 222, 182)
 CONSTANTS = {
@@ -33,7 +29,7 @@ CONSTANTS = {
     "nodes": ("_WORSE", "_MISFIT", "_ONE_SIDED", "_NOISY"),
     "solve": ("_STARTED", "_WANDERING", "_SWINGING", "_SETTLED", "_LOOKED_AT"),
     "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT"),
-    "statistics": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING"),
+    "light_weights": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING"),
 }
 TENFOLD = ("_SMOOTHNESS", "_ROUNDING", "_ANCHOR")
 """Constants of `equations` and `assembly` of which only the order of magnitude counts."""
@@ -59,33 +55,53 @@ def scenes() -> dict[str, Solution]:
     }
 
 
-def change(before: Solution, after: Solution) -> str:
-    """Report what differs."""
-    both = before.measured & after.measured
-    motion = np.abs(after.displacement - before.displacement)[both].max()
-    std = np.median(np.abs(after.displacement_std / before.displacement_std - 1)[both])
-    return f"{motion:.0e} px, std {std:.1%}, nodes {int(after.measured.sum()) - int(before.measured.sum()):+d}"
-
-
 def scaled(value: Any, factor: float) -> Any:
     """Return a number times a factor, a whole one rounded."""
     return max(1, round(value * factor)) if isinstance(value, int) else value * factor
 
 
-def main() -> None:
-    """Print a line for every constant and factor."""
+@table("constants", page="explanation/uncertainty", cost=60, keys=1, seed=3)
+def constants(quick: bool) -> Iterator[Row]:
+    """Every constant of a part of the solve halved and doubled (tenfold where only its order counts), in three scenes:
+    root mean square change of the displacement over its stated uncertainty, largest change of the median stated
+    uncertainty, and of the fraction of nodes measured; the worst of the part's constants.
+    """
     usual = scenes()
-    for name, constants in CONSTANTS.items():
-        room = "weights" if name == "statistics" else "correlation"
-        module = importlib.import_module(f"rgbmidic.{room}.{name}")
-        for constant in constants:
+    rooms = {name: "weights" if name == "light_weights" else "correlation" for name in CONSTANTS}
+    modules = {name: importlib.import_module(f"rgbmidic.{room}.{name}") for name, room in rooms.items()}
+    stale = [(name, one) for name, names in CONSTANTS.items() for one in names if not hasattr(modules[name], one)]
+    if stale:
+        raise AttributeError(f"constants that are not there: {stale}")
+    for name, names in CONSTANTS.items():
+        if quick and name != "images":
+            continue
+        room, module = rooms[name], modules[name]
+        worst = (0.0, 0.0, 0.0)
+        for constant in names:
             value = getattr(module, constant)
             for factor in (0.1, 10) if name in ("equations", "assembly") and constant in TENFOLD else (0.5, 2):
                 setattr(module, constant, scaled(value, factor))
-                found = "; ".join(f"{scene} {change(usual[scene], after)}" for scene, after in scenes().items())
-                print(f"{name}.{constant} x {factor:g}: {found}", flush=True)
-            setattr(module, constant, value)
+                try:
+                    found = [change(usual[scene], after) for scene, after in scenes().items()]
+                finally:
+                    setattr(module, constant, value)
+                worst = tuple(np.max([worst, *found], axis=0))
+        yield {
+            "part": f"{room}/{name}",
+            "constants": len(names),
+            "displacement/stated": float(worst[0]),
+            "stated [%]": 100 * float(worst[1]),
+            "nodes [%]": 100 * float(worst[2]),
+        }
 
 
-if __name__ == "__main__":
-    main()
+def change(before: Solution, after: Solution) -> tuple[float, float, float]:
+    """What differs: displacement over its standard uncertainty, that uncertainty, and nodes, both as fractions."""
+    both = before.measured & after.measured
+    motion = ((after.displacement - before.displacement) / before.displacement_std)[both]
+    std = np.median(after.displacement_std[both] / before.displacement_std[both]) - 1
+    return (
+        float(np.sqrt(np.mean(motion**2))),
+        abs(float(std)),
+        abs(float(after.measured.mean() - before.measured.mean())),
+    )

@@ -26,8 +26,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from colour_scenes import NOISE, A, sparkle, speckle
-from demosaicing import TILT, painted
-from uncertainty_scenes import stored_render
 
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.frames import open_source
@@ -39,6 +37,9 @@ from rgbmidic.lab.virtual import plate_scene, sphere_scene
 from rgbmidic.scene.camera import PIXEL
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import FloatArray, FloatImage
+
+from .demosaicing import TILT, painted
+from .uncertainty_scenes import stored_render
 
 BLACK, WHITE = 64, 4095
 RANGE = WHITE - BLACK

@@ -21,10 +21,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import cv2
-import peers
 
 from rgbmidic import timing
 from rgbmidic._kernels import threads
+
+from . import peers
 
 PAIRS = ("star", "affine, 1 % noise")
 

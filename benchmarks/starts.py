@@ -1,19 +1,15 @@
-"""How often a start is found, and how sure it is: random large motions by size, speckle and lights; prints a table.
+"""How often an initial guess is found: random large motions by size, speckle and lights.
 
-    python benchmarks/starts.py [--sizes 64 200 1000] [--repeats 3]
-
-A start counts as found if nine tenths of the nodes around which the images correlate by 0.5 or more at the true
-displacement are within 1.5 px of it; motions at which no node does are left out.
-Dark discs on white at random places, or on a jittered lattice, which has no coarse content; every light has its own
-shading and level, and reflections that move from one state to the other: up to three times full white, erratic, left
-out where they exceed 1.5 times full white. The deformed image is the undeformed one brought to its place by cubic
-interpolation, with noise of 2 % in both. The last column is a search in a picture of another specimen.
+An initial guess counts as found if nine tenths of the nodes around which the images correlate by 0.5 or more at the
+true displacement are within 1.5 px of it; motions at which no node does are left out. Dark discs on white at random
+places, or on a jittered lattice, which has no coarse content; every light has its own shading and level, and
+reflections that move from one state to the other: up to three times full white, erratic, left out where they exceed 1.5
+times full white. The deformed image is the undeformed one moved by cubic interpolation, with noise of 2 % in both.
 """
 
 from __future__ import annotations
 
-import argparse
-import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -23,24 +19,26 @@ from rgbmidic import Region, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.nodes import correlation_around
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.correlation.start import FoundStart, find_start
+from rgbmidic.correlation.start import find_start
 from rgbmidic.typing import FloatArray, FloatImage
 
+from .tables import Row, table
+
 SPECKLES = {"discs 3 px": (3.0, False), "discs 8 px": (8.0, False), "lattice 4 px": (4.0, True)}
-LIGHTS = {"1 light": (1, 0.0), "1, reflection": (1, 0.12), "3, reflections": (3, 0.2)}
+LIGHTS = {"1 light": (1, 0.0), "1 light reflecting": (1, 0.12), "3 lights reflecting": (3, 0.2)}
 MOTIONS = {
     "2 px": (0.0, 0.0, 0.0, 2.0),
-    "half": (0.0, 0.0, 0.5, 0.0),
+    "half its side": (0.0, 0.0, 0.5, 0.0),
     "100 px": (0.0, 0.0, 0.0, 100.0),
-    "30 deg": (30.0, 0.0, 0.1, 0.0),
-    "20 %": (0.0, 0.2, 0.1, 0.0),
-    "20 deg 10 %": (20.0, 0.1, 0.2, 0.0),
-    "30 deg half": (30.0, 0.0, 0.5, 0.0),
+    "30°": (30.0, 0.0, 0.1, 0.0),
+    "20 % strain": (0.0, 0.2, 0.1, 0.0),
+    "20° + 10 %": (20.0, 0.1, 0.2, 0.0),
+    "30° + half its side": (30.0, 0.0, 0.5, 0.0),
 }
 """Turn in degrees, largest strain, shift over the region's side, and in px."""
 ROOM = 120
 """px that a picture is larger than the region; small ones are twice the region too, so that it stays in the picture."""
-WITHIN, SHARE, VISIBLE = 1.5, 0.9, 0.5
+WITHIN, FRACTION, VISIBLE = 1.5, 0.9, 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,65 +111,42 @@ def under_lights(image: FloatImage, name: str, random: np.random.Generator) -> t
     return images, weights
 
 
-def search(
-    side: int, textures: tuple[FloatImage, FloatImage], size: int, lights: str, motion: Motion, seed: int
-) -> tuple[bool | None, FoundStart, float]:
-    """Whether a start of a square region in the middle of a picture is found, the start, and the
-    seconds it took; None where nothing is seen."""
+def search(side: int, texture: FloatImage, size: int, lights: str, motion: Motion, seed: int) -> bool | None:
+    """Whether the displacement of a square region in the middle of a picture is found; None where nothing is seen."""
     random = np.random.default_rng(seed)
     rest = Motion(gradient=np.eye(2), shift=np.zeros(2))
-    images, weights = under_lights(moved(textures[0], size, rest), lights, random)
+    images, weights = under_lights(moved(texture, size, rest), lights, random)
     edge = (size - side) // 2
     region = Region.from_rectangle((edge, edge, edge + side - 1, edge + side - 1), (size, size))
     mesh = Tri3Mesh.from_region(region, 25)
     reference = Reference.prepare(images, region, weights, mesh=mesh, prefilter="binomial")
-    deformed = Deformed.prepare(*under_lights(moved(textures[1], size, motion), lights, random), prefilter="binomial")
-    begin = time.perf_counter()
+    deformed = Deformed.prepare(*under_lights(moved(texture, size, motion), lights, random), prefilter="binomial")
     start = find_start(reference, deformed)
-    seconds = time.perf_counter() - begin
     truth = motion.of(mesh.nodes, (size - 1) / 2)
     residual = Residual.at(reference, deformed, reference.values, [truth] * len(images))
     visible = np.nan_to_num(correlation_around(residual)) >= VISIBLE
     if not visible.any():
-        return None, start, seconds
+        return None
     near = np.linalg.norm(start.displacement - truth, axis=1)[visible] < WITHIN
-    return bool(near.mean() >= SHARE), start, seconds
+    return bool(near.mean() >= FRACTION)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 200, 1000], help="sides of the region, px")
-    parser.add_argument("--repeats", type=int, default=3, help="random motions of each kind")
-    arguments = parser.parse_args()
-    print(f"{'side':>5} {'speckle':<13} {'lights':<15}" + "".join(f"{name:>12}" for name in MOTIONS) + "   other  s")
-    right, wrong = list[float](), list[float]()
-    for side in arguments.sizes:
+@table("initial_guess", page="explanation/how-it-works", cost=200, keys=2)
+def initial_guess(quick: bool) -> Iterator[Row]:
+    """Initial guesses found without a hint, in per cent of 9 random motions of each kind (3 speckles, 3 draws), by the
+    region's side and the lights; reflections are up to three times full white.
+    """
+    for side, names in ((64, ["30° + half its side"]),) if quick else ((64, list(MOTIONS)), (300, list(MOTIONS))):
         size = side + (max(side, 2 * ROOM) if side < 400 else ROOM)
-        for speckle in SPECKLES:
-            random = np.random.default_rng(side)
-            textures = [specimen(int(1.5 * size), speckle, random) for _ in range(2)]
+        textures = {name: specimen(int(1.5 * size), name, np.random.default_rng(side)) for name in SPECKLES}
+        for name in names:
+            cells = {}
             for lights in LIGHTS:
-                row, times = "", list[float]()
-                for name in MOTIONS:
-                    found = possible = 0
-                    for seed in range(arguments.repeats):
-                        motion = Motion.random(name, side, random)
-                        good, start, seconds = search(side, (textures[0],) * 2, size, lights, motion, seed)
-                        times.append(seconds)
-                        if good is not None:
-                            (right if good else wrong).append(start.confidence)
-                            found, possible = found + good, possible + 1
-                    row += f"{f'{found} of {possible}':>12}"
-                _, start, _ = search(side, (textures[0], textures[1]), size, lights, motion, 0)
-                wrong.append(start.confidence)
-                print(
-                    f"{side:>5} {speckle:<13} {lights:<15}{row} {start.confidence:7.2f} {np.median(times):5.2f}",
-                    flush=True,
-                )
-    levels = (0, 1, 5, 50)
-    print(f"confidence of starts found, percentiles {levels}: {np.round(np.percentile(right, levels), 2)}")
-    print(f"confidence of others, from the largest: {np.round(np.sort(wrong)[::-1][:12], 2)}")
-
-
-if __name__ == "__main__":
-    main()
+                found = [
+                    search(side, texture, size, lights, Motion.random(name, side, np.random.default_rng(seed)), seed)
+                    for texture in textures.values()
+                    for seed in range(3)
+                ]
+                seen = [one for one in found if one is not None]
+                cells[f"{lights} [%]"] = 100 * sum(seen) / len(seen) if seen else float("nan")
+            yield {"side [px]": side, "motion": name, **cells}

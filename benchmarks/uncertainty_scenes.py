@@ -1,21 +1,21 @@
-"""Scenes of the uncertainty benchmark: bodies in two states with exact truth, and what spoils a frame.
+"""Scenes of the tables of uncertainty: bodies in two states with exact truth, cameras, and what corrupts a frame.
 
-Rendering is the slow part: what has been rendered is kept on disk.
+A scene is rendered light by light without the camera's colours, so cameras and crosstalk matrices share renderings.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-from demosaicing import TILT, painted
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.crosstalk import unmix
@@ -23,13 +23,24 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
-from rgbmidic.scene.camera import PIXEL
+from rgbmidic.scene.camera import PIXEL, REFERENCE_CROSSTALK
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-Kind = Literal["rgb", "bayer"]
+from .demosaicing import TILT, painted
 
-CACHE = {"folder": Path(tempfile.gettempdir()) / "rgbmidic-uncertainty"}
-"""Where rendered images are kept."""
+Kind = Literal["rgb", "bayer"]
+KINDS: dict[str, Kind] = {"3-CCD": "rgb", "Bayer": "bayer"}
+CROSSTALKS: dict[str, tuple[tuple[float, ...], ...]] = {"mild": REFERENCE_CROSSTALK}
+"""What each light gives in the channels of another: that of the virtual experiments, and those of measured cameras."""
+PAINTS: dict[str, dict[str, float]] = {
+    "smooth": {},
+    "glossy": {"gloss": 3.0},
+    "coarse": {"wrinkles": 0.075},
+}
+"""Options of `Setting`: wrinkles 25 um apart that reflect 1.5 times the full white; twice that; three times as wide."""
+RENDERS = "RGBMIDIC_RENDERS"
+"""Environment variable: folder of rendered scenes that several tables share; the driver sets it for its run."""
+_OWN_RENDERS = tempfile.TemporaryDirectory(prefix="rgbmidic-renders-")
 
 
 def turn(angle: float) -> State:
@@ -39,7 +50,7 @@ def turn(angle: float) -> State:
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """A scene in two states, with everything that tells it from another."""
+    """A scene in two states, with everything that distinguishes it from another."""
 
     body: str
     state: State
@@ -64,7 +75,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Pair:
-    """Noise-free lights (k, H, W) in both states, share of their local mean that is not diffuse, and the truth."""
+    """Noise-free lights (k, H, W) in both states, fraction of their local mean that is not diffuse, and the truth."""
 
     scene: Scene
     lights: tuple[FloatImage, FloatImage]
@@ -86,16 +97,17 @@ class Pair:
 
 
 def stored_render(scene: Scene, state: State | None) -> FloatImage:
-    """`render`, kept on disk: rendering is the slow part."""
+    """`render`, kept on disk while tables are measured: rendering is the slow part."""
     key = hashlib.sha1(repr((scene, state)).encode()).hexdigest()[:20]
-    path = CACHE["folder"] / f"render_{key}.npy"
+    path = Path(os.environ.get(RENDERS, _OWN_RENDERS.name)) / f"render_{key}.npy"
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, render(scene, state))
+        temporary = path.with_suffix(f".{os.getpid()}.npy")
+        np.save(temporary, render(scene, state))
+        temporary.replace(path)
     return np.asarray(np.load(path))
 
 
-@cache
+@lru_cache(maxsize=8)
 def pair_of(setting: Setting) -> Pair:
     """Render a setting, its mat twin and its truth."""
     scene, mat = setting.scene(), setting.scene(gloss=0.0)
@@ -128,9 +140,12 @@ def images_of(raw: Mosaic | ChannelFrame, scene: Scene) -> IlluminationImages:
     return separate(linear, crosstalk)
 
 
-def both(pair: Pair, kind: Kind, seed: int = 11) -> tuple[IlluminationImages, IlluminationImages]:
-    """Illumination images of both states with camera noise."""
-    scene = pair.scene
+def both(
+    pair: Pair, kind: Kind, seed: int = 11, crosstalk: str = "mild"
+) -> tuple[IlluminationImages, IlluminationImages]:
+    """Illumination images of both states with camera noise, seen with one of the `CROSSTALKS`."""
+    camera = replace(pair.scene.camera, crosstalk=np.array(CROSSTALKS[crosstalk]))
+    scene = replace(pair.scene, camera=camera)
     first, second = (images_of(frame(i, scene, kind, 1000 * seed + n), scene) for n, i in enumerate(pair.lights))
     return first, second
 
@@ -144,8 +159,8 @@ def _nowhere(x: FloatArray, y: FloatArray) -> BoolArray:
 
 
 @dataclass(frozen=True)
-class Spoil:
-    """What spoils a frame: the zone it covers, what it does to the lights and to the samples of state 0 or 1."""
+class Corruption:
+    """What corrupts a frame: the zone it covers, what it does to the lights and to the samples of state 0 or 1."""
 
     name: str
     zone: Callable[[Any, Any], BoolArray] = _nowhere
@@ -200,7 +215,7 @@ def _dead(values: Any, zone: BoolArray, state: int) -> None:
 
 
 def _saturated(channel: int) -> Callable[[Any, BoolArray, int], None]:
-    def spoil(values: Any, zone: BoolArray, state: int) -> None:
+    def corrupt(values: Any, zone: BoolArray, state: int) -> None:
         if values.ndim == 3:
             values[channel][zone] = 4095
             return
@@ -209,7 +224,7 @@ def _saturated(channel: int) -> Callable[[Any, BoolArray, int], None]:
         there = (y % 2 == samples[0]) & (x % 2 == samples[1]) if channel != 1 else (x + y) % 2 == 1
         values[zone & there] = 4095
 
-    return spoil
+    return corrupt
 
 
 def _left_third(x: Any, y: Any) -> BoolArray:
@@ -227,14 +242,14 @@ def _lamp_spot(x: Any, y: Any) -> BoolArray:
     return np.asarray(bright > 1.5 * np.median(bright))
 
 
-SPOILS = [
-    Spoil("nothing"),
-    Spoil("red light off", light=_off),
-    Spoil("20 % flicker", light=_flicker),
-    Spoil("red saturated on a third", zone=_left_third, sensor=_saturated(0)),
-    Spoil("green saturated on a third", zone=_left_third, sensor=_saturated(1)),
-    Spoil("1 % dead and hot pixels", sensor=_dead),
-    Spoil("dark fragment", zone=_box, light=_fragment),
-    Spoil("speckled fragment", zone=_box, light=_rough_fragment),
-    Spoil("all reflections in one place", zone=_lamp_spot, overlapping=True),
+CORRUPTIONS = [
+    Corruption("nothing"),
+    Corruption("red light off", light=_off),
+    Corruption("20 % flicker", light=_flicker),
+    Corruption("red saturated on a third", zone=_left_third, sensor=_saturated(0)),
+    Corruption("green saturated on a third", zone=_left_third, sensor=_saturated(1)),
+    Corruption("1 % dead and hot pixels", sensor=_dead),
+    Corruption("dark fragment", zone=_box, light=_fragment),
+    Corruption("speckled fragment", zone=_box, light=_rough_fragment),
+    Corruption("all reflections in one place", zone=_lamp_spot, overlapping=True),
 ]

@@ -1,0 +1,125 @@
+"""Measure the tables of the pages: `python -m benchmarks [NAME ...] [--quick] [--list] [--processes N] [--out FOLDER]`.
+
+Each table is measured in a process of its own with one thread and written as a whole to docs/tables/NAME.csv, with the
+commit, date, seed, machine and versions it was measured with. `--quick` measures a few rows and writes nothing unless
+`--out` names a folder. A table that fails does not stop the others; the exit status is 1 then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from . import ROOT
+from .tables import FOLDER, TABLES, Table, load, measured
+from .uncertainty_scenes import RENDERS
+
+ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rgbmidic")
+
+
+def provenance(command: str) -> dict[str, str]:
+    """Where figures come from: commit, date, machine, versions and the command that makes them."""
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    dirty = git("status", "--porcelain", "--", ".", ":!docs/tables")
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "from the checkout" if package == "rgbmidic" else "missing"
+    return {
+        "commit": (git("rev-parse", "--short", "HEAD") or "unknown") + ("-dirty" if dirty else ""),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "machine": f"{os.cpu_count()} cores, {_processor()}",
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+        "command": command,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def isolated(name: str, quick: bool, header: dict[str, str]) -> tuple[Table, float]:
+    """A table measured in a process that may die without taking another along."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        return process.submit(measured, TABLES[name].measure.__module__, name, quick, header).result()
+
+
+def main() -> int:
+    """Read the command line, measure the tables asked for and return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="tables to measure; all if none is named")
+    parser.add_argument("--quick", action="store_true", help="a few rows of each; written only where --out is given")
+    parser.add_argument("--list", action="store_true", help="names, pages and CPU seconds of the tables")
+    parser.add_argument("--processes", type=int, default=1, metavar="N", help="tables measured at once (default 1)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help=f"default: {FOLDER.relative_to(ROOT)}")
+    options = parser.parse_args()
+    broken = load()
+    if unknown := [name for name in options.names if name not in TABLES]:
+        print(f"tables are: {', '.join(sorted(TABLES))}; given was {', '.join(unknown)}", file=sys.stderr)
+        return 2
+    if options.processes < 1:
+        print(f"--processes is a whole number from 1, not {options.processes}", file=sys.stderr)
+        return 2
+    if options.out is not None and options.out.exists() and not options.out.is_dir():
+        print(f"--out is a folder; {options.out} is a file", file=sys.stderr)
+        return 2
+    names = sorted(options.names or TABLES, key=lambda name: -TABLES[name].cost)
+    if options.list:
+        for name in sorted(names):
+            print(f"{name:24} {TABLES[name].cost:6g} s  {TABLES[name].page:30} {TABLES[name].caption}")
+        return 0
+    os.environ |= dict.fromkeys(ONE_THREAD, "1")
+    folder = options.out or (None if options.quick else FOLDER)
+    failed = {f"module {name}": reason for name, reason in broken.items()}
+    start = time.perf_counter()
+    with TemporaryDirectory(prefix="rgbmidic-renders-") as renders, ThreadPoolExecutor(options.processes) as pool:
+        os.environ[RENDERS] = renders
+        mode = " --quick" if options.quick else ""
+        header = provenance("")
+        work = {}
+        for name in names:
+            work[pool.submit(isolated, name, options.quick, header | {"command": _command(name, mode)})] = name
+        for done in as_completed(work):
+            name = work[done]
+            try:
+                made, seconds = done.result()
+                if folder is not None:
+                    made.write(folder / f"{name}.csv")
+            except Exception as error:
+                failed[name] = f"{type(error).__name__}: {error}"
+                print(f"{name}: failed, {failed[name]}", file=sys.stderr, flush=True)
+            else:
+                print(f"{name}: {len(made.rows)} rows, {seconds:.1f} CPU s", flush=True)
+    print(f"{len(names)} tables in {time.perf_counter() - start:.0f} s")
+    for name, reason in failed.items():
+        print(f"failed: {name}, {reason}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _command(name: str, mode: str) -> str:
+    return f"python -m benchmarks {name}{mode}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,181 @@
+"""The tables of the pages: they exist, the pages' figures are theirs, and measuring a few rows again gives the same."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[2]))
+
+from benchmarks import ROOT
+from benchmarks import __main__ as driver
+from benchmarks.tables import FOLDER, TABLES, Entry, MissingDataError, Table, disagreements, load, table, written
+
+BROKEN = load()
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+
+
+def shown(page: Path) -> list[tuple[str, str]]:
+    """Tables that a page shows: name and options."""
+    return re.findall(r"^ *```\{measured\} (\S+)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def options(text: str) -> dict[str, str]:
+    return dict(re.findall(r"^:(\w+): (.*)$", text, re.MULTILINE))
+
+
+def test_every_module_of_tables_can_be_imported():
+    assert not BROKEN
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_each_table_is_committed_and_shown_by_its_page(name):
+    Table.read(FOLDER / f"{name}.csv")
+    page = ROOT / "docs" / f"{TABLES[name].page}.md"
+    text = page.read_text(encoding="utf-8")
+    assert name in dict(shown(page)) or f"{{measured}}`{name} |" in text
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_each_table_and_figure_of_a_page_resolves(page):
+    for name, given in shown(page):
+        found, chosen = Table.read(FOLDER / f"{name}.csv"), options(given)
+        assert set(chosen) <= {"columns", "rows"}
+        for column in chosen.get("columns", "").split(",") if "columns" in chosen else ():
+            found.column(column.strip())
+        for row in chosen.get("rows", "").split(";") if "rows" in chosen else ():
+            found.matching(row.split(","))
+    for text in re.findall(r"\{measured\}`([^`]+)`", page.read_text(encoding="utf-8")):
+        name, keys, column = (part.strip() for part in text.split("|"))
+        Table.read(FOLDER / f"{name}.csv").figure(keys.split(","), column)
+
+
+def test_each_file_is_of_a_table():
+    assert {path.stem for path in FOLDER.glob("*.csv")} <= set(TABLES)
+    assert {path.stem for path in FOLDER.glob("quick/*.csv")} == {n for n, e in TABLES.items() if e.own_quick}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_quick_rows_are_those_of_the_page(name):
+    entry = TABLES[name]
+    try:
+        made = Table.of(entry, entry.measure(True))
+    except MissingDataError as error:
+        pytest.skip(str(error))
+    if not entry.timing:
+        assert not disagreements(entry, made, Table.read(entry.committed()))
+
+
+ROWS = [
+    {"camera": "Bayer", "angle [deg]": 8.0, "rms error [px]": 0.0122, "bias [px]": 0.0004, "lost": 3},
+    {"camera": "3-CCD", "angle [deg]": 8.0, "rms error [px]": 0.01, "bias [px]": float("nan"), "lost": 0},
+]
+ENTRY = Entry("sphere", "page", 1, lambda quick: iter(ROWS), keys=2, scatter={"bias [px]": "rms error [px]"})
+
+
+def changed(**figures: object) -> list[str]:
+    rows = [ROWS[0] | {ROWS_NAMES[name]: value for name, value in figures.items()}]
+    return disagreements(ENTRY, Table.of(ENTRY, rows), Table.of(ENTRY, ROWS))
+
+
+ROWS_NAMES = {"rms": "rms error [px]", "bias": "bias [px]", "lost": "lost", "angle": "angle [deg]"}
+
+
+def test_a_figure_counts_as_the_same_within_a_factor_and_noise_within_its_scatter():
+    assert not changed(rms=0.0122 * 1.49, bias=-0.0170, lost=4)
+    assert len(changed(rms=0.0122 * 1.51)) == len(changed(rms=0.0081)) == len(changed(rms=-0.0122)) == 1
+    assert len(changed(bias=0.02)) == len(changed(lost=0)) == len(changed(rms=float("nan"))) == 1
+    with pytest.raises(ValueError, match="no row 'Bayer, 4'; rows are: Bayer, 8; 3-CCD, 8"):
+        changed(angle=4.0)
+
+
+def test_what_is_written_is_read(tmp_path):
+    made = Table.of(ENTRY, ROWS, {"commit": "abc"})
+    made.write(tmp_path / "sphere.csv")
+    found = Table.read(tmp_path / "sphere.csv")
+    assert (found.columns, found.rows, found.keys, found.header["commit"]) == (made.columns, made.rows, 2, "abc")
+    assert found.figure(["Bayer", "8"], "rms error [px]") == "0.0122"
+    assert found.figure(["3-CCD"], "bias [px]") == "nan"
+    assert [path.name for path in tmp_path.iterdir()] == ["sphere.csv"]
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda t, f: Table.read(f / "cube.csv"), "no table 'cube' in .*; tables are: sphere"),
+        (lambda t, f: t.column("rms"), "no column 'rms'; columns are: camera, angle"),
+        (lambda t, f: t.matching(["Foveon"]), "no row 'Foveon'; rows are: Bayer, 8; 3-CCD, 8"),
+        (lambda t, f: Table.of(ENTRY, ROWS * 2), "two rows of the same keys"),
+        (lambda t, f: Table.of(ENTRY, [ROWS[0], {"camera": "x"}]), "a row has"),
+        (lambda t, f: Table.of(ENTRY, []), "no rows"),
+        (lambda t, f: Table.of(ENTRY, [{"camera": "a, b"}]), "no comma"),
+        (lambda t, f: Table.of(ENTRY, [{"camera": None}]), "not None of type NoneType"),
+        (lambda t, f: table(next(iter(TABLES)), page="x", cost=1)(ENTRY.measure), "two tables named"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, ask, message):
+    made = Table.of(ENTRY, ROWS)
+    made.write(tmp_path / "sphere.csv")
+    with pytest.raises(ValueError, match=message):
+        ask(made, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.012249, "0.0122"),
+        (-0.0219961, "-0.0220"),
+        (9.999, "10.0"),
+        (1.0, "1.00"),
+        (123456.0, "123000"),
+        (float("nan"), "nan"),
+        (0.0, "0"),
+        (3, "3"),
+    ],
+)
+def test_three_digits(value, text):
+    assert written(value) == text
+
+
+def run(monkeypatch, *arguments: str) -> int:
+    """Status of the driver, whose two tables are a good one and one that fails."""
+
+    def made(name: str, quick: bool, header: dict[str, str]) -> tuple[Table, float]:
+        if name == "broken":
+            raise RuntimeError("no camera")
+        return Table.of(ENTRY, ROWS, header), 0.1
+
+    monkeypatch.setattr(sys, "argv", ["benchmarks", *arguments])
+    monkeypatch.setattr(driver, "TABLES", {"sphere": ENTRY, "broken": replace(ENTRY, name="broken")})
+    monkeypatch.setattr(driver, "isolated", made)
+    monkeypatch.setattr(driver, "load", dict)
+    return driver.main()
+
+
+def test_a_table_that_fails_does_not_stop_the_others(monkeypatch, tmp_path, capsys):
+    assert run(monkeypatch, "--out", str(tmp_path)) == 1
+    assert "broken: failed, RuntimeError: no camera" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["sphere.csv"]
+    header = Table.read(tmp_path / "sphere.csv").header
+    assert {"commit", "date", "machine", "versions", "command"} <= set(header)
+    assert header["command"] == "python -m benchmarks sphere"
+    assert run(monkeypatch, "sphere", "--quick") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("cube",), "tables are: broken, sphere; given was cube"),
+        (("--processes", "0"), "--processes is a whole number from 1, not 0"),
+        (("--out", __file__), "--out is a folder"),
+    ],
+)
+def test_what_the_driver_cannot_do_is_said_in_one_line(monkeypatch, capsys, arguments, message):
+    assert run(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
