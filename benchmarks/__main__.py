@@ -28,8 +28,8 @@ ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "M
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rgbmidic")
 
 
-def provenance(command: str) -> dict[str, str]:
-    """Where figures come from: commit, date, machine, versions and the command that makes them."""
+def provenance() -> dict[str, str]:
+    """Where figures come from: commit, date, machine and versions."""
 
     def git(*arguments: str) -> str:
         done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -47,7 +47,6 @@ def provenance(command: str) -> dict[str, str]:
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": f"{os.cpu_count()} cores, {_processor()}",
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
-        "command": command,
     }
 
 
@@ -84,24 +83,42 @@ def main() -> int:
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         print(f"--out is a folder; {options.out} is a file", file=sys.stderr)
         return 2
-    names = sorted(options.names or TABLES, key=lambda name: -TABLES[name].cost)
+    names = sorted(set(options.names) or TABLES, key=lambda name: -TABLES[name].cost)
     if options.list:
         for name in sorted(names):
             print(f"{name:24} {TABLES[name].cost:6g} s  {TABLES[name].page:30} {TABLES[name].caption}")
         return 0
     os.environ |= dict.fromkeys(ONE_THREAD, "1")
-    folder = options.out or (None if options.quick else FOLDER)
     failed = {f"module {name}": reason for name, reason in broken.items()}
     start = time.perf_counter()
-    with TemporaryDirectory(prefix="rgbmidic-renders-") as renders, ThreadPoolExecutor(options.processes) as pool:
+    with TemporaryDirectory(prefix="rgbmidic-renders-") as renders:
         os.environ[RENDERS] = renders
-        mode = " --quick" if options.quick else ""
-        header = provenance("")
-        work = {}
+        # times come last, one at a time
+        for timing, processes in ((False, options.processes), (True, 1)):
+            some = [name for name in names if TABLES[name].timing == timing]
+            failed |= measure(some, options.quick, options.out, processes)
+    print(f"{len(names)} tables in {time.perf_counter() - start:.0f} s")
+    for name, reason in failed.items():
+        print(f"failed: {name}, {reason}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def measure(names: list[str], quick: bool, out: Path | None, processes: int) -> dict[str, str]:
+    """Measure tables, several at once, write them where they belong and return why those that failed did.
+
+    Where the quick rows are a smaller case, they are measured with the full ones and written to `quick` beside them.
+    """
+    header, work, failed = provenance(), {}, {}
+    place = out or (None if quick else FOLDER)
+    with ThreadPoolExecutor(processes) as pool:
         for name in names:
-            work[pool.submit(isolated, name, options.quick, header | {"command": _command(name, mode)})] = name
+            full = header | {"command": f"python -m benchmarks {name}{' --quick' if quick else ''}"}
+            work[pool.submit(isolated, name, quick, full)] = name, place
+            if TABLES[name].own_quick and not quick:
+                small = header | {"command": f"python -m benchmarks {name} --quick"}
+                work[pool.submit(isolated, name, True, small)] = name, (out or FOLDER) / "quick"
         for done in as_completed(work):
-            name = work[done]
+            name, folder = work[done]
             try:
                 made, seconds = done.result()
                 if folder is not None:
@@ -111,14 +128,7 @@ def main() -> int:
                 print(f"{name}: failed, {failed[name]}", file=sys.stderr, flush=True)
             else:
                 print(f"{name}: {len(made.rows)} rows, {seconds:.1f} CPU s", flush=True)
-    print(f"{len(names)} tables in {time.perf_counter() - start:.0f} s")
-    for name, reason in failed.items():
-        print(f"failed: {name}, {reason}", file=sys.stderr)
-    return 1 if failed else 0
-
-
-def _command(name: str, mode: str) -> str:
-    return f"python -m benchmarks {name}{mode}"
+    return failed
 
 
 if __name__ == "__main__":

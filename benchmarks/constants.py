@@ -29,7 +29,7 @@ CONSTANTS = {
     "nodes": ("_WORSE", "_MISFIT", "_ONE_SIDED", "_NOISY"),
     "solve": ("_STARTED", "_WANDERING", "_SWINGING", "_SETTLED", "_LOOKED_AT"),
     "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT"),
-    "light_weights": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING"),
+    "light_weights": ("_FREEDOM", "_LEAST_VARIANCE", "_ROUNDING", "_OWN"),
 }
 TENFOLD = ("_SMOOTHNESS", "_ROUNDING", "_ANCHOR")
 """Constants of `equations` and `assembly` of which only the order of magnitude counts."""
@@ -60,39 +60,35 @@ def scaled(value: Any, factor: float) -> Any:
     return max(1, round(value * factor)) if isinstance(value, int) else value * factor
 
 
-@table("constants", page="explanation/uncertainty", cost=60, keys=1, seed=3)
+@table("constants", page="explanation/uncertainty", cost=20, keys=2, seed=3)
 def constants(quick: bool) -> Iterator[Row]:
-    """Every constant of a part of the solve halved and doubled (tenfold where only its order counts), in three scenes:
-    root mean square change of the displacement over its stated uncertainty, largest change of the median stated
-    uncertainty, and of the fraction of nodes measured; the worst of the part's constants.
+    """Constants of the solve halved and doubled (tenfold where only the order counts), in three scenes: root mean
+    square change of the displacement over its stated uncertainty, change of the median stated uncertainty, and of the
+    fraction of nodes measured; the larger of the two, in the scene where it is largest.
     """
-    usual = scenes()
     rooms = {name: "weights" if name == "light_weights" else "correlation" for name in CONSTANTS}
     modules = {name: importlib.import_module(f"rgbmidic.{room}.{name}") for name, room in rooms.items()}
     stale = [(name, one) for name, names in CONSTANTS.items() for one in names if not hasattr(modules[name], one)]
     if stale:
         raise AttributeError(f"constants that are not there: {stale}")
-    for name, names in CONSTANTS.items():
-        if quick and name != "images":
-            continue
-        room, module = rooms[name], modules[name]
-        worst = (0.0, 0.0, 0.0)
-        for constant in names:
-            value = getattr(module, constant)
+    usual = scenes()
+    for name in ["images"] if quick else CONSTANTS:
+        for constant in CONSTANTS[name]:
+            found, value = [], getattr(modules[name], constant)
             for factor in (0.1, 10) if name in ("equations", "assembly") and constant in TENFOLD else (0.5, 2):
-                setattr(module, constant, scaled(value, factor))
+                setattr(modules[name], constant, scaled(value, factor))
                 try:
-                    found = [change(usual[scene], after) for scene, after in scenes().items()]
+                    found += [change(usual[scene], after) for scene, after in scenes().items()]
                 finally:
-                    setattr(module, constant, value)
-                worst = tuple(np.max([worst, *found], axis=0))
-        yield {
-            "part": f"{room}/{name}",
-            "constants": len(names),
-            "displacement/stated": float(worst[0]),
-            "stated [%]": 100 * float(worst[1]),
-            "nodes [%]": 100 * float(worst[2]),
-        }
+                    setattr(modules[name], constant, value)
+            displacement, std, nodes = np.max(found, axis=0)
+            yield {
+                "part": f"{rooms[name]}/{name}",
+                "constant": constant.strip("_").lower().replace("_", " "),
+                "displacement/stated": float(displacement),
+                "stated [%]": 100 * float(std),
+                "nodes [%]": 100 * float(nodes),
+            }
 
 
 def change(before: Solution, after: Solution) -> tuple[float, float, float]:

@@ -142,8 +142,8 @@ def overlaps(quick: bool) -> Iterator[Row]:
         }
 
 
-BANDS = ((0, 30), (30, 60), (60, 100), (100, 150))
-"""Distances from a crack (px)."""
+BANDS = ((1, 30), (30, 60), (60, 100), (100, 150))
+"""Distances from a crack (px); a node nearer than 1 px belongs to either side."""
 
 
 @table("crack", page="explanation/uncertainty", cost=10, keys=2, seed=1)
@@ -176,6 +176,9 @@ def crack(quick: bool) -> Iterator[Row]:
             }
 
 
+NAMES = {"none": "no prefilter", "binomial": "binomial", "gaussian": "gaussian"}
+
+
 @table("interpolation", page="explanation/uncertainty", cost=20, keys=1)
 def interpolation(quick: bool) -> Iterator[Row]:
     """Bias of the displacement by interpolation: largest mean error over rigid shifts by tenths of a pixel, no noise,
@@ -185,13 +188,13 @@ def interpolation(quick: bool) -> Iterator[Row]:
     for speckle in (4.0,) if quick else (2.0, 2.5, 3.0, 4.0, 6.0):
         texture = Texture.random(0, speckle)
         reference, largest = texture.image(shape), dict[str, float]()
-        for prefilter in ("none", "binomial", "gaussian"):
+        for prefilter in NAMES:
             for tenths in range(11):
                 motion = Affine(shift=(tenths / 10, 1 - tenths / 10))
                 found = correlate(reference, texture.image(shape, motion), region=region, prefilter=prefilter)
                 bias = np.abs((found.displacement - motion.shift).mean(axis=0)).max()
                 largest[prefilter] = max(largest.get(prefilter, 0.0), float(bias))
-        yield {"speckle [px]": speckle, **{f"{name} [px]": value for name, value in largest.items()}}
+        yield {"speckle [px]": speckle, **{f"{NAMES[name]} [px]": value for name, value in largest.items()}}
 
 
 def _unfitted(image: FloatArray, region: tuple[int, int, int, int], size: float) -> float:

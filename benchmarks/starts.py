@@ -133,8 +133,8 @@ def search(side: int, texture: FloatImage, size: int, lights: str, motion: Motio
 
 @table("initial_guess", page="explanation/how-it-works", cost=200, keys=2)
 def initial_guess(quick: bool) -> Iterator[Row]:
-    """Initial guesses found without a hint, in per cent of 9 random motions of each kind (3 speckles, 3 draws), by the
-    region's side and the lights; reflections are up to three times full white.
+    """Initial guesses within 1.5 px of the truth, without a hint, in per cent of 9 random motions of each kind (3
+    speckles, 3 draws), by the region's side and the lights; reflections are up to three times full white.
     """
     for side, names in ((64, ["30° + half its side"]),) if quick else ((64, list(MOTIONS)), (300, list(MOTIONS))):
         size = side + (max(side, 2 * ROOM) if side < 400 else ROOM)

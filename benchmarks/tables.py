@@ -92,8 +92,8 @@ def table(
     seed
         Seed of the first draw, as stated in the file.
     own_quick
-        The quick rows are a smaller case with a file of their own (`--quick --out docs/tables/quick`), not rows of the
-        full table.
+        The quick rows are a smaller case with a file of their own, docs/tables/quick/NAME.csv, not rows of the full
+        table.
     timing
         The figures depend on the machine: a test only sees that the table is made.
     scatter

@@ -5,8 +5,9 @@
     :rows: 3-CCD; Bayer, 8
     ```
 
-shows a table (or some of its columns, or the rows whose first cells are the ones named) with its caption, date and
-commit; {measured}`sphere | Bayer, 8 | rms error [px]` is one figure of it. An unknown table, row or column is an error.
+shows a table (or some of its columns, or the rows whose first cells are the ones named) with its caption (or another,
+`:caption:`), date and commit; {measured}`sphere | Bayer, 8 | rms error [px]` is one figure. An unknown table, row or
+column is an error.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class MeasuredTable(SphinxDirective):
     """The directive `measured`: a table of docs/tables."""
 
     required_arguments = 1
-    option_spec = {"columns": directives.unchanged_required, "rows": directives.unchanged_required}  # noqa: RUF012
+    option_spec = dict.fromkeys(("columns", "rows", "caption"), directives.unchanged_required)
 
     def run(self) -> list[nodes.Node]:
         """Docutils table with a caption."""
@@ -74,7 +75,7 @@ class MeasuredTable(SphinxDirective):
 
     def _title(self, table: Table) -> nodes.title:
         """Caption, and small where it comes from."""
-        parsed, messages = self.parse_inline(table.header.get("caption", "") + " ")
+        parsed, messages = self.parse_inline(self.options.get("caption", table.header.get("caption", "")) + " ")
         title = nodes.title("", "", *parsed, *messages)
         origin = f"(measured {table.header.get('date', '')} at commit {table.header.get('commit', '')} by "
         small = nodes.inline(classes=["small", "measured-origin"])

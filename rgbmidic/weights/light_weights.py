@@ -245,7 +245,7 @@ who found 4 to work well). With 2 or 8 lights under a reflection differ by 2e-3 
 uncertainty by 11 % (benchmarks/constants.py)."""
 _LEAST_VARIANCE = 0.1
 """Least variance of a light's residual that is believed, over the median of all. Chosen; with half or twice of it
-lights under a reflection do not change, those beside a gap by 8e-2 px at most, their uncertainty by 42 %
+lights under a reflection do not change, those beside a gap by half their uncertainty, that by 59 %
 (benchmarks/constants.py)."""
 _ROUNDING = 1e-6
 """Least variance of a residual, over that of the grey levels, where two images are the same. Chosen; with half or twice

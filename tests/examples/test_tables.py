@@ -44,7 +44,7 @@ def test_each_table_is_committed_and_shown_by_its_page(name):
 def test_each_table_and_figure_of_a_page_resolves(page):
     for name, given in shown(page):
         found, chosen = Table.read(FOLDER / f"{name}.csv"), options(given)
-        assert set(chosen) <= {"columns", "rows"}
+        assert set(chosen) <= {"columns", "rows", "caption"}
         for column in chosen.get("columns", "").split(",") if "columns" in chosen else ():
             found.column(column.strip())
         for row in chosen.get("rows", "").split(";") if "rows" in chosen else ():
@@ -150,7 +150,9 @@ def run(monkeypatch, *arguments: str) -> int:
         return Table.of(ENTRY, ROWS, header), 0.1
 
     monkeypatch.setattr(sys, "argv", ["benchmarks", *arguments])
-    monkeypatch.setattr(driver, "TABLES", {"sphere": ENTRY, "broken": replace(ENTRY, name="broken")})
+    monkeypatch.setattr(
+        driver, "TABLES", {"sphere": replace(ENTRY, own_quick=True), "broken": replace(ENTRY, name="broken")}
+    )
     monkeypatch.setattr(driver, "isolated", made)
     monkeypatch.setattr(driver, "load", dict)
     return driver.main()
@@ -159,10 +161,14 @@ def run(monkeypatch, *arguments: str) -> int:
 def test_a_table_that_fails_does_not_stop_the_others(monkeypatch, tmp_path, capsys):
     assert run(monkeypatch, "--out", str(tmp_path)) == 1
     assert "broken: failed, RuntimeError: no camera" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["sphere.csv"]
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.csv")) == [
+        "quick/sphere.csv",
+        "sphere.csv",
+    ]
     header = Table.read(tmp_path / "sphere.csv").header
     assert {"commit", "date", "machine", "versions", "command"} <= set(header)
     assert header["command"] == "python -m benchmarks sphere"
+    assert Table.read(tmp_path / "quick" / "sphere.csv").header["command"] == "python -m benchmarks sphere --quick"
     assert run(monkeypatch, "sphere", "--quick") == 0
 
 

@@ -10,7 +10,8 @@ from rgbmidic_calibration.crosstalk import estimate_crosstalk
 from rgbmidic_calibration.ratio import block_means
 
 SEEDS = 50
-RELATIVE_ERROR = 0.002
+RELATIVE_ERROR = 0.00039
+"""Of the matrix, in its norm: .00026."""
 
 
 def estimate(matrix, seed, **scene):

@@ -9,7 +9,8 @@ from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.registration import estimate_registration
 
-ACCURACY = 0.01
+ACCURACY = 0.006
+"""px: .0041."""
 LIGHTS = ("red", "green", "blue")
 
 

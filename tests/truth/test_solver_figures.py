@@ -14,27 +14,34 @@ from textures import Affine, Texture, noisy_pair
 
 from rgbmidic import NodeStatus, Region, Status, correlate
 
-RIGID_BIAS = 0.002
-"""|mean error| in px for rigid shifts of 0 to 1 px, no noise, 4 px speckle."""
-AFFINE_RMS = 0.003
-"""rms error in px for 1 % strain and 2 degrees of rotation, no noise."""
-STRAIN = 1e-4
-"""rms error of the strain at the nodes, no noise."""
-ROOT_OF_LIGHTS = 0.05
-"""Relative deviation of the noise under k lights from 1/sqrt(k)."""
-PREDICTED_NOISE = 0.10
-"""Relative deviation of the predicted from the observed noise."""
-LARGE_MOTION_RMS = 0.003
-"""rms error in px after a motion of 40 px without any hint."""
-GAP_RMS = 0.004
-"""rms error in px of the nodes beside a hole, invalid pixels or an untextured part."""
-LIGHT_SHIFT = 0.001
-"""Error in px of the shift between two lights found by the rigid functions."""
-SEEN_RMS = 0.01
-"""rms error in px of nodes well away from a part that does not match."""
+RIGID_BIAS = {"none": 0.0012, "binomial": 0.0006, "gaussian": 0.0004}
+"""|mean error| in px for rigid shifts of 0 to 1 px, no noise, 4 px speckle: .00085, .00043, .00028 (table
+`interpolation` of docs/explanation/uncertainty.md)."""
+AFFINE_RMS = 9.5e-4
+"""rms error in px for 1 % strain and 2 degrees of rotation, no noise: up to 6.5e-4."""
+STRAIN = 4e-5
+"""rms error of the strain at the nodes, no noise: up to 2.8e-5."""
+STRAIN_BIAS = 2.7e-6
+"""Mean error of the strain at the nodes, no noise: up to 1.8e-6."""
+NOISE = 0.02
+"""Standard deviation in px of u and v of one light, noise of 8 % of the contrast: .0160 with the default prefilter."""
+ROOT_OF_LIGHTS = 0.015
+"""Relative deviation of the noise under k lights from 1/sqrt(k): .010."""
+PREDICTED_NOISE = 0.06
+"""Relative deviation of the predicted from the observed noise: .042."""
+LARGE_MOTION_RMS = 4.5e-4
+"""rms error in px after a motion of 40 px without any hint: 3.1e-4."""
+GAP_RMS = 5e-4
+"""rms error in px of the nodes beside a hole, invalid pixels or an untextured part: 3.4e-4."""
+LIGHT_SHIFT = 8.5e-5
+"""Error in px of the shift between two lights found by the rigid functions: 5.8e-5."""
+BLANK_RMS = {0.0: 5.5e-4, 2.0: 0.013}
+"""rms error in px of nodes away from a part without texture, by noise in grey levels: 3.8e-4, .0087."""
+SEEN_RMS = 0.02
+"""rms error in px of nodes well away from a part that does not match, noise of 2 grey levels: .014."""
 
-CURVED_RMS = (0.002, 0.005)
-"""rms error in px at the nodes of a curved field, no noise: inside, and with the edges."""
+CURVED_RMS = (0.0012, 0.0021)
+"""rms error in px at the nodes of a curved field, no noise: inside .0008, with the edges .0014."""
 
 SHAPE = (200, 200)
 REGION = (20, 20, 180, 180)
@@ -68,7 +75,7 @@ def test_rigid_shifts_are_not_biased(prefilter):
         found = correlate(reference_image(), texture().image(SHAPE, motion), region=REGION, prefilter=prefilter)
         assert found.status is Status.CONVERGED
         assert found.measured.all()
-        assert np.abs(error(found, motion).mean(axis=0)).max() <= RIGID_BIAS
+        assert np.abs(error(found, motion).mean(axis=0)).max() <= RIGID_BIAS[prefilter]
 
 
 @pytest.mark.parametrize("prefilter", PREFILTERS)
@@ -86,7 +93,7 @@ def test_the_strain_of_a_stretch_is_that_stretch_and_of_a_rigid_motion_none():
         motion = Affine(shift=(0.4, 0.3), gradient=((1 + stretch, 0.002), (0.0, 1 - stretch / 3)))
         found = correlate(reference_image(), texture().image(SHAPE, motion), region=REGION)
         truth = np.broadcast_to((stretch, -stretch / 3, 0.001), found.strain.shape)
-        assert np.abs((found.strain - truth).mean(axis=0)).max() <= STRAIN / 10
+        assert np.abs((found.strain - truth).mean(axis=0)).max() <= STRAIN_BIAS
         assert rms(found.strain - truth) <= STRAIN
 
 
@@ -120,6 +127,7 @@ def noise(lights: int, prefilter: str = "binomial", *, statistics: bool = True) 
 @pytest.mark.parametrize("statistics", [False, True])
 def test_the_noise_falls_as_the_root_of_the_number_of_lights(statistics):
     alone = noise(1, statistics=statistics)[0]
+    assert alone <= NOISE
     assert noise(3, statistics=statistics)[0] * np.sqrt(3) == pytest.approx(alone, rel=ROOT_OF_LIGHTS)
 
 
@@ -259,7 +267,7 @@ def test_nodes_without_texture_are_flagged_and_the_others_measured(sigma):
     assert (found.node_status[blank] != NodeStatus.MEASURED).all()
     assert np.isnan(found.displacement[blank]).all()
     assert found.measured[found.nodes[:, 0] > 100 + 27].all()
-    assert rms(error(found)[found.nodes[:, 0] > 110]) <= (SEEN_RMS if sigma == 0 else 0.02)
+    assert rms(error(found)[found.nodes[:, 0] > 110]) <= BLANK_RMS[sigma]
 
 
 @pytest.mark.parametrize("inside", [left_half, square])
@@ -274,7 +282,7 @@ def test_a_part_that_does_not_match_is_flagged_and_spoils_nothing_else(inside):
     assert np.isnan(found.displacement[well_inside]).all()
     outside = away(found, inside, 28)
     assert found.measured[outside].all()
-    assert rms(error(found)[outside]) <= 2 * SEEN_RMS
+    assert rms(error(found)[outside]) <= SEEN_RMS
     assert np.nanmax(np.abs(error(found))) <= 0.2
 
 

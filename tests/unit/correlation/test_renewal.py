@@ -96,10 +96,10 @@ def test_totals_are_displacement_and_strain_on_the_first_frame():
     motions = [Affine.strain_and_rotation(0.01 * k, 2.0 * k, (2.3 * k, -1.7 * k)) for k in range(4)]
     solutions, _ = chained([texture.image(SHAPE, motion) for motion in motions], always)
     for solution, motion in zip(solutions, motions[1:], strict=True):
-        assert rms(error(solution, motion)) < 0.006
+        assert rms(error(solution, motion)) < 0.0013
         gradient = np.array(motion.gradient) - np.eye(2)
-        np.testing.assert_allclose(solution.strain[:, 0], gradient[0, 0], atol=1e-3)
-        np.testing.assert_allclose(solution.strain[:, 1], gradient[1, 1], atol=1e-3)
+        np.testing.assert_allclose(solution.strain[:, 0], gradient[0, 0], atol=1.6e-4)
+        np.testing.assert_allclose(solution.strain[:, 1], gradient[1, 1], atol=2.3e-4)
     np.testing.assert_array_equal(solutions[-1].nodes, solutions[0].nodes)
 
 
@@ -188,7 +188,7 @@ def test_a_node_that_the_new_reference_did_not_measure_stays_unmeasured_on_it():
     assert (solutions[1].node_status[lost] == NodeStatus.NOT_SEEN).all()
     assert solutions[1].measured[~lost].all()
     np.testing.assert_array_equal(np.isnan(solutions[1].displacement[:, 0]), lost)
-    assert rms(error(solutions[1], motions[2])) < 0.02
+    assert rms(error(solutions[1], motions[2])) < 4.4e-4
 
 
 def test_a_renewal_from_stored_numbers_is_the_same_to_the_bit():
@@ -236,7 +236,7 @@ def test_both_sides_of_an_open_crack_are_followed_on_a_renewed_reference():
     half = 8.0 * np.clip(1 - mesh.nodes[:, 0] / 110, 0, None) / 2
     expected = np.where(mesh.places[:, 1] < middle, -half, half)
     assert solution.measured.all()
-    assert rms(solution.displacement[:, 1] - expected) < 0.06
+    assert rms(solution.displacement[:, 1] - expected) < 0.042
 
 
 def test_a_frame_in_which_nothing_is_measured_is_no_reference():
@@ -264,5 +264,5 @@ def test_a_light_that_moves_for_itself_calls_for_no_reference():
     solution = reference_update.track(
         deformed, start, replace(OPTIONS, rigid="translation", prefilter="none"), Statistics()
     )
-    np.testing.assert_allclose(solution.rigid[1], (2.5, 0), atol=0.01)
+    np.testing.assert_allclose(solution.rigid[1], (2.5, 0), atol=0.0013)
     assert np.nanmin(reference_update.match(deformed, solution)) > 0.99

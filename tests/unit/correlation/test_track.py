@@ -39,7 +39,7 @@ def test_a_jump_of_100_px_is_found(texture, reference):
     last = Start(displacement=np.full((len(reference.mesh.nodes), 2), (60.0, 0.0)))
     found = track(reference, moved(texture, Affine(shift=(160.0, 0.0))), last, OPTIONS, Statistics())
     assert found.status is Status.CONVERGED
-    assert np.abs(found.displacement - (160.0, 0.0)).max() < 0.01
+    assert np.abs(found.displacement - (160.0, 0.0)).max() < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_guess_some_pixels_away_costs_hardly_more_iterations_than_a_near_one(t
     assert found.status is Status.CONVERGED
     assert found.measured.all()
     assert found.iterations <= 6  # 8 to 22 where elements come back row by row
-    assert np.abs(found.displacement - motion.displacement(nodes, SHAPE)).max() < 0.01
+    assert np.abs(found.displacement - motion.displacement(nodes, SHAPE)).max() < 0.0068
 
 
 def test_elements_across_a_jump_are_torn_and_a_stretched_sheet_is_not(reference):
@@ -97,7 +97,7 @@ def test_a_fragment_that_has_turned_is_followed_as_the_specimen_jumps(texture, t
     assert found.iterations <= 16
     for part in (inner, outer):
         assert found.measured[part].mean() > 0.9
-        assert np.nanmax(np.abs(found.displacement - motion(turn, jump))[part]) < 0.3
+        assert np.nanmax(np.abs(found.displacement - motion(turn, jump))[part]) < 0.15
 
 
 def test_a_specimen_that_leaves_is_found_again_and_a_restored_start_gives_the_same_bits(texture, reference):
@@ -109,7 +109,7 @@ def test_a_specimen_that_leaves_is_found_again_and_a_restored_start_gives_the_sa
         statuses.append(solution.status)
     assert statuses[2] is Status.FAILED
     assert statuses[3] is Status.CONVERGED
-    assert np.abs(solution.displacement - (60.0, 0.0)).max() < 0.01
+    assert np.abs(solution.displacement - (60.0, 0.0)).max() < 1e-6
     again = track(reference, moved(texture, Affine(shift=(60.0, 0.0))), restored, OPTIONS, Statistics())
     np.testing.assert_array_equal(again.displacement, solution.displacement)
 
