@@ -127,7 +127,7 @@ def measure(names: list[str], quick: bool, out: Path | None, processes: int) -> 
                 failed[name] = f"{type(error).__name__}: {error}"
                 print(f"{name}: failed, {failed[name]}", file=sys.stderr, flush=True)
             else:
-                print(f"{name}: {len(made.rows)} rows, {seconds:.1f} CPU s", flush=True)
+                print(f"{made.header['command']}: {len(made.rows)} rows, {seconds:.1f} CPU s", flush=True)
     return failed
 
 
