@@ -1,8 +1,9 @@
 """Measure the tables of the pages: `python -m benchmarks [NAME ...] [--quick] [--list] [--processes N] [--out FOLDER]`.
 
-Each table is measured in a process of its own with one thread and written as a whole to docs/tables/NAME.csv, with the
-commit, date, seed, machine and versions it was measured with. `--quick` measures a few rows and writes nothing unless
-`--out` names a folder. A table that fails does not stop the others; the exit status is 1 then.
+Each table is measured in a process of its own with one thread and written as a whole to docs/tables/NAME.csv, with
+the commit, date, seed, machine and versions it was measured with, and into README.md where that shows it. `--quick`
+measures a few rows and writes nothing unless `--out` names a folder. A table that fails does not stop the others; the
+exit status is 1 then.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from . import ROOT
-from .tables import FOLDER, TABLES, Table, load, measured
+from .tables import FOLDER, README, TABLES, Table, load, measured
 from .uncertainty_scenes import RENDERS
 
 ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -123,6 +124,8 @@ def measure(names: list[str], quick: bool, out: Path | None, processes: int) -> 
                 made, seconds = done.result()
                 if folder is not None:
                     made.write(folder / f"{name}.csv")
+                if folder == FOLDER:
+                    README.write_text(made.shown_in(README.read_text(encoding="utf-8")), encoding="utf-8")
             except Exception as error:
                 failed[name] = f"{type(error).__name__}: {error}"
                 print(f"{name}: failed, {failed[name]}", file=sys.stderr, flush=True)

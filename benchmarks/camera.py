@@ -1,33 +1,27 @@
 """Lens and plane: coverage of the stated uncertainty over draws, the strain that is left, and OpenCV's own pictures.
 
-    python benchmarks/camera.py [--draws 100] [--seed 0] [--pictures FOLDER]
+    python -m benchmarks.camera FOLDER
 
 Every draw is another virtual camera: distortion of -2 to 2 % in the frame's corners, a plane tilted by 0 to 5 degrees
-about any axis, 20 views of a chessboard under up to 25 degrees, corners with noise of .01 px. A line for every
-parameter and length: fraction of the draws whose error is within 1.96 stated standard uncertainties, and
-rms(error / stated). A true 95 % interval gives 90.6 to 99.4 % of 100 draws (2 sigma of the binomial law), and all lines
-together, were they independent, 94 to 96 %. A distortion term that the F test did not take up states no uncertainty
-and does not count; one that it takes up by chance (k2, k3, p1, p2 are 0 here) is off by more than it states, because
-only then is it taken up. Then the largest error of both principal strains on the plane, of a specimen that only moves
-by ten pixels, turns by 2 degrees or stretches by 1 %: in pixels with one scale, and by lens and plane, without noise
-of the images.
+about any axis, 20 views of a chessboard under up to 25 degrees, corners with noise of .01 px. A true 95 % interval has
+90.6 to 99.4 % of 100 draws (2 sigma of the binomial law), and all lines together, were they independent, 94 to 96 %. A
+distortion term that the F test did not take up states no uncertainty and does not count.
 
-`--pictures` is a folder with left01.jpg to left14.jpg of OpenCV (samples/data: 13 views of a chessboard of 9 x 6
-corners, 25 mm): residual and parameters by the corners of OpenCV's own sample (`findChessboardCorners`, `cornerSubPix`
-with 11 px), by what `find_view` finds, and as published in samples/data/left_intrinsics.yml; the same of right*.jpg.
+FOLDER holds left01.jpg to left14.jpg of OpenCV (samples/data: 13 views of a chessboard of 9 x 6 corners, 25 mm).
+Printed are residual and parameters by the corners of OpenCV's own sample (`findChessboardCorners`, `cornerSubPix` with
+11 px), by what `find_view` finds, and as published in samples/data/left_intrinsics.yml; the same of right*.jpg.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
+from collections.abc import Iterator
+from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-
 from target_scene import LENS, SHAPE, imaged, on_plane, pose, random_views, view_of
 
 from rgbmidic.fields import CameraCalibration
@@ -35,6 +29,8 @@ from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.target import Target, View, find_view
+
+from .tables import table
 
 NOISE, VIEWS = 0.01, 20
 PUBLISHED = {"left": (535.916, 342.283, 235.571, -0.26637, -0.03859, 0.00178, -0.00028, 0.23839)}
@@ -119,30 +115,46 @@ def pictures(folder: Path) -> None:
         print("rms of every picture:", *(f"{np.sqrt((part**2).mean()):.3f}" for part in fit.residuals))
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--draws", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--pictures", type=Path)
-    options = parser.parse_args()
-    if options.pictures is not None:
-        pictures(options.pictures)
-    if not options.draws:
-        return
-    found = [draw(random) for random in np.random.default_rng(options.seed).spawn(options.draws)]
-    names = dict.fromkeys(name for one, _ in found for name in one)
-    off = {name: np.array([one[name] for one, _ in found if name in one]) for name in names}
-    everything = np.concatenate(list(off.values()))
-    print(f"{'parameter':18s} draws  within  rms(error / stated)")
-    for name, values in {**off, "all together": everything}.items():
-        print(f"{name:18s} {len(values):5d}  {(np.abs(values) < 1.96).mean():6.3f}  {np.sqrt((values**2).mean()):.3f}")
-    print("specimen, largest strain error: median and largest of the draws, in pixels, then by lens and plane")
+@cache
+def draws(count: int) -> tuple[dict[str, list[float]], list[dict[str, tuple[float, float]]]]:
+    """Errors over stated uncertainty by parameter, and strains of each draw."""
+    found = [draw(random) for random in np.random.default_rng(0).spawn(count)]
+    off: dict[str, list[float]] = {}
+    for one, _ in found:
+        for name, value in one.items():
+            off.setdefault(name, []).append(float(value))
+    return off, [strains for _, strains in found]
+
+
+QUICK, FULL = 6, 100
+"""Draws of the tables."""
+
+
+@table("camera_coverage", page="../calibration/README", cost=13, own_quick=True)
+def coverage(quick: bool) -> Iterator[dict[str, object]]:
+    """100 virtual cameras: draws whose error is within 1.96 stated standard uncertainties, and rms(error / stated)."""
+    off = draws(QUICK if quick else FULL)[0]
+    some = ("f", "cx", "cy", "k1", "tilt", "length along x", "length along y", "diagonal")
+    for name, values in {**{name: off[name] for name in some}, "all": [*chain(*off.values())]}.items():
+        within = 100 * float((np.abs(values) < 1.96).mean())
+        yield {"parameter": name, "within 95 % [%]": within, "error/stated": float(np.sqrt(np.mean(np.square(values))))}
+
+
+@table("camera_strain", page="../calibration/README", cost=13, own_quick=True)
+def strain_left(quick: bool) -> Iterator[dict[str, object]]:
+    """Largest strain error (1e-6) over the field of a specimen that only moves, turns or stretches, images without
+    noise: median and largest of the draws, in pixels with one scale and by lens and plane."""
     for name in MOTIONS:
-        values = np.array([strains[name] for _, strains in found])
+        values = 1e6 * np.array([strains[name] for strains in draws(QUICK if quick else FULL)[1]])
         middle, largest = np.median(values, axis=0), values.max(axis=0)
-        print(f"{name:18s}" + "".join(f"    {a:.1e} {b:.1e}" for a, b in zip(middle, largest, strict=True)))
+        yield {
+            "specimen": name,
+            "one scale [1e-6]": float(middle[0]),
+            "its largest [1e-6]": float(largest[0]),
+            "lens and plane [1e-6]": float(middle[1]),
+            "largest by lens and plane [1e-6]": float(largest[1]),
+        }
 
 
 if __name__ == "__main__":
-    main()
+    pictures(Path(sys.argv[1]))

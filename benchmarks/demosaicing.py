@@ -1,42 +1,32 @@
-"""What each demosaicing method costs in displacement error, with and without reflections, on scenes with exact truth.
+"""What each way from a raw frame to the lights costs in displacement error, on scenes with exact truth.
 
-    python benchmarks/demosaicing.py [--study main] [--seeds 11 12 13] [--wrinkles 0.025 0.05 0.1] [--plates-only]
-    python benchmarks/demosaicing.py --study shifts --wrinkles 0.05 --seeds 31 --only "0.25 px" "0.5 px"
-    python benchmarks/demosaicing.py --study phases|blur|aberration|coloured
-    python benchmarks/demosaicing.py --study speed
-
-Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, crosstalk 10 to 16 % between neighbours,
-specular peak 1.5 times an ideal white. Three lights are solved together with the true crosstalk, TRI3 of 25 px started
-within half a pixel of the truth; errors over the pixels of the field without its border element. Wrinkles of the paint
-25 um apart give a smooth reflection, 50 um one that sparkles at the scale of the pixel, 100 um one with coarser spots.
-Each is traced with as many rays as its reflection needs.
+Scenes of `rgbmidic.lab.virtual`: RGGB, 12 bit, 4 e-/DN, read noise 12 e-, specular peak 1.5 times an ideal white, a
+speckle of 4.2 px. Three lights are solved together with the true crosstalk, TRI3 of 25 px started near the
+truth; errors over the pixels of the field without its border element. Wrinkles of the paint 25 um apart give a smooth
+reflection, 100 um one that sparkles in spots. Each is traced with as many rays as its reflection needs.
 
 The 3-CCD camera is the ideal: all three colours at every pixel, the same solve. One sample instead of three costs a
-factor of sqrt(3) in noise; what is above that is the demosaicing's doing, and each cell ends with the ratio to it. The
-studies vary one thing at a time: the
-shift, the Bayer phase, the lens blur, the lens's lateral colour aberration (calibrated, and undone after the
-separation), and a specimen whose colours show partly or wholly different textures.
+factor of sqrt(3) in noise; what is above that is the demosaicing's doing.
 """
 
 from __future__ import annotations
 
-import argparse
+import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cache
-from itertools import product
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from rgbmidic._kernels.threads import threads
-from rgbmidic.fields import at_pixels
-from rgbmidic.illumination.crosstalk import align, unmix
-from rgbmidic.illumination.images import IlluminationImages, Registration, normalise
-from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
-from rgbmidic.illumination.separation import DEMOSAICERS, separate
+from rgbmidic import read_frame
+from rgbmidic.fields import at_nodes, at_pixels
+from rgbmidic.illumination.crosstalk import Crosstalk, unmix
+from rgbmidic.illumination.images import IlluminationImages, normalise
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel, linearise
+from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import correlate
@@ -44,131 +34,55 @@ from rgbmidic.scene.camera import PIXEL
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights.threshold import threshold_weights
 
+from .tables import MissingDataError, table
+
 TILT = (float(-np.degrees(0.15)), 0.0)
 """The plate leans towards green's lamp."""
 MASKED_ABOVE = 0.4
-"""Blurred grey level, as a share of the full scale, above which the paper's masks exclude a light."""
-ABERRATION = (-2e-4, 0.0, 3e-4)
+"""Blurred grey level, as a fraction of the full scale, above which binary masks exclude a light."""
+MEASURED = np.array([[1, 0.15, 0.05], [0.12, 1, 0.33], [0.02, 0.28, 1]])
+"""A crosstalk with as much between green and blue as measured cameras have under LEDs of 630, 525 and 465 nm."""
+MARGIN = 25
+"""Border (px) of the field whose errors do not count: an element."""
+
+
+def shifted(pixels: float) -> State:
+    """A plate that only shifts, by this along x and by .3 of it along y."""
+    return strained_plate(shift_px=(pixels, 0.3 * pixels), strain=0)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A pair of states. `coloured` is the share of each light's contrast that no other light shows."""
+    """A body in two states. `coloured` is the fraction of each light's contrast that no other light shows."""
 
     name: str
-    scene: Callable[..., Scene]
+    scene: Scene
     state: State
-    size: int
-    is_plate: bool = True
-    options: dict[str, Any] = field(default_factory=dict)
     coloured: float = 0.0
 
-    def called(self, name: str, **changes: Any) -> Case:
-        """The same with other options of the scene (or `coloured`) and something added to its name."""
-        coloured = changes.pop("coloured", self.coloured)
-        return replace(self, name=f"{self.name}, {name}", options=self.options | changes, coloured=coloured)
-
-
-def _glaring(**options: Any) -> Scene:
-    return plate_scene(gloss=1.5, glare="green", tilt_deg=TILT, **options)
-
-
-def _mat(**options: Any) -> Scene:
-    return plate_scene(tilt_deg=TILT, **options)
-
-
-GLARING = Case("plate in green's reflection", _glaring, strained_plate(), 512)
-MAT = Case("plate without reflection", _mat, strained_plate(), 512)
-SPHERES = [Case(f"sphere {a:g}°", sphere_scene, turned(a), 640, is_plate=False) for a in (0.33, 1, 2, 4, 8)]
-BASE = [GLARING, SPHERES[1], SPHERES[3], MAT]
-SHIFTS = [
-    replace(
-        case, name=f"{case.name}, shift {n / 8:g} px", state=strained_plate(shift_px=(n / 8, 0.3 * n / 8), strain=0)
-    )
-    for case in (GLARING, MAT)
-    for n in range(9)
-]
-STUDIES = {
-    "shifts": SHIFTS,
-    "main": [GLARING, *SPHERES, MAT],
-    "phases": [case.called(cfa, cfa=cfa) for case in BASE for cfa in ("RGGB", "BGGR", "GRBG", "GBRG")],
-    "blur": [case.called(f"blur {blur:g}", lens_blur=blur) for case in BASE for blur in (0.3, 0.45, 0.6, 0.8)],
-    "aberration": [case.called("aberration", aberration=ABERRATION) for case in [GLARING, *SPHERES, MAT]],
-    "coloured": [
-        case.called(f"{share:.0%} coloured", coloured=share) for case in (MAT, GLARING) for share in (0.1, 0.3, 0.6, 1)
-    ],
-}
-
-
-@dataclass(frozen=True)
-class Contender:
-    """A way from the raw frame to the solve; a method that rgbmidic does not have is one of colour-demosaicing."""
-
-    name: str
-    method: str
-    prefilter: str = "binomial"
-    normalise: float | None = 10.0
-    masks: bool = False
-    one_image: bool = False
-
-    def lights(self, frame: Any, scene: Scene) -> IlluminationImages:
-        """Illumination images of a recorded frame."""
-        crosstalk = scene.camera.true_crosstalk(scene.lights)
-        linear = linearise(frame, scene.camera.noise)
-        if isinstance(linear, LinearChannels):
-            return unmix(linear, crosstalk)
-        assert isinstance(linear, LinearMosaic)
-        if self.method in DEMOSAICERS:
-            return separate(linear, crosstalk, self.method)
-        import colour_demosaicing
-
-        demosaicer = getattr(colour_demosaicing, f"demosaicing_CFA_Bayer_{self.method}")
-        values = np.moveaxis(demosaicer(linear.values, linear.cfa), -1, 0)
-        valid = np.broadcast_to(~linear.saturated, values.shape)
-        return unmix(LinearChannels(values=values, valid=valid, full_scale=linear.full_scale), crosstalk)
-
-
-CONTENDERS = [
-    Contender("Malvar + masks, no prefilter (the paper)", "malvar", prefilter="none", normalise=None, masks=True),
-    Contender("bilinear", "bilinear"),
-    Contender("Malvar", "malvar"),
-    Contender("Menon", "Menon2007"),
-    Contender("normalised mosaic", "normalised"),
-    Contender("mean of the lights, as one image", "reflection-aware", normalise=None, one_image=True),
-    Contender("reflection-aware (default)", "reflection-aware"),
-    Contender("ideal 3-CCD", "3-CCD"),
-]
-
-
-@dataclass(frozen=True)
-class Error:
-    """Displacement error over the field, px, and of the lights' images, as a share of their mean."""
-
-    bias: tuple[float, float]
-    scatter: float
-    rms: float
-    unmeasured: float
-    image: float
-
     @classmethod
-    def mean(cls, errors: list[Error]) -> Error:
-        """Over several seeds: biases averaged, the rest as root mean square."""
-        x, y = np.mean([error.bias for error in errors], axis=0)
-        scatter, rms, image = np.sqrt(np.mean([(e.scatter**2, e.rms**2, e.image**2) for e in errors], axis=0))
-        missing = max(e.unmeasured for e in errors)
-        return cls((float(x), float(y)), float(scatter), float(rms), missing, float(image))
+    def of(cls, name: str, *, wrinkles: float = 0.025, speckle: float = 4.2, seed: int = 41, **options: Any) -> Case:
+        """A plate ("reflection" or "mat") that shifts, or a sphere that turns, by the last word of the name."""
+        amount = float(name.split()[-2])
+        given: dict[str, Any] = {"seed": seed, "droplet": speckle * PIXEL, **options}
+        if name.startswith("sphere"):
+            scene = sphere_scene(**{"size": 384} | given)
+        elif name.startswith("mat"):
+            scene = plate_scene(**{"size": 256, "tilt_deg": TILT} | given)
+        else:
+            scene = plate_scene(**{"size": 320, "gloss": 1.5, "glare": "green", "tilt_deg": TILT} | given)
+        return cls(name, painted(scene, wrinkles), turned(amount) if name.startswith("sphere") else shifted(amount))
 
-    def size(self, case: Case) -> float:
-        """What a case is judged by: scatter for plates, rms for spheres."""
-        return self.scatter if case.is_plate else self.rms
+    @property
+    def is_plate(self) -> bool:
+        """Whether it is judged by its scatter, and not by its rms error."""
+        return not self.name.startswith("sphere")
 
-    def text(self, case: Case, ideal: float) -> str:
-        """As in the table: bias x/y, scatter for plates, rms for spheres; over the ideal."""
-        flag = "" if self.unmeasured < 0.001 else f" ({self.unmeasured:.1%} not measured)"
-        if case.coloured:
-            flag += f"; image {self.image:.1%}"
-        bias = f"{self.bias[0]:+.4f}/{self.bias[1]:+.4f}, " if case.is_plate else ""
-        return f"{bias}{self.size(case):.4f}, {self.size(case) / ideal:.2f}{flag}"
+    def photographs(self) -> tuple[list[FloatImage], FloatArray]:
+        """Lights (k, H, W) of both states without noise, and the truth (2, H, W)."""
+        return [coloured(self.scene, state, self.coloured) for state in (None, self.state)], truth(
+            self.scene, self.state
+        )
 
 
 def painted(scene: Scene, wrinkles: float) -> Scene:
@@ -177,64 +91,74 @@ def painted(scene: Scene, wrinkles: float) -> Scene:
     return replace(scene, surface=replace(scene.surface, white=white, black=black))
 
 
-def coloured_images(scene: Scene, state: State | None, share: float) -> Any:
-    """The lights' images; a `share` of each light's variance comes from a spray of its own."""
-    images = render(scene, state)
-    if share == 0:
-        return images
-    for light in range(len(images)):
+def coloured(scene: Scene, state: State | None, fraction: float) -> FloatImage:
+    """The lights' images; a `fraction` of each light's variance comes from a spray of its own."""
+    from .uncertainty_scenes import stored_render
+
+    images = stored_render(scene, state)
+    for light in range(len(images) if fraction else 0):
         own = replace(scene, surface=replace(scene.surface, seed=scene.surface.seed + 1000 * (light + 1)))
-        other = render(own, state)[light]
-        mean = float(images[light].mean())
-        images[light] = mean + (1 - share) ** 0.5 * (images[light] - mean) + share**0.5 * (other - mean)
+        other = stored_render(own, state)[light]
+        mean = images[light].mean()
+        images[light] = mean + (1 - fraction) ** 0.5 * (images[light] - mean) + fraction**0.5 * (other - mean)
     return np.maximum(images, 0)
 
 
-@cache
-def rendered(study: str, index: int, wrinkles: float, seed: int, speckle: float) -> tuple[Scene, Any, Any, FloatArray]:
-    """Scene, lights in both states without noise, and truth (2, H, W); rendered once for all contenders."""
-    case = STUDIES[study][index]
-    scene = painted(case.scene(size=case.size, seed=seed, droplet=speckle * PIXEL, **case.options), wrinkles)
-    images = [coloured_images(scene, state, case.coloured) for state in (None, case.state)]
-    # the first light's pixels are the frame of reference
-    zoom = 1 + scene.lights[0].magnification
-    (x, y), (rows, columns) = scene.camera.centre, scene.camera.shape
-    pixels = np.meshgrid((np.arange(columns) - x) / zoom + x, (np.arange(rows) - y) / zoom + y)
-    return scene, images[0], images[1], zoom * truth(scene, case.state, pixels=(pixels[0], pixels[1]))
+@dataclass(frozen=True)
+class Contender:
+    """A way from the raw frame to the solve, by our solver."""
+
+    name: str
+    method: str
+    prefilter: str = "binomial"
+    normalise: float | None = 10.0
+    masks: bool = False
+    one_image: bool = False
 
 
-def registered(images: IlluminationImages, scene: Scene) -> IlluminationImages:
-    """The lights aligned as a perfect calibration would."""
-    zoom = np.array([1 + light.magnification for light in scene.lights])
-    identity = Registration.identity(images.names, images.shape)
-    parameters = identity.parameters.copy()
-    parameters[:, 3] = zoom / zoom[0] - 1
-    return align(images, replace(identity, parameters=parameters))
+CONTENDERS = [
+    Contender("masks without prefilter", "malvar", prefilter="none", normalise=None, masks=True),
+    Contender("Malvar", "malvar"),
+    Contender("normalised mosaic", "normalised"),
+    Contender("mean of the lights", "auto", normalise=None, one_image=True),
+    Contender("default", "auto"),
+    Contender("3-CCD", "3-CCD"),
+]
+NAMED = {contender.name: contender for contender in CONTENDERS}
 
 
-def together(images: IlluminationImages) -> FloatImage:
-    """The mean (1, H, W) of the lights, each divided by its local mean."""
-    return np.asarray(normalise(images.values, 10.0, images.full_scale).mean(axis=0, keepdims=True))
+@dataclass(frozen=True)
+class Error:
+    """Displacement error over the field, px; of its nodes over stated; of the lights' images over their mean."""
+
+    bias: float
+    scatter: float
+    rms: float
+    ratio: float
+    image: float = float("nan")
+
+    @classmethod
+    def of(cls, found: Any, exact: FloatArray, image: float = float("nan")) -> Error:
+        """Of a solution."""
+        mesh = Tri3Mesh(nodes=found.nodes, elements=found.elements)
+        low, high = found.nodes.min(axis=0) + MARGIN, found.nodes.max(axis=0) - MARGIN
+        (left, top), (right, bottom) = np.ceil(low).astype(int), high.astype(int) + 1
+        error = (at_pixels(mesh, found.displacement, exact.shape[1:]) - exact)[:, top:bottom, left:right]
+        bias = np.nanmean(error, axis=(1, 2))
+        inner = ((found.nodes >= low) & (found.nodes <= high)).all(axis=1)
+        relative = ((found.displacement - at_nodes(exact, found.nodes)) / found.displacement_std)[inner]
+        scatter = np.sqrt(np.nanmean((error - bias[:, None, None]) ** 2))
+        rms, ratio = (float(np.sqrt(np.nanmean(part**2))) for part in (error, relative))
+        return cls(float(bias[0]), float(scatter), rms, ratio, image)
 
 
-def measured(study: str, index: int, contender: Contender, *, wrinkles: float, seed: int, speckle: float) -> Error:
-    """Error of one contender on one case."""
-    scene, first, second, exact = rendered(study, index, wrinkles, seed, speckle)
-    camera = replace(scene.camera, kind="rgb" if contender.method == "3-CCD" else "bayer")
-    recorded = replace(scene, camera=camera)
-    frames = [record(i, camera, recorded.lights, seed=1000 * seed + n) for n, i in enumerate((first, second))]
-    separated = [contender.lights(frame, recorded) for frame in frames]
-    image = (separated[0].values - first)[:, 16:-16, 16:-16] / first.mean(axis=(1, 2), keepdims=True)
-    reference, deformed = (registered(images, scene) for images in separated)
-    f, g = (together(images) if contender.one_image else images.values for images in (reference, deformed))
-    size = STUDIES[study][index].size
-    margin = (size - 1 - (size - 17) // 25 * 25) // 2
-    far = margin + (size - 17) // 25 * 25
-    region = Region.from_rectangle((margin, margin, far, far), (size, size))
-    nodes = Tri3Mesh.from_region(region, 25).nodes
+def solved(contender: Contender, pair: list[IlluminationImages], exact: FloatArray, region: Any) -> Any:
+    """Solution of a pair of separated states; the search starts near the truth where it is given by a renderer."""
+    f, g = (together(images) if contender.one_image else images.values for images in pair)
+    nodes = Tri3Mesh.from_region(Region.from_rectangle(region, exact.shape[1:]), 25).nodes
     start = np.stack([map_coordinates(one, nodes[:, ::-1].T, order=1) for one in exact], axis=1) + 0.2
-    weights = [threshold_weights(i, threshold=MASKED_ABOVE) if contender.masks else None for i in (reference, deformed)]
-    solution = correlate(
+    weights = [threshold_weights(i, threshold=MASKED_ABOVE) if contender.masks else None for i in pair]
+    return correlate(
         f,
         g,
         region=region,
@@ -245,84 +169,143 @@ def measured(study: str, index: int, contender: Contender, *, wrinkles: float, s
         normalise=contender.normalise,
         statistics=not contender.masks,
     )
-    mesh, inside = Tri3Mesh(nodes=solution.nodes, elements=solution.elements), slice(margin + 25, far - 24)
-    error = (at_pixels(mesh, solution.displacement, (size, size)) - exact)[:, inside, inside].reshape(2, -1)
-    bias = np.nanmean(error, axis=1)
-    scatter, rms = np.sqrt(np.nanmean((error - bias[:, None]) ** 2)), np.sqrt(np.nanmean(error**2))
-    missing, of_image = float(np.isnan(error).any(axis=0).mean()), float(np.sqrt(np.nanmean(image**2)))
-    return Error((float(bias[0]), float(bias[1])), float(scatter), float(rms), missing, of_image)
 
 
-def table(
-    study: str, wrinkles: float, seeds: list[int], speckle: float, contenders: list[Contender], only: list[str]
-) -> None:
-    """Print the table of one study, paint and speckle, of the cases with a part of their name among `only`."""
-    print(f"\n{study}: wrinkles {1000 * wrinkles:g} um, speckle {speckle:g} px, seeds {seeds}\n")
-    print("| scene | " + " | ".join(c.name for c in contenders) + " | 3-CCD × √3 |")
-    print("|---" * (len(contenders) + 2) + "|")
-    for index, case in enumerate(STUDIES[study]):
-        if not any(part in case.name for part in only):
-            continue
-        row = [
-            Error.mean([measured(study, index, c, wrinkles=wrinkles, seed=seed, speckle=speckle) for seed in seeds])
-            for c in contenders
+def together(images: IlluminationImages) -> FloatImage:
+    """The mean (1, H, W) of the lights, each divided by its local mean."""
+    return np.asarray(normalise(images.values, 10.0, images.full_scale).mean(axis=0, keepdims=True))
+
+
+def errors(case: Case, contenders: list[Contender], matrix: FloatArray | None = None) -> dict[str, Error]:
+    """Errors of some contenders on a case, with the scene's crosstalk or another one."""
+    clean, exact = case.photographs()
+    lights, made = case.scene.lights, {}
+    size = exact.shape[1]
+    margin = (size - 1 - (size - 17) // 25 * 25) // 2
+    region = (margin, margin, size - 1 - margin, size - 1 - margin)
+    for contender in contenders:
+        kind = "rgb" if contender.method == "3-CCD" else "bayer"
+        camera = replace(case.scene.camera, kind=kind)
+        if matrix is not None:
+            camera = replace(camera, crosstalk=matrix)
+        crosstalk, pair = camera.true_crosstalk(lights), []
+        for number, images in enumerate(clean):
+            linear = linearise(record(images, camera, lights, seed=41000 + number), camera.noise)
+            whole = isinstance(linear, LinearChannels)
+            pair.append(unmix(linear, crosstalk) if whole else separate(linear, crosstalk, contender.method))
+        image = (pair[0].values - clean[0])[:, 16:-16, 16:-16] / clean[0].mean(axis=(1, 2), keepdims=True)
+        found = solved(contender, pair, exact, region)
+        made[contender.name] = Error.of(found, exact, float(np.sqrt(np.nanmean(image**2))))
+    return made
+
+
+def row(found: dict[str, Error], *, plate: bool) -> dict[str, object]:
+    """Errors of all contenders and, of the best camera, what a third of its samples could give."""
+    size = {name: error.scatter if plate else error.rms for name, error in found.items()}
+    cells: dict[str, object] = {f"{name} [px]": size[name] for name in size if name != "3-CCD"}
+    cells |= {"3-CCD × √3 [px]": size["3-CCD"] * 3**0.5} if "3-CCD" in size else {}
+    cells |= {f"bias of {name} [px]": found[name].bias for name in ("Malvar", "default")}
+    return cells | {"default: error/stated": found["default"].ratio}
+
+
+SCENES = ("mat plate .25 px", "mat plate .5 px", "reflection .25 px", "reflection .5 px")
+SPHERES = ("sphere .33 deg", "sphere 1 deg", "sphere 8 deg")
+BIAS = {f"bias of {name} [px]": f"{name} [px]" for name in ("Malvar", "default")}
+
+
+@table("demosaicing", page="explanation/demosaicing", cost=20, seed=41, scatter=BIAS)
+def demosaicing(quick: bool) -> Iterator[dict[str, object]]:
+    """Error over the field of the project's own scenes (scatter of plates, rms of spheres) by the way from the raw
+    frame to the solve; crosstalk as assumed (.10 to .16) or as measured cameras have it (.28 to .33 between green and
+    blue)."""
+    cases = [(25, "assumed", name) for name in (*SCENES, *SPHERES)]
+    cases += [(25, "measured", name) for name in (*SCENES[3:], *SPHERES[1:])]
+    cases += [(100, "assumed", name) for name in (*SCENES[2:], *SPHERES)]
+    for wrinkles, crosstalk, name in cases[:1] if quick else cases:
+        case = Case.of(name, wrinkles=wrinkles / 1000)
+        found = errors(case, CONTENDERS, MEASURED if crosstalk == "measured" else None)
+        names = {"wrinkles [um]": str(wrinkles), "crosstalk": crosstalk, "scene": name}
+        yield names | row(found, plate=case.is_plate)
+
+
+def independent_scenes() -> Path:
+    """Folder with the scenes of the independent renderer.
+
+    Raises
+    ------
+    MissingDataError
+        They are not at hand.
+    """
+    folder = Path(os.environ.get("RGBMIDIC_SHARED_DATA", "")) / "independent_scenes"
+    if not (folder / "sphere").is_dir():
+        raise MissingDataError(f"there are no independent scenes in {folder}: set RGBMIDIC_SHARED_DATA")
+    return folder
+
+
+@table("demosaicing_independent", page="explanation/demosaicing", cost=8, scatter=BIAS)
+def independent(quick: bool) -> Iterator[dict[str, object]]:
+    """Rms error over the field of scenes of a renderer that has no code in common with the project (256 rays a pixel,
+    wrinkles 50 um apart)."""
+    cases = [("plate_in_green_glare", 1, "plate in green's glare .25 px"), ("plate_in_green_glare", 2, "shift .5 px")]
+    cases += [("plate_in_green_glare", 4, "strain 1 % and 4 px")]
+    cases += [("sphere", n, f"sphere {angle} deg") for n, angle in ((1, ".33"), (2, "1"), (3, "2"), (5, "8"))]
+    for folder, number, name in cases[3:4] if quick else cases:
+        data = independent_scenes() / folder
+        exact = np.load(data / "truth.npz")["u"][number]
+        matrix = np.load(data / "lights.npz")["crosstalk"].astype(float)
+        crosstalk, found = Crosstalk(matrix=matrix, lights=("red", "green", "blue")), {}
+        linear = [
+            linearise(
+                read_frame(
+                    data / "frames" / f"frame_{n:03d}.tif", cfa="RGGB", black_level=64, white_level=4095, kind="bayer"
+                ),
+                NoiseModel(gain=4.0, read_noise=3.0),
+            )
+            for n in (0, number)
         ]
-        ideal = row[-1].size(case) * 3**0.5
-        cells = [error.text(case, ideal) for error in row]
-        print(f"| {case.name} | " + " | ".join(cells) + f" | {ideal:.4f} |", flush=True)
-        rendered.cache_clear()
+        for contender in CONTENDERS[1:-1]:
+            pair = [separate(linear[0], crosstalk, contender.method)]
+            pair.append(separate(linear[1], crosstalk, contender.method, texture=pair[0].texture))
+            found[contender.name] = Error.of(solved(contender, pair, exact, (20, 20, 491, 491)), exact)
+        yield {"scene": name} | row(found, plate=False)
 
 
-def speed(sizes: tuple[int, ...] = (1024, 2048), repeats: int = 5) -> None:
-    """Print the time per pixel from a linearised frame to the lights (least of several runs)."""
-    patch = plate_scene(size=512, seed=3)
-    frame = record(render(patch), patch.camera, patch.lights, seed=0)
-    small = linearise(frame, patch.camera.noise)
+@table("demosaicing_coloured", page="explanation/demosaicing", cost=2, seed=11)
+def coloured_specimen(quick: bool) -> Iterator[dict[str, object]]:
+    """A mat plate of which a fraction of each light's variance is a texture of its own: scatter of the displacement
+    over .25 px, error of the lights' images over their mean, error over stated uncertainty."""
+    for fraction in (0.1,) if quick else (0.1, 0.3, 0.6, 1.0):
+        case = replace(Case.of("mat plate .25 px", size=256, seed=11), coloured=fraction)
+        found = errors(case, [NAMED["Malvar"], NAMED["default"]])
+        row: dict[str, object] = {"channel-specific": f"{fraction:.0%}"}
+        row |= {f"{name} [px]": error.scatter for name, error in found.items()}
+        row |= {f"images by {name} [%]": 100 * error.image for name, error in found.items()}
+        yield row | {f"{name}: error/stated": error.ratio for name, error in found.items()}
+
+
+@table("demosaicing_speed", page="explanation/demosaicing", cost=4, timing=True)
+def speed(quick: bool) -> Iterator[dict[str, object]]:
+    """Processor time from a linearised frame to the lights on one thread, least of three runs."""
+    patch = plate_scene(size=256, seed=3, samples=2)
+    small = linearise(record(render(patch), patch.camera, patch.lights, seed=0), patch.camera.noise)
     assert isinstance(small, LinearMosaic)
     crosstalk = patch.camera.true_crosstalk(patch.lights)
     texture = separate(small, crosstalk).texture
     ways: dict[str, Callable[[LinearMosaic], Any]] = {
-        "reflection-aware, texture given": lambda mosaic: separate(mosaic, crosstalk, texture=texture),
-        "reflection-aware, texture learnt": lambda mosaic: separate(mosaic, crosstalk),
+        "default with the texture known": lambda mosaic: separate(mosaic, crosstalk, texture=texture),
+        "default with the texture learnt": lambda mosaic: separate(mosaic, crosstalk),
         "Malvar": lambda mosaic: separate(mosaic, crosstalk, "malvar"),
     }
-    print(f"\nns per pixel, {threads()} threads\n")
-    print("| size | " + " | ".join(ways) + " |\n" + "|---" * (len(ways) + 1) + "|")
-    for size in sizes:
-        copies = (size // 512, size // 512)
+    for size in (256,) if quick else (1024, 2048):
+        copies = (size // 256, size // 256)
         mosaic = replace(small, values=np.tile(small.values, copies), saturated=np.tile(small.saturated, copies))
-        best = []
-        for way in ways.values():
+        row: dict[str, object] = {"frame": f"{size} px"}
+        for name, way in ways.items():
             way(mosaic)
             runs = []
-            for _ in range(repeats):
-                start = time.perf_counter()
+            for _ in range(3):
+                start = time.process_time()
                 way(mosaic)
-                runs.append(time.perf_counter() - start)
-            best.append(min(runs) / size**2 * 1e9)
-        print(f"| {size} | " + " | ".join(f"{ns:.0f}" for ns in best) + " |", flush=True)
-
-
-def main() -> None:
-    """Read the command line, print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--study", choices=(*STUDIES, "speed"), default="main")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12, 13])
-    parser.add_argument("--wrinkles", type=float, nargs="+", default=[0.025], help="their spacing in mm")
-    parser.add_argument("--speckles", type=float, nargs="+", default=[4.2])
-    parser.add_argument("--plates-only", action="store_true", help="leave the spheres out")
-    parser.add_argument("--methods", nargs="+", help="of CONTENDERS; the ideal 3-CCD is always there")
-    parser.add_argument("--only", nargs="+", default=[""], help="cases by a part of their name")
-    arguments = parser.parse_args()
-    if arguments.study == "speed":
-        speed()
-        return
-    if arguments.plates_only:
-        STUDIES[arguments.study] = [case for case in STUDIES[arguments.study] if case.is_plate]
-    chosen = [c for c in CONTENDERS if not arguments.methods or c.method in (*arguments.methods, "3-CCD")]
-    for wrinkles, speckle in product(arguments.wrinkles, arguments.speckles):
-        table(arguments.study, wrinkles, arguments.seeds, speckle, chosen, arguments.only)
-
-
-if __name__ == "__main__":
-    main()
+                runs.append(time.process_time() - start)
+            row[f"{name} [ns/px]"] = min(runs) / size**2 * 1e9
+        yield row

@@ -1,39 +1,27 @@
-"""Time, memory and accuracy beside other DIC programs, in one run, alternating; prints a table.
-
-    pip install "rgbmidic[bench]"
-    python benchmarks/peers.py [--size 1024] [--threads 2] [--repeats 3] [--base DIRECTORY] [--json FILE]
-    python benchmarks/peers.py --quick
-    python benchmarks/peers.py --cases raw calibrated --base DIRECTORY
+"""Time, memory and accuracy beside other DIC programs, in one run, alternating.
 
 Every contender is a process of its own that lives as long as a case; in each round they take their turns, so that what
-else the machine does meets all of them, and the best time counts. Absolute times depend on the machine: compare the
-ratios. `--base` adds another checkout of rgbmidic as a contender. All get the same images, place their nodes or subset
-centres 25 px apart over the same region (pyALDIC 32: a power of two), and start from zero. ``al-dic local`` is pyALDIC
-without its global step.
+else the machine does meets all of them, and the best time counts: processor time, on one thread. All get the same
+images, place their nodes or subset centres 25 px apart over the same region (pyALDIC 32: a power of two), and start
+from zero. ``al-dic local`` is pyALDIC without its global step. The peers are installed in a Python of their own (they
+bring opencv-python and PySide6): PEERS_PYTHON names it, `pip install ".[bench]"` fills it.
 
 Grey pairs, for all contenders:
 
 ``star``: v = 0.5 cos(2 pi y / period) px with a period that grows from 100 to 300 px along x, noise of 1 DN.
-``affine``: 1 % strain and a turn of 2 degrees, without noise and with noise of 2.55 DN (1 %): far motion.
+``affine, 1 % noise``: 1 % strain and a turn of 2 degrees, noise of 2.55 DN (1 %): far motion.
 
-Our own, beside three pairs of each peer:
+Our own, beside three pairs of pyvale: ``raw``, the second frame of a raw Bayer series under three lights, from file to
+record, with noise and crosstalk calibrated; ``calibrated``, with the registration of the lights besides, which the
+frames then need; ``small``, 256 x 128 px of ``raw``. ``compiling``: what a first
+`rgbmidic run` takes more than a second one.
 
-``3 lights``: three noisy views of the affine pair together. ``raw``: the second frame of a raw Bayer series under three
-lights, from file to record, with noise and crosstalk calibrated; ``calibrated``: with the registration of the lights
-besides, which the frames then need; ``small``: 256 x 128 px of ``raw``. ``sequence`` and ``sequence, calibrated``: the
-same in a series of which every frame moves by as much as ``star``, in as many processes as threads, its start left out;
-the seconds are those from one frame to the next. ``demo`` and ``event``: iterations of the frames of `rgbmidic demo`
-and of the first 60 of ``benchmarks/fast_event.py``. ``compiling``: processor seconds that a first `rgbmidic run` takes
-more than a second one. These three once, at the first size.
-
-Accuracy is over the points away from the edge; pyxel-dic has one thread only.
+Accuracy is over the points away from the edge.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import importlib.metadata
 import io
 import json
 import os
@@ -51,18 +39,21 @@ import numpy as np
 
 from rgbmidic.typing import AnyArray, FloatArray
 
+from . import ROOT
+from .tables import table
+
 MARGIN, STEP = 30, 25
-CONTENDERS = {"rgbmidic": "rgbmidic", "pyvale": "pyvale", "pyxel-dic": "pyxel-dic", "al-dic": "al-dic"}
-CONTENDERS["al-dic local"] = "al-dic"
-"""Contenders, and the packages that they need."""
-PAIRS = ("star", "affine", "affine, 1 % noise")
-OWN = ("3 lights", "raw", "calibrated", "small", "sequence", "sequence, calibrated", "demo", "event", "compiling")
-TIMED = ("star", "affine, 1 % noise", "raw", "calibrated", "small")
-"""Cases run several times, the others once."""
-ONCE = ("demo", "event", "compiling")
-"""Cases that do not depend on size and threads."""
-FRAMES, STARTED, EVENT = 24, 6, 60
-"""Frames of the sequence, and those after which its time counts; frames of the event."""
+SIZE, ROUNDS = 1024, 3
+"""Side of the images (px), and timed rounds."""
+CONTENDERS = {"rgbmidic": "rgbmidic", "pyvale": "pyvale", "pyxel-dic": "pyxel", "al-dic": "al_dic"}
+CONTENDERS["al-dic local"] = "al_dic"
+"""Contenders, and the modules that they need."""
+PAIRS = {"star": "grey pair – waves of half a pixel", "affine, 1 % noise": "grey pair – 1 % and 2 deg – 1 % noise"}
+FRAMES = {
+    "raw": "raw frame – noise and crosstalk",
+    "calibrated": "raw frame – registration as well",
+    "small": "raw frame of 256 x 128 px",
+}
 _STRAIN, _TURN = 0.01, np.radians(2.0)
 
 Points = tuple[FloatArray, FloatArray]
@@ -117,22 +108,15 @@ def noisy(image: FloatArray, deviation: float, seed: int) -> FloatArray:
     return np.asarray(np.round(image + noise).clip(0, 255))
 
 
-def write_cases(folder: Path, size: int, cases: list[str]) -> None:
+def write_cases(folder: Path, size: int) -> None:
     """The pairs of all cases and the raw series."""
     star_pair, affine = pair("star", size), pair("affine", size)
     np.savez(folder / "star.npz", *(noisy(image, 1.0, n) for n, image in enumerate(star_pair)))
-    np.savez(folder / "affine.npz", *affine)
-    for light in range(3):
-        states = [noisy(image, 2.55, 2 * light + n) for n, image in enumerate(affine)]
-        np.savez(folder / f"affine_{light}.npz", *states)
+    np.savez(folder / "affine.npz", *(noisy(image, 2.55, n) for n, image in enumerate(affine)))
     plain = np.stack([np.stack([image] * 3) for image in star_pair])
-    frames = {
-        name: FRAMES if f"sequence{end}" in cases else 2 for name, end in (("raw", ""), ("calibrated", ", calibrated"))
-    }
-    write_raw_test(folder / "raw", frames["raw"], plain)
+    write_raw_test(folder / "raw", 2, plain)
     write_raw_test(folder / "small", 2, plain[..., :128, :256])
-    if {"calibrated", "sequence, calibrated", "compiling"} & set(cases):
-        write_raw_test(folder / "calibrated", frames["calibrated"], *registered_states(size, plain))
+    write_raw_test(folder / "calibrated", 2, *registered_states(size, plain))
 
 
 def registered_states(size: int, plain: FloatArray) -> tuple[FloatArray, Any]:
@@ -175,17 +159,6 @@ def write_raw_test(folder: Path, frames: int, states: FloatArray, registration: 
         f'[frames]\npath = "*.dng"\n[calibration]\nfile = "calibration.json"\n'
         f"[region]\nrectangle = [{MARGIN}, {MARGIN}, {right}, {bottom}]\n"
     )
-
-
-def write_tests(folder: Path, cases: list[str]) -> None:
-    """The demo and the event, if they are asked for."""
-    if "demo" in cases:
-        command = [sys.executable, "-c", "from rgbmidic.cli import main; main()", "demo", "--out", str(folder / "demo")]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    if "event" in cases:
-        script = str(Path(__file__).with_name("fast_event.py"))
-        command = [sys.executable, script, "make", str(folder / "event"), "--frames", str(EVENT), "--lost", "0"]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
 def with_rgbmidic(f: AnyArray, g: AnyArray, threads: int) -> Points:
@@ -259,23 +232,6 @@ def raw_frame(folder: Path) -> Callable[[], Points]:
     return measure
 
 
-def sequence(test: Path, processes: int) -> dict[str, Any]:
-    """Seconds a frame of a series, measured as `rgbmidic run` does, without pictures; iterations of its frames."""
-    from rgbmidic import measure, read_test
-
-    times: list[float] = []
-    with tempfile.TemporaryDirectory() as out:
-        found = measure(
-            read_test(test),
-            Path(out) / "result",
-            workers=processes,
-            progress=lambda *_: times.append(time.perf_counter()),
-        )
-        started = min(STARTED, len(times) // 2)
-        iterations = found.iterations[list(found.deformed)].tolist()
-    return {"seconds": (times[-1] - times[started]) / (len(times) - 1 - started), "iterations": iterations}
-
-
 def compiling(test: Path) -> float:
     """Processor seconds that a first `rgbmidic run`, whose cache of kernels is empty, takes more than a second one."""
     with tempfile.TemporaryDirectory() as folder:
@@ -297,8 +253,12 @@ def error(case: str, found: Points, size: int) -> float:
 
 
 def peak_memory() -> float:
-    """Largest memory of this process so far, MB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024**2 if sys.platform == "darwin" else 1024)
+    """Largest memory of this process so far, MB; NaN: not known. (Of `resource` it is the parent's.)"""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        return float("nan")
 
 
 def serve(name: str, folder: Path, threads: int) -> None:
@@ -326,58 +286,33 @@ def _measures(name: str, folder: Path, threads: int) -> Callable[[str], dict[str
     frame = cache(lambda case: raw_frame(folder / case))
 
     def measure(case: str) -> dict[str, Any]:
-        if case.startswith("sequence"):
-            return sequence(folder / ("calibrated" if "," in case else "raw") / "TEST.toml", threads)
-        if case in ("demo", "event"):
-            return sequence(folder.parent / {"demo": "demo/test/test.toml", "event": "event/test.toml"}[case], 1)
-        if case == "compiling":
-            return {"seconds": compiling(folder / "calibrated" / "TEST.toml")}
-        if case in ("raw", "calibrated", "small"):
-            work = frame(case)
-        else:
-            f, g = _images(folder, case)
-            work = partial(run, f, g, threads)
-        seconds, found = _time(work)
-        with np.load(folder / "star.npz") as kept:
-            size = len(kept["arr_0"])
-        rms = error("star" if case in ("star", "raw", "calibrated", "small") else "affine", found, size)
-        return {"seconds": seconds, "nodes": len(found[0]), "error": rms if case != "small" else None}
+        work = frame(case) if case in FRAMES else partial(run, *images(folder, case), threads)
+        begin = time.process_time()
+        found = work()
+        seconds = time.process_time() - begin
+        size = len(images(folder, "star")[0])
+        rms = error("affine" if case.startswith("affine") else "star", found, size)
+        return {"seconds": seconds, "nodes": len(found[0]), "error": rms if case != "small" else float("nan")}
 
     return measure
 
 
-def _time(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of some work, and what it gives."""
-    begin = time.perf_counter()
-    found = work()
-    return time.perf_counter() - begin, found
-
-
-def _images(folder: Path, case: str) -> tuple[AnyArray, AnyArray]:
-    if case == "3 lights":
-        f, g = (np.stack(part) for part in zip(*(_stored(folder / f"affine_{n}.npz") for n in range(3)), strict=True))
-        return f, g
-    return _stored(folder / {"star": "star.npz", "affine": "affine.npz"}.get(case, "affine_0.npz"))
-
-
-def _stored(file: Path) -> tuple[AnyArray, AnyArray]:
-    with np.load(file) as kept:
+def images(folder: Path, case: str) -> tuple[AnyArray, AnyArray]:
+    """The pair of a case."""
+    with np.load(folder / ("star.npz" if case == "star" else "affine.npz")) as kept:
         return kept["arr_0"], kept["arr_1"]
 
 
 class Contender:
     """A process that measures what it is told."""
 
-    def __init__(self, name: str, label: str, folder: Path, threads: int, path: str | None = None) -> None:
-        self.name, self.label = name, label
-        whole = os.pathsep.join([*([path] if path else []), *(str(Path(entry).resolve()) for entry in sys.path)])
-        threading = dict.fromkeys(
-            ("RGBMIDIC_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads)
-        )
-        command = [sys.executable, str(Path(__file__).resolve()), "--serve", name, str(folder), str(threads)]
+    def __init__(self, python: str, name: str, folder: Path) -> None:
+        variables = ("RGBMIDIC_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+        path = os.pathsep.join(map(str, (ROOT, ROOT / "calibration")))
         # in the temporary folder: some contenders leave files where they run
         self._process = subprocess.Popen(
-            command, env={**os.environ, **threading, "PYTHONPATH": whole}, cwd=folder, text=True,
+            [python, "-m", "benchmarks.peers", name, str(folder)],
+            env={**os.environ, **dict.fromkeys(variables, "1"), "PYTHONPATH": path}, cwd=folder, text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         )  # fmt: skip
 
@@ -395,136 +330,92 @@ class Contender:
         self._process.wait()
 
 
-def installed(name: str) -> str | None:
-    """Version of a package; None where it is not installed."""
+def compare(python: str, folder: Path, case: str, names: list[str], rounds: int) -> dict[str, dict[str, Any]]:
+    """The best of several alternating runs of contenders, after one that warms up.
+
+    Raises
+    ------
+    RuntimeError
+        A contender cannot measure the case.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    contenders = {name: Contender(python, name, folder) for name in names}
     try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "" if name == "rgbmidic" else None
+        for turn in range(1 + rounds):
+            for name, one in contenders.items():
+                row = one.measure(case)
+                if turn < 2 or row.get("seconds", np.inf) < found[name].get("seconds", np.inf):
+                    found[name] = row
+    finally:
+        for one in contenders.values():
+            one.close()
+    if failed := {name: row["failed"] for name, row in found.items() if "failed" in row and name == "rgbmidic"}:
+        raise RuntimeError(f"{case}: {failed}")
+    return found
 
 
-def compare(folder: Path, size: int, threads: int, options: argparse.Namespace) -> list[dict[str, Any]]:
-    """The best of several alternating runs of every contender, after one that warms up, in the `TIMED` cases."""
-    there = [
-        (name, f"{name} {version}".strip(), None)
-        for name, package in CONTENDERS.items()
-        if (version := installed(package)) is not None
-    ]
-    base = options.base
-    there += [("rgbmidic", f"rgbmidic in {base}", str(Path(base).resolve()))] if base else []
-    rows = []
-    for case in options.cases:
-        if case in ONCE and (size, threads) != (options.size[0], options.threads[-1]):
-            continue
-        able = there if case in PAIRS else [one for one in there if one[0] == "rgbmidic"]
-        contenders = [Contender(name, label, folder, threads, path) for name, label, path in able]
-        found: dict[str, dict[str, Any]] = {}
-        try:
-            for turn in range(1 + options.repeats if case in TIMED else 1):
-                for one in contenders:
-                    row = one.measure(case)
-                    if turn < 2 or row.get("seconds", np.inf) < found[one.label].get("seconds", np.inf):
-                        found[one.label] = row
-        finally:
-            for one in contenders:
-                one.close()
-        for (name, label, path), row in zip(able, found.values(), strict=True):
-            named = {"case": case, "contender": label, "name": "base" if path else name}
-            rows.append({"size": size, "threads": threads, **named, **row})
-    return rows
+def peers_python() -> tuple[str, list[str]]:
+    """The Python of the peers and those of them that it has."""
+    python = os.environ.get("PEERS_PYTHON", sys.executable)
+    code = "import importlib.util as u, sys; print(*(n for n in sys.argv[1:] if u.find_spec(n)))"
+    modules = set(CONTENDERS.values()) - {"rgbmidic"}
+    done = subprocess.run([python, "-c", code, *modules], capture_output=True, text=True, check=True)
+    return python, ["rgbmidic", *(name for name, module in CONTENDERS.items() if module in done.stdout.split())]
 
 
-def show(rows: list[dict[str, Any]]) -> None:
-    """Print all rows."""
-    own = {row["case"]: row.get("seconds", np.nan) for row in rows[::-1] if row["name"] == "rgbmidic"}
-    print(f"{'case':<21} {'contender':<32} {'s':>8} {'/ ours':>7} {'points':>7} {'rms error px':>13} {'peak MB':>8}")
-    for row in rows:
-        head = f"{row['case']:<21} {row['contender']:<32} "
-        if "failed" in row:
-            print(head + f"failed: {row['failed'][:90]}")
-            continue
-        rms = row.get("error")
-        print(
-            head + f"{row['seconds']:>8.3f} {row['seconds'] / own[row['case']]:>7.2f} {row.get('nodes', ''):>7} "
-            f"{np.nan if rms is None else rms:>13.5f} {row['memory']:>8.0f}"
+@table("speed_peers", page="explanation/speed", cost=130, timing=True)
+def speed_peers(quick: bool) -> Iterator[dict[str, object]]:
+    """Beside other programs in one run, processor seconds on one thread, best of three alternating runs, 1024 x 1024
+    px."""
+    python, names = peers_python()
+    if not quick and len(names) < len(CONTENDERS):
+        raise RuntimeError(
+            f"PEERS_PYTHON names a Python with all of {', '.join(CONTENDERS)}; there are {', '.join(names)}"
         )
+    with tempfile.TemporaryDirectory() as text:
+        folder = Path(text)
+        write_cases(folder, 160 if quick else SIZE)
+        ours, rows = 0.0, []
+        for case in ("star",) if quick else (*PAIRS, *FRAMES):
+            able = names if case in PAIRS and not quick else ["rgbmidic"]
+            for name, row in compare(python, folder, case, able, 1 if quick else ROUNDS).items():
+                ours = row["seconds"] if name == "rgbmidic" else ours
+                seconds = row.get("seconds", float("nan"))
+                rows.append((PAIRS.get(case) or FRAMES[case], name, seconds, seconds / ours, row))
+        for case, name, seconds, over, row in rows:
+            yield {
+                "case": case,
+                "program": name,
+                "time [s]": seconds,
+                "over ours": over,
+                "rms error [px]": row.get("error", float("nan")),
+                "memory [MB]": row.get("memory", float("nan")),
+            }
+        if not quick:
+            pyvale = next(seconds for case, name, seconds, *_ in rows if (case, name) == (PAIRS["star"], "pyvale"))
+            for case in ("raw", "calibrated"):
+                frame = next(seconds for text, _, seconds, *_ in rows if text == FRAMES[case])
+                yield {
+                    "case": FRAMES[case],
+                    "program": "three pairs by pyvale",
+                    "time [s]": 3 * pyvale,
+                    "over ours": 3 * pyvale / frame,
+                    "rms error [px]": float("nan"),
+                    "memory [MB]": float("nan"),
+                }
 
 
-def table(rows: list[dict[str, Any]]) -> None:
-    """Print what the rows come to beside what issue 24 asks for, another checkout's in a column of its own."""
-    names = [name for name in ("base", "rgbmidic") if any(row["name"] == name for row in rows)]
-    print("\n| | " + " | ".join(("now" if name == "rgbmidic" else name) for name in names) + " | asked |")
-    print("|---" * (len(names) + 2) + "|")
-    for size, threads in sorted({(row["size"], row["threads"]) for row in rows}):
-        part = {(row["case"], row["name"]): row for row in rows if (row["size"], row["threads"]) == (size, threads)}
-        for lines in zip(*(list(asked(part, size, threads, name)) for name in names), strict=True):
-            values = [value for _, value, _ in lines]
-            if np.isfinite(values).any():
-                print(f"| {lines[0][0]} | " + " | ".join(f"{value:.3g}" for value in values) + f" | {lines[0][2]} |")
-
-
-def asked(
-    found: dict[tuple[str, str], dict[str, Any]], size: int, threads: int, ours: str
-) -> Iterator[tuple[str, float, float | str]]:
-    """Each line of the issue's table: its text, the value of a contender of ours (NaN: not known), what is asked."""
-    at, far = f"{size} px, {threads} threads", PAIRS[2]
-
-    def of(case: str, name: str = ours, what: str = "seconds") -> Any:
-        return found.get((case, name), {}).get(what, np.nan)
-
-    for peer, least in (("pyvale", 4), ("pyxel-dic", 25), ("al-dic", ""), ("al-dic local", "")):
-        yield f"{peer} / ours, grey pair, small motion, {at}", of("star", peer) / of("star"), least
-    yield f"pyvale / ours, far motion with noise, {at}", of(far, "pyvale") / of(far), 2.5
-    for text, case, end in (("full calibration", "calibrated", ", calibrated"), ("crosstalk only", "raw", "")):
-        full, large = case == "calibrated", size == 2048
-        ratio = 3 * of("star", "pyvale") / of(case)
-        yield f"three pyvale pairs / our raw frame, {text}, {at}", ratio, 6 if full else ""
-        rate = 1 / of(f"sequence{end}")
-        yield f"frames a second, files included, {text}, {at}", rate, 6 if full and threads > 1 else ""
-        yield f"raw frame, {text}, s, {at}", of(case), 0.7 if large else ""
-        yield f"its peak memory, GB, {at}", of(case, what="memory") / 1000, 1.0 if large else ""
-    yield f"raw frame, full calibration / crosstalk only, {at}", of("calibrated") / of("raw"), 1.1
-    yield f"256 x 128 px frame, ms, {threads} threads", 1000 * of("small"), 10
-    demo, event = (np.atleast_1d(of(case, what="iterations")) for case in ("demo", "event"))
-    yield "iterations, demo's last frame", demo[-1], 8
-    yield "iterations, event's median", float(np.median(event)), 6
-    yield "iterations, event's most", event.max(), 12
-    yield "compiling for `run`, CPU s", of("compiling"), 20
-
-
-def main() -> None:
-    """Run the command line above."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--size", type=int, nargs="+", default=[1024, 2048], help="rows and columns of the images")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
-    parser.add_argument("--cases", nargs="+", choices=[*PAIRS, *OWN], default=[*PAIRS, *OWN], metavar="CASE")
-    parser.add_argument("--quick", action="store_true", help="small images, one round: whether all of it runs")
-    parser.add_argument("--base", help="another checkout of rgbmidic that takes part")
-    parser.add_argument("--json", type=Path, help="file for the rows")
-    options = parser.parse_args()
-    if options.quick:
-        options.size, options.threads, options.repeats = [256], [2], 1
-        options.cases = [case for case in options.cases if case not in ONCE]
-    rows = []
-    with tempfile.TemporaryDirectory() as name:
-        write_tests(Path(name), options.cases)
-        for size in options.size:
-            folder = Path(name) / str(size)
-            folder.mkdir()
-            write_cases(folder, size, options.cases)
-            for threads in options.threads:
-                print(f"{size} x {size} px, {threads} threads, load {os.getloadavg()[0]:.1f}", flush=True)
-                part = compare(folder, size, threads, options)
-                show(part)
-                rows += part
-    table(rows)
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1))
+@table("speed_compiling", page="explanation/speed", cost=30, timing=True)
+def speed_compiling(quick: bool) -> Iterator[dict[str, object]]:
+    """Processor seconds that a first `rgbmidic run`, whose cache of kernels is empty, takes more than a second one."""
+    if quick:  # what it takes does not depend on the size
+        yield {"command": "rgbmidic run", "time [s]": float("nan")}
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        states = np.stack([np.stack([image] * 3) for image in pair("star", 256)])
+        write_raw_test(Path(folder) / "test", 2, *registered_states(256, states))
+        yield {"command": "rgbmidic run", "time [s]": compiling(Path(folder) / "test" / "TEST.toml")}
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--serve"]:
-        serve(sys.argv[2], Path(sys.argv[3]), int(sys.argv[4]))
-    else:
-        main()
+    serve(sys.argv[1], Path(sys.argv[2]), 1)

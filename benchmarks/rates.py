@@ -1,31 +1,21 @@
 """Velocity and acceleration of signals with a known truth: error over stated uncertainty, false motion, noise, time.
 
-    python benchmarks/rates.py [--draws 200] [--noise 0.005 0.015] [--seed 1] [--time]
-
-For every signal and noise (px) a line, each number of velocity / acceleration, in px and frames; windows of 7 frames:
-
-- worst: largest rms(error / stated) of a frame, over the draws; the frame of a kink itself is left out, its rates of
-  both sides have a column of their own (fraction of draws in which they are stated, rms(error / stated));
-- over 1.3: part of the frames where that is above 1.3;
-- all: the same over all frames, which for smooth motion should be near 1;
-- near, far: largest estimate over stated where the body is at rest, within a window of the onset and elsewhere;
-- noise: rms error at rest over that of one parabola over the same window; last, what that parabola makes of `near`.
-
-`--time` measures 10,000 nodes of 500 frames. The constants of `rgbmidic/_kernels/rates.py` were chosen on other
-signals, but for the highest degree and the least probability that counts.
+The constants of `rgbmidic/_kernels/rates.py` were chosen on other signals, but for the highest degree and the least
+probability that counts.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.fields import Rates, rates
+from rgbmidic.fields import rates
 from rgbmidic.typing import BoolArray, FloatArray
+
+from .tables import table
 
 FRAMES, WINDOW, EDGE = 61, 7, 3
 
@@ -122,16 +112,38 @@ def fixed(times: FloatArray, values: FloatArray, known: BoolArray) -> FloatArray
     return out
 
 
-def judge(signal: Signal, noise: float, draws: int, seed: int) -> list[str]:
-    """The columns of a signal."""
+@dataclass(frozen=True)
+class Verdict:
+    """What the draws of a signal give for one rate.
+
+    Attributes
+    ----------
+    ratio
+        Of every frame but the ends' and that of a kink itself: rms(error / stated).
+    near, far
+        Largest estimate over stated where the body is at rest, within a window of the onset and elsewhere; NaN: never.
+    near_parabola
+        What one parabola over each window makes of `near`.
+    noise
+        rms error at rest over that of the parabola.
+    """
+
+    ratio: FloatArray
+    near: float
+    far: float
+    near_parabola: float
+    noise: float
+
+
+def judge(signal: Signal, noise: float, draws: int, seed: int, stated: float | None = None) -> list[Verdict]:
+    """Verdicts on velocity and acceleration, windows of 7 frames; `stated` is not the noise where that is unknown."""
     random = np.random.default_rng([seed, round(noise * 1e6)])
     known = np.isin(np.arange(len(signal.times)), signal.lost, invert=True)
     values = signal.value[:, None] + noise * random.normal(size=(len(signal.times), draws))
     own = np.where(known[:, None], values, np.nan)
     still: BoolArray = np.zeros(len(signal.times), dtype=bool)
-    found = rates(
-        signal.times, own, np.full(own.shape, noise), window=WINDOW - 1.0, common_fraction=0.0, references=still
-    )
+    std = np.full(own.shape, stated or noise)
+    found = rates(signal.times, own, std, window=WINDOW - 1.0, common_fraction=0.0, references=still)
     plain = fixed(signal.times, values, known)
     at_rest = signal.times <= (np.inf if signal.onset is None else signal.onset)
     if not (signal.velocity[at_rest] == 0).all():
@@ -139,73 +151,90 @@ def judge(signal: Signal, noise: float, draws: int, seed: int) -> list[str]:
     away = at_rest & (signal.times < (signal.times[-1] if signal.onset is None else signal.onset - WINDOW))
     inner = np.zeros(len(signal.times), dtype=bool)
     inner[EDGE:-EDGE] = True
-    kink = signal.kink
-    if kink is not None:
-        inner[kink] = False
-    columns: list[list[str]] = []
+    if signal.kink is not None:
+        inner[signal.kink] = False
+    quiet, beside, verdicts = away & inner, at_rest & ~away & inner, []
     for order, name in enumerate(("velocity", "acceleration")):
-        truth = getattr(signal, name)[:, None]
-        value, std = getattr(found, name), getattr(found, f"{name}_std")
-        ratio = np.sqrt(np.mean(((value - truth) / std) ** 2, axis=1))[inner]
-        column = [f"{ratio.max():.2f}", f"{np.mean(ratio > 1.3):.2f}", f"{np.sqrt(np.mean(ratio**2)):.2f}"]
-        false = np.abs(value / std).max(axis=1)
-        near, far = (false[part & inner] for part in (at_rest & ~away, away))
-        column += [f"{part.max():.1f}" if part.size else "" for part in (near, far)]
-        quiet = away & inner
-        error = np.sqrt(np.mean(value[quiet] ** 2) / np.mean(plain[order, 0][quiet] ** 2)) if quiet.any() else np.nan
-        column += [f"{error:.2f}" if quiet.any() else ""]
-        rested = at_rest & ~away & inner
-        column += [f"{np.abs(plain[order, 0] / plain[order, 1] / noise)[rested].max():.0f}" if rested.any() else ""]
-        column += [_both_sides(signal, found, name, kink)]
-        columns.append(column)
-    return [f"{a} / {b}" if a or b else "" for a, b in zip(*columns, strict=True)]
+        error = getattr(found, name) - getattr(signal, name)[:, None]
+        false = np.abs(getattr(found, name) / getattr(found, f"{name}_std")).max(axis=1)
+        parabola = np.abs(plain[order, 0] / plain[order, 1] / noise).max(axis=1)
+        power = (np.mean(way[quiet] ** 2) if quiet.any() else np.nan for way in (getattr(found, name), plain[order, 0]))
+        verdicts.append(
+            Verdict(
+                ratio=np.sqrt(np.mean((error / getattr(found, f"{name}_std")) ** 2, axis=1))[inner],
+                near=float(false[beside].max()) if beside.any() else np.nan,
+                far=float(false[quiet].max()) if quiet.any() else np.nan,
+                near_parabola=float(parabola[beside].max()) if beside.any() else np.nan,
+                noise=float(np.sqrt(np.divide(*power))),
+            )
+        )
+    return verdicts
 
 
-def _both_sides(signal: Signal, found: Rates, name: str, kink: int | None) -> str:
-    """In how many draws the rates of both sides are stated at a kink, and their rms(error / stated)."""
-    stated = np.zeros(1, dtype=bool) if kink is None else np.isfinite(getattr(found, f"{name}_after")[kink])
-    if kink is None or not stated.any():
-        return ""
-    truth = getattr(signal, name)
-    ratios = [
-        (getattr(found, f"{name}_{side}")[kink] - true) / getattr(found, f"{name}_{side}_std")[kink]
-        for side, true in (("before", 0.0), ("after", 2 * truth[kink + 1] - truth[kink + 2]))
-    ]
-    return f"{stated.mean():.2f}, {np.sqrt(np.nanmean(np.square(ratios))):.2f}"
+GROUPS = {
+    "kinks of .02 to 5 px a frame": ("kink",),
+    "steps of acceleration and pulses to .3 px a square frame": ("step", "pulse .3", "pulse .15"),
+    "pulse of .8 px a square frame in 16 frames": ("pulse .8",),
+    "smooth motion": ("swing", "wave", "fall"),
+    "rest": ("rest",),
+}
+"""Signals by the first words of their names."""
 
 
-def measure_time(nodes: int = 10_000, frames: int = 500) -> None:
-    """Print the processor's seconds for a large result at rest, in a swing and under blows."""
-    t = np.arange(frames, dtype=np.float64)
+@table("rates", page="how-to/results", cost=5, seed=20261)
+def rates_of_known_motion(quick: bool) -> Iterator[dict[str, object]]:
+    """Velocity and acceleration over 7 frames of motions with noise of .005 and .015 px, 61 frames, 200 draws:
+    rms(error / stated) of the worst frame and of all, frames where it is over 1.3; largest estimate over stated of a
+    body at rest within 7 frames of an onset, the same by one parabola, and further away."""
+    for group, names in GROUPS.items():
+        if quick and not group.startswith("pulse"):
+            continue
+        judged = [
+            judge(signal, noise, 200, 20261)
+            for name, signal in signals()
+            if name.startswith(names)
+            for noise in (0.005, 0.015)
+        ]
+        for rate, found in zip(("velocity", "acceleration"), zip(*judged, strict=True), strict=True):
+            ratios = np.concatenate([one.ratio for one in found])
+            yield {
+                "motion": group,
+                "rate": rate,
+                "worst frame": float(ratios.max()),
+                "all frames": float(np.sqrt(np.mean(ratios**2))),
+                "over 1.3 [%]": round(100 * float((ratios > 1.3).mean())),
+                "at rest near an onset": float(np.max([one.near for one in found])),
+                "the same by a parabola": float(np.max([one.near_parabola for one in found])),
+                "at rest further away": float(np.max([one.far for one in found])),
+            }
+
+
+@table("rates_noise", page="how-to/results", cost=1, seed=20261)
+def rates_of_noise(quick: bool) -> Iterator[dict[str, object]]:
+    """A body at rest whose noise is a multiple of the stated uncertainty of its displacement: rms(error / stated) of
+    its rates, and their noise over that of one parabola over 7 frames."""
+    rest = dict(signals())["rest"]
+    for factor in (1.0, 1.2, 1.5, 2.0):
+        velocity, acceleration = judge(rest, 0.01 * factor, 200, 20261, stated=0.01)
+        yield {
+            "noise over stated": f"{factor:g}",
+            "velocity: error/stated": float(np.sqrt(np.mean(velocity.ratio**2))),
+            "acceleration: error/stated": float(np.sqrt(np.mean(acceleration.ratio**2))),
+            "velocity over the parabola's": velocity.noise,
+            "acceleration over the parabola's": acceleration.noise,
+        }
+
+
+@table("rates_speed", page="how-to/results", cost=10, timing=True)
+def rates_speed(quick: bool) -> Iterator[dict[str, object]]:
+    """Processor time of the rates of 500 frames on one thread, by motion."""
+    t, nodes = np.arange(500.0), 20 if quick else 300
     still: BoolArray = t < 0
-    noise = 0.01 * np.random.default_rng(0).normal(size=(frames, nodes))
-    rates(
-        t, noise[:, :2], np.full((frames, 2), 0.01), window=WINDOW - 1.0, common_fraction=0.0, references=still
-    )  # compiles
-    for name, motion in {"rest": 0 * t, "swing": 5 * np.sin(t / 6), "blows": 0.5 * np.abs(t % 80 - 40)}.items():
-        values = noise + motion[:, None]
-        start, wall = time.process_time(), time.perf_counter()
-        rates(t, values, np.full(values.shape, 0.01), window=WINDOW - 1.0, common_fraction=0.0, references=still)
-        seconds = time.process_time() - start
-        print(f"{name}: {nodes} nodes, {frames} frames: {seconds:.3g} s CPU, {time.perf_counter() - wall:.3g} s")
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description="rates of signals with a known truth")
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.005, 0.015])
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--time", action="store_true")
-    given = parser.parse_args()
-    if given.time:
-        measure_time()
-        return
-    print("signal | noise | worst | over 1.3 | all | near | far | noise | parabola's near | both sides")
-    for name, signal in signals():
-        for noise in given.noise:
-            print(" | ".join([name, f"{noise:g}", *judge(signal, noise, given.draws, given.seed)]), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    noise = 0.01 * np.random.default_rng(0).normal(size=(len(t), nodes))
+    std = np.full(noise.shape, 0.01)
+    options = {"window": WINDOW - 1.0, "common_fraction": 0.0, "references": still}
+    rates(t, noise[:, :2], std[:, :2], **options)  # compiles
+    for name, motion in {"at rest": 0 * t, "swinging": 5 * np.sin(t / 6), "blows": 0.5 * abs(t % 80 - 40)}.items():
+        start = time.process_time()
+        rates(t, noise + motion[:, None], std, **options)
+        yield {"motion": name, "time [ms a node]": 1e3 * (time.process_time() - start) / nodes}

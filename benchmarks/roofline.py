@@ -1,31 +1,24 @@
-"""Time per pixel of the kernels that a frame spends its time in, beside what the memory allows; prints a table.
-
-    python benchmarks/roofline.py [--size 1024] [--threads 1 2] [--json FILE]
+"""Time per pixel of the kernels that a frame spends its time in, beside what the memory allows.
 
 The bound is the time in which the memory moves a kernel's arrays once, at the bandwidth that numpy's copy of arrays of
-64 MB reaches with as many threads ("copy" is a triad without its product). Best of several runs; one light, 25 px
-elements, 1 % strain and a turn of 2 degrees; pixels are those of the region or of the image.
+64 MB reaches ("copy" is a triad without its product). Best of several runs on one thread, processor time; one light, 25
+px elements, 1 % strain and a turn of 2 degrees; pixels are those of the region or of the image.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from rgbmidic._kernels.illumination import unmix
 from rgbmidic._kernels.interpolation import PAD, bspline_coefficients
-from rgbmidic._kernels.threads import set_threads
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import FloatArray
+
+from .tables import table
 
 _RUNS = 7
 _COPIED = 1 << 24
@@ -37,24 +30,16 @@ def best(work: Callable[[], object]) -> float:
     work()
     times = []
     for _ in range(_RUNS):
-        begin = time.perf_counter()
+        begin = time.process_time()
         work()
-        times.append(time.perf_counter() - begin)
+        times.append(time.process_time() - begin)
     return min(times)
 
 
-def bandwidth(threads: int) -> float:
+def bandwidth() -> float:
     """Bytes per second that are read or written when arrays are copied."""
     source, target = np.ones(_COPIED, np.float32), np.zeros(_COPIED, np.float32)
-    edges = np.linspace(0, _COPIED, threads + 1).astype(int)
-    with ThreadPoolExecutor(threads) as pool:
-
-        def copy() -> None:
-            parts = [slice(*edge) for edge in pairwise(edges)]
-            for _ in pool.map(lambda part: np.copyto(target[part], source[part]), parts):
-                pass
-
-        return 8 * _COPIED / best(copy)
+    return 8 * _COPIED / best(lambda: np.copyto(target, source))
 
 
 def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
@@ -83,25 +68,10 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--size", type=int, default=1024, help="rows and columns of the image")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--json", type=Path, help="file for the table")
-    arguments = parser.parse_args()
-    rows = []
-    for threads in arguments.threads:
-        set_threads(threads)
-        speed = bandwidth(threads)
-        print(f"{threads} threads, {speed / 1e9:.1f} GB/s, load {os.getloadavg()[0]:.1f}")
-        print(f"{'kernel':<22} {'ns per px':>9} {'bound':>6} {'/ bound':>8}")
-        for name, count, size, work in cases(arguments.size):
-            taken, bound = 1e9 * best(work) / count, 1e9 * size / speed
-            print(f"{name:<22} {taken:>9.2f} {bound:>6.2f} {taken / bound:>8.1f}")
-            rows.append({"kernel": name, "threads": threads, "ns": taken, "bound": bound})
-    if arguments.json:
-        arguments.json.write_text(json.dumps(rows, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+@table("speed_kernels", page="explanation/speed", cost=2, timing=True)
+def speed_kernels(quick: bool) -> Iterator[dict[str, object]]:
+    """Time per pixel of the kernels on one thread, and over the time in which the memory moves their arrays once."""
+    speed = bandwidth()
+    for name, count, size, work in cases(256 if quick else 1024):
+        taken, bound = 1e9 * best(work) / count, 1e9 * size / speed
+        yield {"kernel": name.replace(", ", " of "), "time [ns/px]": taken, "over the memory's": taken / bound}

@@ -32,6 +32,8 @@ class MissingDataError(Exception):
 
 
 FOLDER = ROOT / "docs" / "tables"
+README = ROOT / "README.md"
+"""Shows tables as markdown, which a repository's page renders: see `Table.shown_in`."""
 QUICK_FOLDER = FOLDER / "quick"
 """Committed files of the tables whose quick rows are a smaller case instead of some rows of the full table."""
 DIGITS = 3
@@ -203,6 +205,13 @@ class Table:
         lines += [",".join(row) for row in (self.columns, *self.rows)]
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
         temporary.replace(path)
+
+    def shown_in(self, text: str) -> str:
+        """A page's text with what lies between `<!-- measured: NAME -->` and `<!-- end -->` replaced by the table."""
+        lines = [self.columns, ["---"] * self.keys + ["---:"] * (len(self.columns) - self.keys), *self.rows]
+        shown = "\n".join(f"| {' | '.join('–' if cell == 'nan' else cell for cell in line)} |" for line in lines)
+        block = re.compile(rf"(<!-- measured: {re.escape(self.name)} -->\n).*?(<!-- end -->)", re.DOTALL)
+        return block.sub(lambda found: f"{found[1]}\n{shown}\n\n{found[2]}", text)
 
     def column(self, name: str) -> int:
         """Number of a column.

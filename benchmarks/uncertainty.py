@@ -141,17 +141,20 @@ def best_threshold(
 
 
 ANGLES = (0.33, 1.0, 2.0, 4.0, 8.0)
-SPHERES = [("3-CCD", "mild", "smooth", 4.2), ("Bayer", "mild", "smooth", 4.2)]
+SPHERES = [
+    *(("3-CCD", crosstalk, "smooth", 4.2) for crosstalk in ("mild", "measured")),
+    *(("Bayer", c, paint, speckle) for paint in PAINTS for speckle in (4.2, 2.5) for c in ("mild", "measured")),
+]
 """Camera, crosstalk, paint, speckle of the spheres: 30 CPU s for another paint or speckle, 4 for another crosstalk."""
 
 
-@table("sphere", page="explanation/uncertainty", cost=30, keys=4, seed=11, own_quick=True)
+@table("sphere", page="explanation/uncertainty", cost=200, keys=4, seed=11, own_quick=True)
 def sphere(quick: bool) -> Iterator[Row]:
     """Turning sphere: rms error of the displacement over the field after a turn; then, over all angles and nodes, error
     over stated uncertainty (also within reflections alone), errors within 1.96 stated uncertainties, and the same of
     strain.
     """
-    for camera, crosstalk, paint, speckle in SPHERES[1:2] if quick else SPHERES:
+    for camera, crosstalk, paint, speckle in SPHERES[2:4] if quick else SPHERES:
         errors: dict[str, object] = {}
         ratios, strains, inside = list[FloatArray](), list[FloatArray](), list[BoolArray]()
         for angle in ANGLES[1::2] if quick else ANGLES:
@@ -200,7 +203,10 @@ def weights(quick: bool) -> Iterator[Row]:
                 }
 
 
-@table("noise", page="explanation/uncertainty", cost=40, keys=2, seed=17, own_quick=True)
+CAMERAS = [("3-CCD", "mild"), ("Bayer", "mild"), ("Bayer", "measured")]
+
+
+@table("noise", page="explanation/uncertainty", cost=60, keys=3, seed=17, own_quick=True)
 def noise(quick: bool) -> Iterator[Row]:
     """Camera noise alone, 40 draws for one pair of states of the sphere: observed scatter of the displacement (median
     of the field), stated over observed, and draws within 1.96 stated uncertainties of their mean; the same of strain.
@@ -208,8 +214,9 @@ def noise(quick: bool) -> Iterator[Row]:
     setting = Setting(body="sphere", state=turn(1.0), size=256 if quick else 448)
     for angle in (0.0,) if quick else (0.0, 1.0):
         pair = pair_of(replace(setting, state=turn(angle))).cut(*((48, 48, 160) if quick else (96, 192, 224)))
-        for camera in ("Bayer",) if quick else KINDS:
-            found = [solve_pair(pair, both(pair, KINDS[camera], seed=17 + n)) for n in range(10 if quick else 40)]
+        for camera, crosstalk in CAMERAS[1:2] if quick else CAMERAS:
+            draws = (both(pair, KINDS[camera], 17 + n, crosstalk) for n in range(10 if quick else 40))
+            found = [solve_pair(pair, images) for images in draws]
             cells: list[float] = []
             for quantity in ("displacement", "strain"):
                 values = np.array([getattr(one, quantity) for one in found])
@@ -221,6 +228,7 @@ def noise(quick: bool) -> Iterator[Row]:
             names = ("observed", "stated/observed", "covered [%]")
             yield {
                 "camera": camera,
+                "crosstalk": crosstalk,
                 "angle [deg]": angle,
                 **dict(zip(("observed [px]", *names[1:]), cells[:3], strict=True)),
                 **dict(zip((f"strain {name}" for name in names), cells[3:], strict=True)),

@@ -23,15 +23,19 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
-from rgbmidic.scene.camera import PIXEL, REFERENCE_CROSSTALK
+from rgbmidic.scene.camera import MEASURED_CROSSTALK, PIXEL, REFERENCE_CROSSTALK
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 from .demosaicing import TILT, painted
 
 Kind = Literal["rgb", "bayer"]
 KINDS: dict[str, Kind] = {"3-CCD": "rgb", "Bayer": "bayer"}
-CROSSTALKS: dict[str, tuple[tuple[float, ...], ...]] = {"mild": REFERENCE_CROSSTALK}
-"""What each light gives in the channels of another: that of the virtual experiments, and those of measured cameras."""
+CROSSTALKS: dict[str, tuple[tuple[float, ...], ...]] = {
+    "none": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "mild": REFERENCE_CROSSTALK,
+    "measured": MEASURED_CROSSTALK,
+}
+"""What each light gives in the channels of another: that of the virtual experiments, and a measured camera's."""
 PAINTS: dict[str, dict[str, float]] = {
     "smooth": {},
     "glossy": {"gloss": 3.0},
@@ -41,6 +45,11 @@ PAINTS: dict[str, dict[str, float]] = {
 RENDERS = "RGBMIDIC_RENDERS"
 """Environment variable: folder of rendered scenes that several tables share; the driver sets it for its run."""
 _OWN_RENDERS = tempfile.TemporaryDirectory(prefix="rgbmidic-renders-")
+
+
+def renders() -> Path:
+    """Folder of what tables of one run share."""
+    return Path(os.environ.get(RENDERS, _OWN_RENDERS.name))
 
 
 def turn(angle: float) -> State:
@@ -99,7 +108,7 @@ class Pair:
 def stored_render(scene: Scene, state: State | None) -> FloatImage:
     """`render`, kept on disk while tables are measured: rendering is the slow part."""
     key = hashlib.sha1(repr((scene, state)).encode()).hexdigest()[:20]
-    path = Path(os.environ.get(RENDERS, _OWN_RENDERS.name)) / f"render_{key}.npy"
+    path = renders() / f"render_{key}.npy"
     if not path.exists():
         temporary = path.with_suffix(f".{os.getpid()}.npy")
         np.save(temporary, render(scene, state))

@@ -40,9 +40,9 @@ def sparkle(shape, strength, seed):
     return strength * np.clip(1 + 0.35 * rough / rough.std(), 0, None)
 
 
-def mosaic_of(lights, *, cfa="RGGB", seed=0, noise=NOISE, full_scale=FULL_SCALE):
+def mosaic_of(lights, *, cfa="RGGB", seed=0, noise=NOISE, full_scale=FULL_SCALE, matrix=A):
     """The raw frame of lights (3, H, W) in DN, with camera noise and saturation."""
-    channels = np.tensordot(A, lights, axes=1)
+    channels = np.tensordot(matrix, lights, axes=1)
     rows, columns = lights.shape[1:]
     site = np.tile(cfa_channels(cfa), (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
     values = np.take_along_axis(channels, site[None], axis=0)[0]

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
+from results import make_result
 from scipy.sparse.linalg import spsolve
 from textures import Texture
 
+from rgbmidic import correlate
 from rgbmidic.fields.nodal import Places
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.mesh.files import FiniteElementMesh, Placement
+from rgbmidic.results import FrameRecord
+from rgbmidic.results.comparison import Comparison, FrameComparison, Simulation
 from rgbmidic.typing import FloatArray
 
-__all__ = ["MM_PER_PIXEL", "PLACEMENT", "SHAPE", "Plate", "plane_stress"]
+__all__ = ["MM_PER_PIXEL", "PLACEMENT", "SHAPE", "Plate", "compared_plates", "plane_stress"]
 
 SHAPE, MM_PER_PIXEL = (210, 190), 0.05
 RADIUS, CENTRE = 30.0, (95.0, 105.0)
@@ -112,3 +118,33 @@ class Plate:
             values = amount * self.moved[drawn.elements[places.element]]
             material = spatial - np.einsum("pc,pcd->pd", places.barycentric, values)
         return texture.at(*material.T).reshape(SHAPE)
+
+
+def compared_plates(
+    folder: Path, *, draws: int, moduli: Sequence[float], texture: int = 3, element_size: float = 30
+) -> dict[float, list[FrameComparison]]:
+    """Compare pairs of noisy photographs of a plate with its simulation, and with one whose modulus is a multiple."""
+    plate, painted, random = Plate.of(10), Texture.random(texture, waves=150), np.random.default_rng(1)
+    pair = [plate.image(painted, amount) for amount in (0.0, 1.0)]
+    solutions = [
+        correlate(
+            *(image + random.normal(0, 4.0, image.shape) for image in pair),
+            region=plate.region(),
+            element_size=element_size,
+        )
+        for _ in range(draws)
+    ]
+    nodes = solutions[0].nodes
+
+    def record(index: int) -> FrameRecord:
+        (u, v), (u_std, v_std) = solutions[index].displacement.T, solutions[index].displacement_std.T
+        return FrameRecord.of(nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, u_std=u_std, v_std=v_std)
+
+    mesh = {"nodes": nodes, "elements": solutions[0].elements, "references": []}
+    result = make_result(folder / "result", frames=draws, record=record, **mesh)
+    simulation = Simulation(mesh=plate.mesh, displacement=plate.displacement[None])
+    made = {}
+    for modulus in moduli:
+        wrong = replace(simulation, displacement=simulation.displacement / modulus)
+        made[modulus] = list(Comparison(result, wrong, PLACEMENT, frames=range(draws)).each())
+    return made

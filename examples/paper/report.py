@@ -89,8 +89,9 @@ def _page(study: PaperStudy, claims: Sequence[Claim]) -> Page:
     page.text(
         f"rgbmidic {__version__}; frames of {study.size} px, angles {angles}°, seed {study.seed}. P is the standard "
         "deviation over 50 x 100 px of the vertical displacement minus its Gaussian-filtered copy (40 px); the mesh is "
-        "TRI3 with 25 px, grey levels as recorded, weights binary, as in the paper. Nothing here was adjusted to the "
-        "paper's P: the paint is that of `rgbmidic.lab.virtual.paper_scene`."
+        "TRI3 with 25 px. The paper's methods are as in the paper: linear elements, each light's own gradient, grey "
+        "levels as recorded, weights binary; 'our solver' has the same images and masks. Nothing here was adjusted to "
+        "the paper's P: the paint is that of `rgbmidic.lab.virtual.paper_scene`."
     )
     page.heading("Statements of the paper and what was measured")
     verdicts = [claim.verdict for claim in claims]

@@ -116,7 +116,7 @@ def run_paper_study(
             f"angles lie between 0 and {LARGEST:g} degrees, at least one of them above 0; given are {list(angles)}"
         )
     benches = [Bench.build(name, size, seed=seed) for name in scenes]
-    studies = tuple(_run_scene(bench, wanted, progress) for bench in benches)
+    studies = tuple(run_scene(bench, wanted, progress) for bench in benches)
     progress("flat specimen, noise of the lights")
     return PaperStudy(
         angles=wanted,
@@ -130,10 +130,18 @@ def run_paper_study(
     )
 
 
-def _run_scene(bench: Bench, angles: tuple[float, ...], progress: Progress) -> SceneStudy:
+def run_scene(
+    bench: Bench,
+    angles: tuple[float, ...],
+    progress: Progress = lambda line: None,
+    *,
+    methods: Sequence[str] = tuple(METHODS),
+    set_up: Sequence[float] = SET_UP_ANGLES,
+) -> SceneStudy:
+    """Render one bench and measure it with the methods; the weighting threshold is found at the angles of `set_up`."""
     photographs, gain = _photograph(bench, angles, progress)
     reference, shots = photographs[METHODS["midic"].demosaic]
-    thresholds = _thresholds(bench, reference, shots, gain)
+    thresholds = _thresholds(bench, reference, shots, gain, set_up)
     chosen = max(thresholds, key=lambda angle: thresholds[angle].zone.contrast, default=None)
     limit = NO_THRESHOLD if chosen is None else thresholds[chosen].value
     competitors = {
@@ -146,6 +154,7 @@ def _run_scene(bench: Bench, angles: tuple[float, ...], progress: Progress) -> S
             prefilter=bench.prefilter,
         )
         for method, settings in METHODS.items()
+        if method in methods
     }
     masks = threshold_weights(reference, threshold=limit, blur=BLUR)
     scale = np.float32(reference.full_scale)
@@ -193,12 +202,16 @@ def _photograph(
 
 
 def _thresholds(
-    bench: Bench, reference: IlluminationImages, shots: dict[float, IlluminationImages], gain: np.float32
+    bench: Bench,
+    reference: IlluminationImages,
+    shots: dict[float, IlluminationImages],
+    gain: np.float32,
+    set_up: Sequence[float],
 ) -> dict[float, SetUpThreshold]:
     """Thresholds from plain DIC at the set-up angles, up to the first at which the reflection clearly disturbs it."""
     competitor = Competitor.prepare("dic", reference, bench.region, light=bench.light, prefilter=bench.prefilter)
     found: dict[float, SetUpThreshold] = {}
-    for number, angle in enumerate(SET_UP_ANGLES):
+    for number, angle in enumerate(set_up):
         shot = shots.get(angle) or bench.photograph(bench.render(angle) * gain, EXTRA_SHOTS + number)
         ripple = high_pass(displacement_at_pixels(competitor.measure(shot), shot.shape)[1])
         try:

@@ -44,17 +44,18 @@ _NOISES = 2
 """Images of noise from which is found what both fits leave of it: 800 blocks of 13 px in 380 px, to 5 % (derived)."""
 _SPREAD = 4
 """Times that squares are averaged with those of the nodes beside: a window of standard deviation 1.5 elements."""
-_OF_DIFFERENCE = np.array([1.3, 1.3, 1.25, 1.25, 1.25])
+_OF_DIFFERENCE = 1.25
 """Error over the difference. Of what the mesh loses the halved one loses 1/16 for displacement and 1/4 for strain where
-waves are long, next to nothing at 3 elements: 1.07 and 4/3 to 1.1 (derived; 1.1 to 1.2 on the DIC Challenge star)."""
+waves are long, next to nothing at 3 elements: 4/3 to 1.1 for strain (derived). For displacement 1.07, and more for what
+is lost with differences taken for noise; chosen on the DIC Challenge star."""
 _UNSMOOTHED = 0.72
 """Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates."""
 _EDGE = 1.8
 """Error of one-sided slopes over that of central ones: 2.5 across the edge, 1 along it (DIC Challenge star)."""
-_SURE, _SURE_SMOOTH = np.array([1.2, 1.2, 4.0, 4.0, 4.0]), 2.0
-"""Standard deviations of the mean square of noise alone by which the difference must exceed it. Strain's is 3 to 4
-times its noise, so that what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at
-most."""
+_SURE = np.repeat([1.2, 4.0, 2.0], [2, 3, 3])
+"""Standard deviations of the mean square of noise alone by which the difference, of displacement and of strain, and
+unsmoothed strain must exceed it. Strain's difference has 3 to 4 times the noise of strain, so that what passes by
+chance would be a multiple of it. Chosen: affine fields come out 15 % larger at most."""
 _UNEVEN = np.array([1.15, 1.15, 1.4, 1.4, 1.4])
 """Variance of the difference, and of what is unsmoothed, over that with equal weights: a robust loss weighs pixels
 unevenly (measured on affine fields)."""
@@ -276,10 +277,10 @@ class _Halves:
         assert self.gains is not None
         noise = np.concatenate([_UNEVEN, _UNEVEN[2:]]) * self.gains.variance * std[:, _OF] ** 2
         edge = self.mesh.on_boundary[:, None]
-        sure = np.append(_SURE, [_SURE_SMOOTH] * 3) * self.gains.scatter * (1 + 2 * edge)
+        sure = _SURE * self.gains.scatter * (1 + 2 * edge)
         unsmoothed = np.where(edge, np.nan, self.unsmooth(np.nan_to_num(strain)))
         square = self._beyond(np.concatenate([difference, unsmoothed], axis=1), noise, sure)
-        square *= np.append(_OF_DIFFERENCE, [_UNSMOOTHED] * 3) ** 2
+        square *= np.repeat([_OF_DIFFERENCE, _UNSMOOTHED], [5, 3]) ** 2
         smooth = np.where(edge, _EDGE**2 * self._inside(square[:, 5:]), square[:, 5:])
         return np.asarray(np.sqrt(np.concatenate([square[:, :2], np.fmax(square[:, 2:5], smooth)], axis=1)))
 

@@ -290,5 +290,8 @@ def colour_factors(
         specific = excess - least + np.maximum(least - 1 - allowed, 0)
         sparkle = specific * square * band.own
     # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side
-    variance = np.maximum(specific * (band.own / WHITE_ENERGY) - UNCERTAIN, 0) + LEAST
+    variance = np.maximum(specific * (band.own / WHITE_ENERGY) - UNCERTAIN, 0)
+    # every channel sees at least what its crosstalk lets through of the lights that sparkle
+    lights = np.maximum(np.tensordot(to_lights, variance * square, axes=1), 0)
+    variance = np.maximum(variance, np.tensordot(crosstalk**2, lights, axes=1) / square) + LEAST
     return ColourFactors(slope=np.sqrt(square), specific=variance, noise=moments.noise / square)

@@ -13,7 +13,9 @@ The contrast of channel c, divided by its own spread, is ``sqrt(s_c) a + sqrt(1 
 autocorrelation C, channel-specific component e_c, and camera noise, with s_c the fraction of the common texture. The
 best linear prediction of a channel at a pixel from the N x N samples around it has the filter ``(K + V)^-1 k``, with K
 the covariance of the samples, V their noise and k their covariance with what is wanted. It depends on the pixel's phase
-in the 2x2 cell and on the three fractions alone, so the filters of a frame are a small table.
+in the 2x2 cell and on the three fractions alone, so the filters of a frame are a small table. What one light sparkles
+all channels see by their crosstalk: the components e_c of two channels go together as ``A V A^T`` of the lights'
+variances V, so that the samples of all colours say how much of it to take off which.
 """
 
 from __future__ import annotations
@@ -167,7 +169,13 @@ class FilterTable:
 
 
 def prediction_filters(
-    specific: FloatArray, noise: npt.ArrayLike, texture: TextureModel, cfa: str, *, size: int = SIZE
+    specific: FloatArray,
+    noise: npt.ArrayLike,
+    texture: TextureModel,
+    cfa: str,
+    *,
+    size: int = SIZE,
+    seen: FloatArray | None = None,
 ) -> FilterTable:
     """Return the table of filters for tiles whose channels have some variance of their own.
 
@@ -183,6 +191,9 @@ def prediction_filters(
         Bayer pattern.
     size
         Side of the square of samples, `SIZE` or `WIDE`.
+    seen : (3, k), or None
+        Crosstalk over each channel's slope on the common texture; None: the channels' own components have nothing to
+        do with each other.
 
     Returns
     -------
@@ -192,8 +203,11 @@ def prediction_filters(
     level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
     code = (level[0] * 1000 + level[1]) * 1000 + level[2]
     _, first, index = np.unique(code, return_index=True, return_inverse=True)
-    fraction = 1 / (1 + 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE))
-    taps = _solved(fraction, np.asarray(noise, dtype=np.float64), texture, cfa, size)
+    variance = 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE)
+    # a specimen's colour has no slope on the common texture that could tell how the channels see it
+    sparkle = _correlations(variance, np.eye(3) if seen is None else seen)
+    together = texture.specific * np.eye(3) + (1 - texture.specific) * sparkle
+    taps = _solved(1 / (1 + variance), together, np.asarray(noise, dtype=np.float64), texture, cfa, size)
     lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
     return FilterTable(
         index=index.reshape(level.shape[1:]).astype(np.int32),
@@ -202,29 +216,43 @@ def prediction_filters(
     )
 
 
-def _solved(fraction: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int) -> FloatArray:
+def _correlations(variance: FloatArray, seen: FloatArray) -> FloatArray:
+    """Correlations (T, 3, 3) of the channels' own components of `variance` (T, 3), which are those of the lights."""
+    lights = np.maximum(variance @ np.linalg.pinv(seen**2).T, 0)
+    products = np.einsum("cl,tl,dl->tcd", seen, lights, seen)
+    # what the lights do not explain is the channel's alone
+    of_lights = np.diagonal(products, axis1=1, axis2=2)
+    root = np.sqrt(np.maximum(of_lights, variance))
+    correlations = products / (root[:, :, None] * root[:, None])
+    correlations[:, range(3), range(3)] = 1
+    return np.asarray(correlations)
+
+
+def _solved(
+    fraction: FloatArray, together: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int
+) -> FloatArray:
     """Return filters (T, 4, 3, size²) for fractions (T, 3) of the common texture.
 
-    Covariances and Bayer pattern are alike left and right of the centre, and above and below it, and so are the
-    filters: what is solved for is the sum of the samples that lie alike, of which there are 9 among 25.
+    The channels' own components are correlated as `together` (T, 3, 3). Covariances and Bayer pattern are alike left
+    and right of the centre, and above and below it, and so are the filters: what is solved for is the sum of the
+    samples that lie alike, of which there are 9 among 25.
     """
     common, fine = _covariances(texture, size)
     # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
     specific = texture.specific * common + (1 - texture.specific) * fine
     alike, first = _alike(size)
-    shared, centre = alike.T @ common @ alike, alike.T @ common[:, size * size // 2]
-    noisy, mine_centre = np.maximum(noise, 1e-8), alike.T @ specific[:, size * size // 2]
+    shared, own = alike.T @ common @ alike, alike.T @ specific @ alike
+    centre, own_centre = (alike.T @ part[:, size * size // 2] for part in (common, specific))
+    noisy, root, own_root = np.maximum(noise, 1e-8), np.sqrt(fraction), np.sqrt(1 - fraction)
+    of_texture, of_own = (part[:, :, None] * part[:, None] for part in (root, own_root))
+    of_own *= together
     taps = np.empty((len(fraction), 4, 3, size * size))
     cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
     for phase, (p, q) in enumerate(np.ndindex(2, 2)):  # of the centre of the square
-        channel = cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel()
-        own_part = alike.T @ ((channel[:, None] == channel) * specific) @ alike
-        channel = channel[first]
-        root, own = np.sqrt(fraction[:, channel]), np.sqrt(1 - fraction[:, channel])
-        samples = root[:, :, None] * root[:, None] * shared + own[:, :, None] * own[:, None] * own_part
+        channel = cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel()[first]
+        wanted = of_texture[:, channel] * centre[:, None] + of_own[:, channel] * own_centre[:, None]
+        samples = of_texture[:, channel[:, None], channel] * shared + of_own[:, channel[:, None], channel] * own
         samples += np.diag(noisy[channel])
-        wanted = root[:, :, None] * np.sqrt(fraction)[:, None] * centre[:, None]
-        wanted += (1 - fraction)[:, None] * ((channel[:, None] == np.arange(3)) * mine_centre[:, None])
         taps[:, phase] = (alike @ np.linalg.solve(samples, wanted)).transpose(0, 2, 1)
     return taps
 
@@ -330,7 +358,8 @@ class ReflectionAwareDemosaicer:
         noise = np.median(factors.noise / (1 + factors.specific), axis=(1, 2))
         # a colour left to itself has only every other sample, so it needs to look farther
         size = SIZE if texture.specific < 0.5 else WIDE
-        table = prediction_filters(_per_tile(factors.specific), noise, texture, mosaic.cfa, size=size)
+        seen = matrix / np.median(factors.slope, axis=(1, 2))[:, None]
+        table = prediction_filters(_per_tile(factors.specific), noise, texture, mosaic.cfa, size=size, seen=seen)
         mixing = np.eye(3) if mixing is None else mixing
         out, unknown = _predict(moments, factors, table, mixing, damaged=damaged)
         valid = np.ones(out.shape, dtype=bool)

@@ -22,9 +22,8 @@ import numpy as np
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
 from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Histories, Maps, Result, shared_part
-from rgbmidic.results.files import write_complete
+from rgbmidic.results.files import is_result, write_complete
 from rgbmidic.results.histories import read_histories
-from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import TestSettings, read_toml, regular
 from rgbmidic.typing import FloatArray
 

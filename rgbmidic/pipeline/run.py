@@ -32,7 +32,7 @@ from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, 
 from rgbmidic.pipeline.source import FrameSequence, LightSeparation, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
-from rgbmidic.results.provenance import PROVENANCE, read_provenance
+from rgbmidic.results.files import PROVENANCE, read_provenance
 from rgbmidic.results.store import listed
 from rgbmidic.settings import (
     ELEMENT_SIZE,

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from rgbmidic.command import optional
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.provenance import fingerprint, read_provenance
+from rgbmidic.results.files import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.results.shards import FrameTable
 from rgbmidic.results.store import check_complete, listed, load_frames, load_result, read_reference

@@ -32,8 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import ResultError, disk_faults
-from rgbmidic.results.files import writing
-from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
+from rgbmidic.results.files import PROVENANCE, PUT_BACK, writing
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.typing import BoolArray
 

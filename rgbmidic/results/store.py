@@ -19,24 +19,22 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results.files import (
     ALL_FRAMES,
-    Claim,
-    read_arrays,
-    read_json,
-    write_arrays,
-    write_json,
-    writing,
-)
-from rgbmidic.results.provenance import (
     PROVENANCE,
     PUT_BACK,
+    Claim,
     Origin,
     check_same,
     digest,
     fingerprint,
     is_result,
     now,
+    read_arrays,
+    read_json,
     read_provenance,
     sealed,
+    write_arrays,
+    write_json,
+    writing,
 )
 from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED, FrameRecord
 from rgbmidic.results.shards import FrameTable, RecordLayout, ShardWriter, discard, shard_files

@@ -16,7 +16,7 @@ import numpy as np
 from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
-from rgbmidic.scene.camera import PIXEL, Camera, Light, Vector, reference_camera, rotation, three_lights
+from rgbmidic.scene.camera import PIXEL, Camera, Light, Polarisers, Vector, reference_camera, rotation, three_lights
 from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
 from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
 from rgbmidic.typing import FloatArray
@@ -225,6 +225,14 @@ class Scene:
         self.light(light.name)
         return replace(self, lights=tuple(light if old.name == light.name else old for old in self.lights))
 
+    def polarised(self, polarisers: Polarisers) -> Scene:
+        """Return the scene behind crossed polarisers: less light, and less gloss than there is diffuse light."""
+        white, black = (
+            replace(paint, gloss=paint.gloss * polarisers.glare) for paint in (self.surface.white, self.surface.black)
+        )
+        lights = tuple(replace(light, power=light.power * polarisers.transmission) for light in self.lights)
+        return replace(self, lights=lights, surface=replace(self.surface, white=white, black=black))
+
     def mirror_position(self, distance: float, state: State | None = None) -> Vector:
         """Where a lamp must stand for its reflection to cover the body's front point, seen from the camera.
 
@@ -303,7 +311,8 @@ def read_scene(path: Path | str) -> Experiment:
     """Read a SCENE.toml.
 
     Sections: ``[body]``, ``[surface]`` with ``[surface.white]`` and ``[surface.black]``, ``[[lights]]``, ``[camera]``,
-    ``[[states]]`` and ``[output]``. Every one may be left out: the reference sphere, paint, lights and camera stand in.
+    ``[polarisers]``, ``[[states]]`` and ``[output]``. Every one may be left out: the reference sphere, paint, lights
+    and camera stand in; polarisers are there where their section is, even an empty one.
 
     Raises
     ------
@@ -319,7 +328,7 @@ def read_scene(path: Path | str) -> Experiment:
 
 
 def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
-    sections = ("body", "surface", "lights", "camera", "states", "output")
+    sections = ("body", "surface", "lights", "camera", "polarisers", "states", "output")
     check_names(document, sections, "section", "the file")
     table = read_table(document, "body")
     kind = convert_value(table.pop("kind", "sphere"), Literal["sphere", "cylinder", "plate"], "body.kind", base)
@@ -333,6 +342,8 @@ def _experiment(document: Mapping[str, Any], base: Path) -> Experiment:
         lights=tuple(_light(table, body, base) for table in lights) if lights else three_lights(body.front),
         camera=_camera(read_table(document, "camera"), body, base),
     )
+    if "polarisers" in document:
+        scene = scene.polarised(read_section(Polarisers, "polarisers", read_table(document, "polarisers"), base))
     return Experiment(
         scene=scene,
         states=tuple(_state(table, body, base) for table in _tables(document, "states")),

@@ -24,7 +24,7 @@ from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.view.address import KINDS, Mark, probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
-from rgbmidic.view.fields import Background, warning
+from rgbmidic.view.picture import Background, warning
 
 __all__ = ["CurvePanel", "LinePanel", "Progress", "TimeLine", "as_csv", "band", "groups", "marks_of"]
 __all__ += ["places", "probes", "read"]

@@ -36,20 +36,25 @@ from rgbmidic.view.address import (
 from rgbmidic.view.canvas import Canvas, LabelLayer, LineLayer, arrow_lines, contour_lines, direction_lines
 from rgbmidic.view.curves import CurvePanel, LinePanel, Progress, TimeLine, as_csv, marks_of, places, probes
 from rgbmidic.view.draft import Confirmation, Draft, channel_section, probe_section, scale_section
-from rgbmidic.view.fields import (
+from rgbmidic.view.models import CONTROLS, WRITTEN, MarkLayer, ResultControls, SharedState, script
+from rgbmidic.view.picture import (
+    AROUND,
+    Overlay,
+    Picture,
     Pictures,
     every,
     extremes,
     frame_text,
     guarded,
+    paint,
+    palette,
+    palette_name,
     pointer_text,
     probe_text,
     range_of_test,
     robust_range,
     warning,
 )
-from rgbmidic.view.models import CONTROLS, WRITTEN, MarkLayer, ResultControls, SharedState, script
-from rgbmidic.view.picture import AROUND, Overlay, Picture, paint, palette, palette_name
 from rgbmidic.view.setup_panel import Movie
 
 __all__ = ["ResultPage"]

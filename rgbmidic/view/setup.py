@@ -34,9 +34,8 @@ from rgbmidic.view.draft import (
     masks_of,
     region_of,
 )
-from rgbmidic.view.fields import Background, every, guarded, warning
 from rgbmidic.view.models import SharedState, script
-from rgbmidic.view.picture import AROUND, Overlay, paint, palette
+from rgbmidic.view.picture import AROUND, Background, Overlay, every, guarded, paint, palette, warning
 from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, pictures, side_by_side
 
 __all__ = ["SetupPage"]

@@ -17,8 +17,7 @@ from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories, read_profile
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
 from rgbmidic.view import setup_panel
-from rgbmidic.view.fields import robust_range
-from rgbmidic.view.picture import element_at
+from rgbmidic.view.picture import element_at, robust_range
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 RIGHT, LEFT, HOME = "\ue014", "\ue012", "\ue011"

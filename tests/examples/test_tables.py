@@ -13,7 +13,18 @@ sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 from benchmarks import ROOT
 from benchmarks import __main__ as driver
-from benchmarks.tables import FOLDER, TABLES, Entry, MissingDataError, Table, disagreements, load, table, written
+from benchmarks.tables import (
+    FOLDER,
+    README,
+    TABLES,
+    Entry,
+    MissingDataError,
+    Table,
+    disagreements,
+    load,
+    table,
+    written,
+)
 
 BROKEN = load()
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -52,6 +63,26 @@ def test_each_table_and_figure_of_a_page_resolves(page):
     for text in re.findall(r"\{measured\}`([^`]+)`", page.read_text(encoding="utf-8")):
         name, keys, column = (part.strip() for part in text.split("|"))
         Table.read(FOLDER / f"{name}.csv").figure(keys.split(","), column)
+
+
+def test_the_readme_shows_its_tables_as_they_are():
+    text = README.read_text(encoding="utf-8")
+    names = re.findall(r"<!-- measured: (\w+) -->", text)
+    assert "reflections" in names
+    for name in names:
+        assert Table.read(FOLDER / f"{name}.csv").shown_in(text) == text
+
+
+def test_a_block_is_replaced_and_nothing_else():
+    text = "before\n<!-- measured: sphere -->\nold\n<!-- end -->\n<!-- measured: cube -->\nold\n<!-- end -->\n"
+    shown = Table.of(ENTRY, ROWS).shown_in(text)
+    assert shown.startswith("before\n<!-- measured: sphere -->\n\n| camera | angle [deg] | rms error [px] |")
+    assert (
+        "| --- | --- | ---: | ---: | ---: |\n| Bayer | 8 | 0.0122 | 0.000400 | 3 |\n| 3-CCD | 8 | 0.0100 | – | 0 |\n"
+        in shown
+    )
+    assert shown.endswith("\n\n<!-- end -->\n<!-- measured: cube -->\nold\n<!-- end -->\n")
+    assert Table.of(ENTRY, ROWS).shown_in(shown) == shown
 
 
 def test_each_file_is_of_a_table():

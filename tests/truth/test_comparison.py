@@ -2,52 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
-from plate_fe import PLACEMENT, Plate
-from results import make_result
-from textures import Texture
+from plate_fe import compared_plates
 
-from rgbmidic import correlate
-from rgbmidic.results import FrameRecord
-from rgbmidic.results.comparison import Comparison, FrameComparison, Simulation
+from rgbmidic.results.comparison import FrameComparison
 
-DRAWS, NOISE, STIFF = 8, 4.0, 1.03
+DRAWS, STIFF = 8, 1.03
 RATIO = (0.9, 1.1)  # rms over the draws of difference over stated: .94 of displacement, .92 to 1.01 of strain
-COARSE, FINE = 30, 10  # sides of the measurement's and of the simulation's elements, px
 
 
 @pytest.fixture(scope="module")
 def comparisons(tmp_path_factory: pytest.TempPathFactory) -> dict[float, list[FrameComparison]]:
     """Pairs of noisy photographs of a simulated plate, compared with its simulation and with one that is too stiff."""
-    plate, texture, random = Plate.of(FINE), Texture.random(3, waves=150), np.random.default_rng(1)
-    pair = [plate.image(texture, amount) for amount in (0.0, 1.0)]
-    solutions = [
-        correlate(
-            *(image + random.normal(0, NOISE, image.shape) for image in pair),
-            region=plate.region(),
-            element_size=COARSE,
-        )
-        for _ in range(DRAWS)
-    ]
-    nodes = solutions[0].nodes
-
-    def record(index: int) -> FrameRecord:
-        (u, v), (u_std, v_std) = solutions[index].displacement.T, solutions[index].displacement_std.T
-        return FrameRecord.of(nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, u_std=u_std, v_std=v_std)
-
-    path: Path = tmp_path_factory.mktemp("comparison") / "result"
-    mesh = {"nodes": nodes, "elements": solutions[0].elements, "references": []}
-    result = make_result(path, frames=DRAWS, record=record, **mesh)
-    simulation = Simulation(mesh=plate.mesh, displacement=plate.displacement[None])
-    made = {}
-    for modulus in (1.0, STIFF):
-        wrong = replace(simulation, displacement=simulation.displacement / modulus)
-        made[modulus] = list(Comparison(result, wrong, PLACEMENT, frames=range(DRAWS)).each())
-    return made
+    return compared_plates(tmp_path_factory.mktemp("comparison"), draws=DRAWS, moduli=(1.0, STIFF))
 
 
 def chi_square(frames: list[FrameComparison], way: str, name: str) -> float:

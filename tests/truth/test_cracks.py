@@ -3,64 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
+from crack_scene import (
+    FACTORS,
+    GAP_LEVEL,
+    MATERIAL,
+    NOISE,
+    PATH,
+    REGION,
+    SHAPE,
+    SHIFT,
+    TIP,
+    as_nodal,
+    cracked,
+    deformed_image,
+    noisy,
+    opening_at,
+    reference_image,
+    truth,
+    williams_field,
+)
 from textures import Texture
 
 from rgbmidic import NodeStatus, Region, Tri3Mesh, correlate, measure_sequence
 from rgbmidic.correlation import Deformed, Reference, Start, fill, track
 from rgbmidic.correlation.images import as_light_stack
-from rgbmidic.fields import Nodal, Units, Williams, crack_jump, stress_intensity
-from rgbmidic.fields.cracks import williams_series
+from rgbmidic.fields import crack_jump, stress_intensity
 from rgbmidic.settings import SolverSettings
 from rgbmidic.weights import Statistics
 
-SHAPE = (240, 320)
-REGION = (10, 10, 309, 229)
-PATH = [(0, 120), (200, 120)]
-SHIFT = np.array([0.3, -0.2])
-NOISE = 2.0
-GAP_LEVEL = 60.0
 ERROR_NEAR = 0.019
 """rms error (px) of the nodes within an element of the crack; .013 measured, .011 far from it."""
 LEFT = 0.28
 """Largest error (px) of a node that is kept beside a crack of which nothing is said, and which opens by 5 px."""
 RATIO = (0.75, 1.25)
 """rms of error over stated uncertainty of these nodes: some 60 values a case, so to 10 %."""
-
-
-def opening_at(x, opening):
-    """The jump along y (px): `opening` at x = 0, none from the tip on."""
-    return opening * np.clip(1 - x / PATH[1][0], 0, None)
-
-
-def truth(points, above, opening):
-    """(u, v) of points (N, 2), of which some lie above the crack."""
-    jump = opening_at(points[:, 0], opening) / 2
-    return SHIFT + np.stack([np.zeros(len(points)), np.where(above, -jump, jump)], axis=1)
-
-
-@cache
-def reference_image(seed=0):
-    return Texture.random(seed).image(SHAPE)
-
-
-@cache
-def deformed_image(opening, gap=GAP_LEVEL, jump=0.0, seed=0):
-    """`gap` is the grey level between the sides, `jump` the fraction by which the lower one is lit more."""
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
-    x, y = x - SHIFT[0], y - SHIFT[1]
-    texture, half, image = Texture.random(seed), opening_at(x, opening) / 2, np.full(SHAPE, gap)
-    for side, light in ((-1, 1.0), (1, 1 + jump)):
-        own = side * (y - PATH[0][1]) >= half
-        image[own] = light * texture.at(x[own], (y - side * half)[own])
-    return image
-
-
-def noisy(image, seed):
-    return image + np.random.default_rng(seed).normal(scale=NOISE, size=SHAPE)
 
 
 def measured(opening, cracks=()):
@@ -193,54 +172,11 @@ def test_nodes_under_a_corrupted_patch_are_lost_for_their_reason_and_come_back_w
     np.testing.assert_allclose(after.displacement, np.broadcast_to(SHIFT, after.displacement.shape), atol=0.06)
 
 
-TIP = (130.0, 130.0)
-FIELD = (260, 260)
-MATERIAL = Williams(youngs_modulus=70_000, poissons_ratio=0.33, plane="stress", units=Units(mm_per_pixel=0.05))
-FACTORS = np.array([20.0, -6.0])
-"""K_I and K_II, MPa sqrt(m): an opening of 1.5 px at the edge of the field."""
-T_STRESS = 20.0
 DRAWS = 24
 BIAS = 0.027
 """Largest error of K (MPa sqrt(m)) in images without noise; .008 and .018 measured, where noise gives .052 and .043."""
 COVERED = (0.9, 1.2)
 """rms of error over stated uncertainty of both factors over the draws; 1.09 measured."""
-
-
-def williams_field(x, y, side):
-    """(u, v) in px at points from the tip, y down, on the continued field of one side (1: above, on the left)."""
-    shear = MATERIAL.youngs_modulus / (1 + MATERIAL.poissons_ratio)
-    root = 1 / np.sqrt(2 * np.pi * MATERIAL.units.mm_per_pixel * 1e-3) / shear
-    coefficients = np.r_[0.1, -0.07, FACTORS * root, T_STRESS / 4 / shear, 0, 2e-3 * FACTORS[0] * root, 1e-5]
-    angle = np.arctan2(-y, x)
-    angle += 2 * np.pi * side * (angle * side < -np.pi / 2)
-    terms = williams_series(np.hypot(x, y).ravel(), angle.ravel(), range(4), MATERIAL.kolosov) @ coefficients
-    return terms[:, 0].reshape(x.shape), -terms[:, 1].reshape(x.shape)
-
-
-@cache
-def cracked_images():
-    texture = Texture.random(3, waves=120)
-    y, x = (axis.astype(float) - at for axis, at in zip(np.mgrid[: FIELD[0], : FIELD[1]], TIP[::-1], strict=True))
-    deformed = np.full(FIELD, GAP_LEVEL)
-    for side in (1, -1):
-        u, v = np.zeros((2, *FIELD))
-        for _ in range(12):  # where each pixel comes from: the field's gradient is .01
-            u, v = williams_field(x - u, y - v, side)
-        own = side * (y - v) <= 0
-        deformed[own] = texture.at((x - u)[own] + TIP[0], (y - v)[own] + TIP[1])
-    return texture.image(FIELD), deformed
-
-
-def cracked(noise, seed, normalise):
-    random = np.random.default_rng(seed)
-    pair = [image + random.normal(scale=noise, size=FIELD) for image in cracked_images()]
-    options = {"region": (6, 6, 253, 253), "element_size": 16, "cracks": [[(0, TIP[1]), TIP]]}
-    return correlate(*pair, normalise=normalise, **options)
-
-
-def as_nodal(solutions):
-    u, v, u_std, v_std = np.moveaxis([np.c_[one.displacement, one.displacement_std] for one in solutions], -1, 0)
-    return Nodal(u=u, v=v, u_std=u_std, v_std=v_std)
 
 
 @pytest.mark.parametrize("normalise", [None, 10.0])

@@ -13,9 +13,9 @@ from rgbmidic.typing import FloatArray
 
 SIZE, ELEMENT = 320, 20
 REGION = (15, 15, 304, 304)
-TOGETHER = (0.8, 1.25)  # measured: .82 to 1.19
-AT_EDGE = (0.6, 1.6)  # measured: .69 to 1.5
-INFLATED = 1.15  # measured: 1.02 to 1.09
+TOGETHER = (0.75, 1.25)  # measured: .79 to 1.19
+AT_EDGE = (0.6, 1.6)  # measured: .69 to 1.44
+INFLATED = 1.15  # measured: 1.04 and 1.14
 Field = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 

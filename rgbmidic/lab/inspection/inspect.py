@@ -20,9 +20,19 @@ from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_m
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.lab.inspection.prediction import CONTRAST_WIDTH, LocalContrast, Prediction, SeparationErrors, predict
+from rgbmidic.lab.inspection.prediction import (
+    CONTRAST_WIDTH,
+    Channel,
+    LocalContrast,
+    Prediction,
+    SeparationErrors,
+    channels_of,
+    noise_estimate,
+    predict,
+    speckle_texture,
+    surroundings,
+)
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
-from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture, surroundings
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings

@@ -56,7 +56,7 @@ class ChannelSummary:
     saturated : float
         Fraction of the samples that are saturated.
     speckle_px : float
-        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.samples.speckle_texture`).
+        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.prediction.speckle_texture`).
     noise_dn : float
         Standard deviation of the camera noise of a sample at the mean level, DN; estimated from the frame where the
         calibration does not know the noise.

@@ -11,7 +11,7 @@ from rgbmidic.lab.virtual.rendering import (
     strained_plate,
     turned,
 )
-from rgbmidic.scene.camera import Camera, Light, reference_camera
+from rgbmidic.scene.camera import Camera, Light, Polarisers, reference_camera
 from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import AffineField, Finish, MeshField, Surface, height_map
 from rgbmidic.scene.zones import material_points, truth
@@ -25,6 +25,7 @@ __all__ = [
     "Light",
     "MeshField",
     "Plate",
+    "Polarisers",
     "Scene",
     "Sensitivities",
     "Sphere",

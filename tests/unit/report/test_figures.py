@@ -21,7 +21,7 @@ from rgbmidic.report import figures, gallery, remove_figures, save_figure, style
 from rgbmidic.results import FrameRecord, Maps, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import AnyArray
-from rgbmidic.view.fields import Pictures
+from rgbmidic.view.picture import Pictures
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 X, Y = MESH.nodes.T

@@ -19,7 +19,7 @@ from results import make_result
 
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
-from rgbmidic.results.provenance import fingerprint
+from rgbmidic.results.files import fingerprint
 from rgbmidic.results.store import load_frames
 from rgbmidic.typing import AnyArray
 

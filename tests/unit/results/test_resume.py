@@ -15,7 +15,8 @@ import pytest
 from results import MESH, make_origin, make_result, random_record
 
 from rgbmidic.errors import ResultError
-from rgbmidic.results import Result, ResultStore, finish_result, provenance
+from rgbmidic.results import Result, ResultStore, finish_result
+from rgbmidic.results import files as provenance
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SolverSettings, TestSettings
 
 FRAMES = 600

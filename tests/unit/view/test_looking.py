@@ -27,9 +27,21 @@ from rgbmidic.view import curves
 from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
 from rgbmidic.view.canvas import arrow_lines, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
-from rgbmidic.view.fields import frame_text, pointer_text, probe_text, range_of_test, robust_range, watched
 from rgbmidic.view.page import ResultPage
-from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, palette_name
+from rgbmidic.view.picture import (
+    Overlay,
+    Window,
+    element_at,
+    frame_text,
+    paint,
+    palette,
+    palette_name,
+    pointer_text,
+    probe_text,
+    range_of_test,
+    robust_range,
+    watched,
+)
 
 NAMES = ("u", "v", "e1")
 

@@ -8,7 +8,7 @@ import pytest
 from rgbmidic.errors import ConfigurationError, ResultError
 from rgbmidic.frames import read_frame
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.lab.virtual import AffineField, MeshField, Sphere, record, render, truth
+from rgbmidic.lab.virtual import AffineField, MeshField, Polarisers, Sphere, record, render, truth
 from rgbmidic.lab.virtual.dataset import write_dataset
 from rgbmidic.scene.scene import read_scene
 from rgbmidic.settings import read_test
@@ -92,6 +92,20 @@ def test_reference_values_stand_in_for_what_is_left_out(tmp_path):
     assert scene.camera.crosstalk[1, 2] == 0.16
 
 
+def test_polarisers_are_there_where_their_section_is(tmp_path):
+    bare, empty, stated = (
+        read_scene(scene_file(tmp_path, text)).scene
+        for text in ("", "[polarisers]", "[polarisers]\nextinction = 1e-4\ntransmission = 0.15\ndepolarised = 0.0")
+    )
+    for scene, polarisers in (
+        (empty, Polarisers()),
+        (stated, Polarisers(extinction=1e-4, transmission=0.15, depolarised=0.0)),
+    ):
+        expected = bare.polarised(polarisers)
+        assert (scene.lights, scene.surface) == (expected.lights, expected.surface)
+    assert stated.lights[1].power == pytest.approx(0.15 * bare.lights[1].power)
+
+
 def test_plate_takes_a_gradient_or_a_mesh_file(tmp_path):
     nodes = np.array([[-9.0, -9.0], [9.0, -9.0], [9.0, 9.0], [-9.0, 9.0]])
     np.savez(tmp_path / "field.npz", nodes=nodes, elements=[[0, 1, 2], [0, 2, 3]], displacement=0.01 * nodes)
@@ -124,6 +138,10 @@ def test_plate_takes_a_gradient_or_a_mesh_file(tmp_path):
         ("[[states]]\ndisplacement_offset = [1.0, 0.0]", "for a plate only"),
         ('body.kind = "plate"\n[[states]]\ndisplacement_file = "absent.npz"', "absent.npz"),
         ('[camera]\nsensitivities = "absent.json"', "absent.json"),
+        ("[polarisers]\nextinction = 1.5", "extinction and depolarised lie in 0 to 1"),
+        ("[polarisers]\ntransmission = 0.0", "given are extinction 0.01, depolarised 0.01, transmission 0.0"),
+        ("[polarisers]\ntransmitted = 0.2", 'unknown key "transmitted" in [polarisers]'),
+        ("[[polarisers]]\nextinction = 0.1", "polarisers"),
         ("[output]\nregion = [1, 2]", "output.region must be 4 values"),
         ("not toml", "not a readable scene file"),
     ],

@@ -15,6 +15,7 @@ from rgbmidic.lab.virtual import (
     Finish,
     Light,
     Plate,
+    Polarisers,
     Scene,
     Sphere,
     State,
@@ -135,6 +136,38 @@ def test_light_adds_up_and_is_linear_in_power():
         assert np.allclose(render(alone)[0], together[j], rtol=1e-6)
         brighter = scene.with_light(replace(light, power=3 * light.power))
         assert np.allclose(render(brighter)[j], 3 * together[j], rtol=1e-5)
+
+
+@pytest.mark.parametrize("lamps", [1, 3])
+def test_crossed_polarisers_dim_the_diffuse_light_and_take_the_glare_off(lamps):
+    scene = sphere_scene(size=32, samples=3)
+    scene = replace(scene, lights=scene.lights[:lamps], camera=replace(scene.camera, crosstalk=np.eye(3)[:, :lamps]))
+    white, black = (replace(finish, gloss=0.0) for finish in (scene.surface.white, scene.surface.black))
+    mat = render(replace(scene, surface=replace(scene.surface, white=white, black=black)))
+    glare = render(scene) - mat
+    for polarisers in (Polarisers(), Polarisers(extinction=0.2, transmission=0.1, depolarised=0.5)):
+        expected = polarisers.transmission * (mat + polarisers.glare * glare)
+        assert np.allclose(render(scene.polarised(polarisers)), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("along", "across"), [(1.0, 0.0), (0.8, 0.004), (0.7, 0.2), (0.6, 0.6)])
+@pytest.mark.parametrize("lost", [0.0, 0.01, 1.0])
+def test_polarisers_pass_what_their_mueller_matrices_pass(along, across, lost):
+    """Real polarisers before an unpolarised lamp and the camera; `across` and `along` are transmittances of one."""
+
+    def polariser(sign):
+        even, odd, rest = (along + across) / 2, sign * (along - across) / 2, np.sqrt(along * across)
+        return np.array([[even, odd, 0], [odd, even, 0], [0, 0, rest]])
+
+    def passed(surface, sign):
+        return (polariser(sign) @ surface @ polariser(1) @ [1, 0, 0])[0]
+
+    keeps, loses = np.eye(3), np.diag([1.0, 0, 0])
+    polarisers = Polarisers(
+        extinction=passed(keeps, -1) / passed(keeps, 1), transmission=passed(loses, -1), depolarised=lost
+    )
+    left = (1 - lost) * passed(keeps, -1) + lost * passed(loses, -1)
+    assert polarisers.transmission * polarisers.glare == pytest.approx(left, rel=1e-12)
 
 
 def test_the_number_of_threads_does_not_change_a_bit():

@@ -1,0 +1,57 @@
+"""What a new frame costs the viewer's server: reading a field and painting it."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from results import make_result
+
+from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.results import FrameRecord, Maps
+from rgbmidic.view.picture import Overlay, Window, paint, palette
+
+from .tables import table
+
+FRAMES, SIDE = 12, 1200
+"""Frames of the result, and side of the region, px."""
+
+
+@table("viewer", page="how-to/view", cost=3, timing=True)
+def viewer(quick: bool) -> Iterator[dict[str, object]]:
+    """Processor time of the viewer's server for a frame that was not shown before: reading a field with its
+    uncertainty, and painting it on 1100 x 700 pixels of the screen; median of ten frames."""
+    picture = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE), dtype=np.uint8)
+    window = Window(left=0, top=0, right=SIDE, bottom=SIDE, width=1100, height=700).fitted()
+    for size in (120,) if quick else (40, 12):
+        mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, SIDE - 1, SIDE - 1), (SIDE, SIDE)), size)
+        fields = np.random.default_rng(1).normal(size=(2, len(mesh.nodes)))
+
+        def record(index: int, fields: np.ndarray = fields) -> FrameRecord:
+            named = dict(zip(("u", "v"), fields, strict=True)) | {f"{name}_std": abs(fields[0]) + 0.1 for name in "uv"}
+            return FrameRecord.of(nodes=fields.shape[1], lights=3, number=index, status=0, **named)
+
+        with tempfile.TemporaryDirectory() as folder:
+            parts = {"nodes": mesh.nodes, "elements": mesh.elements, "references": []}
+            made = make_result(Path(folder) / "result", frames=FRAMES, record=record, **parts)
+            maps, colours = Maps.of(made), palette("viridis")
+            for name in ("u", "exx"):
+                times = []
+                for index in range(FRAMES):
+                    start = time.process_time()
+                    values = maps.read(name, index)
+                    read = time.process_time()
+                    over = {
+                        "nodes": mesh.nodes,
+                        "elements": mesh.elements,
+                        "values": values.values,
+                        "ends": (-1.0, 1.0),
+                    }
+                    paint(window, picture, Overlay(colours=colours, **over))
+                    times.append((read - start, time.process_time() - read))
+                reading, painting = 1e3 * np.median(times[2:], axis=0)
+                row: dict[str, object] = {"nodes": str(len(mesh.nodes)), "field": name}
+                yield row | {"reading [ms]": float(reading), "painting [ms]": float(painting)}
