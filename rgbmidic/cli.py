@@ -45,8 +45,8 @@ def main() -> None:
 @app.callback(invoke_without_command=True)
 def _rgbmidic(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show where an error comes from.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an error occurs.")] = False,
 ) -> None:
     """Digital Image Correlation that survives light reflections."""
     if version:
@@ -60,16 +60,16 @@ def run(
     test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
     out: Out,
     overwrite: Overwrite = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in DIR.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in DIR.")] = False,
     retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="With --resume: measure all frames again that failed.")
+        bool, typer.Option("--retry-failed", help="With --resume: measure all failed frames again.")
     ] = False,
     frames: Annotated[
-        str, typer.Option("--frames", help="Only these, such as 1000:2000; then `rgbmidic finish`.")
+        str, typer.Option("--frames", help="Only these, such as 1000:2000; end with `rgbmidic finish`.")
     ] = "",
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
-    timings: Annotated[bool, typer.Option("--timings", help="Keep and print the time of each stage.")] = False,
+    timings: Annotated[bool, typer.Option("--timings", help="Store and print the time of each stage.")] = False,
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
@@ -119,8 +119,8 @@ def batch(
 ) -> None:
     """Measure a series of tests, each into DIR/NAME, with one summary table and page.
 
-    A test that fails does not stop the rest; one that is measured already is not measured again. --overwrite replaces a
-    result of other settings.
+    A test that fails does not stop the others; a finished test is not measured again. --overwrite replaces a
+    result that was measured with other settings.
     """
     from rgbmidic.pipeline import batch as series
     from rgbmidic.report import REPORT, write_batch_page, write_report
@@ -164,10 +164,10 @@ def batch(
 
 @app.command()
 def finish(
-    result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that runs with --frames have filled.")],
+    result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of runs with --frames.")],
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
 ) -> None:
-    """End a result that was measured in parts: check that no frame is missing, and draw it."""
+    """Finish a result that was measured in parts: check that no frame is missing, and draw it."""
     from rgbmidic.results import Result, finish_result
 
     started = time.perf_counter()
@@ -176,9 +176,9 @@ def finish(
 
 
 def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
-    """Draw a finished result and print how its frames ended.
+    """Draw a finished result and print the status of its frames.
 
-    The drawing takes as many processes as cores if none are asked for; the command fails where more than `_TOO_MANY`
+    The drawing uses as many processes as cores if no number is stated; the command fails if more than `_TOO_MANY`
     of the frames failed or did not converge.
     """
     from rgbmidic._kernels.threads import threads
@@ -200,7 +200,7 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
 
 @contextmanager
 def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> Iterator[None]:
-    """Print how to go on when the run is interrupted, by Ctrl-C or by SIGTERM, if anything was begun."""
+    """Print how to continue when the run is interrupted, by Ctrl-C or by SIGTERM, if it wrote anything."""
     from rgbmidic.results.files import PROVENANCE
 
     def begun() -> bytes:
@@ -223,11 +223,9 @@ def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> I
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("--out", help="Folder for what is written; must be empty or new.")] = Path(
-        "rgbmidic-demo"
-    ),
+    out: Annotated[Path, typer.Option("--out", help="Output folder; must be empty or new.")] = Path("rgbmidic-demo"),
 ) -> None:
-    """Make a small virtual test, calibrate, measure it, and compare with the known truth."""
+    """Make a small virtual test, calibrate and measure it, and compare the result with the exact truth."""
     note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
     _explain_first_run()
     from rgbmidic._kernels.threads import threads
@@ -267,7 +265,7 @@ def demo(
 
 
 def _calibrate_demo(test: Path) -> None:
-    """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` finds it."""
+    """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` computes it."""
     from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.captures import Captures
     from rgbmidic_calibration.jobs import calibrate_crosstalk
@@ -279,7 +277,7 @@ def _calibrate_demo(test: Path) -> None:
 
 
 def _calibrate_demo_camera(test: Path) -> None:
-    """Lens and plane from the demo's photographs, as `rgbmidic-calibrate camera` finds them."""
+    """Lens and plane from the demo's photographs, as `rgbmidic-calibrate camera` computes them."""
     from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.jobs import calibrate_camera
     from rgbmidic_calibration.target import Target
@@ -293,10 +291,10 @@ def _calibrate_demo_camera(test: Path) -> None:
 
 @app.command()
 def sample(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Which one; without it, they are listed.")] = "",
-    folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="Empty or new; else NAME.")] = None,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a sample; without it, all are listed.")] = "",
+    folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="New or empty folder; else NAME.")] = None,
 ) -> None:
-    """Fetch real files to try from where they are published, with their TEST.toml; or list what there is."""
+    """Download published real files with a TEST.toml for them, or list the available samples."""
     from rgbmidic.lab.samples import SAMPLES, write_sample
 
     if not name:
@@ -312,7 +310,7 @@ def sample(
 
 @app.command()
 def virtual(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="What to render.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Scene to render.")],
     out: Out,
 ) -> None:
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
@@ -325,14 +323,14 @@ def virtual(
 
 @app.command()
 def plan(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Lamps, camera, paint, body and its states.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Lamps, camera, paint, specimen and its states.")],
     out: Out,
     distance: Annotated[
-        float | None, typer.Option("--distance", metavar="MM", help="From camera to specimen; else the scene's.")
+        float | None, typer.Option("--distance", metavar="MM", help="Camera to specimen; else the scene's.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Predict where each lamp reflects, the uncertainty to expect, and better places for the lamps."""
+    """Predict where each lamp is reflected, the expected uncertainty, and better positions of the lamps."""
     from rgbmidic.lab import check_folder
     from rgbmidic.lab import planning_report as planning
     from rgbmidic.lab.planning import make_plan, propose_colours, propose_lamps
@@ -366,13 +364,13 @@ def frames(
     statement: dict[str, Any],
     path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
     formats: Annotated[bool, typer.Option("--formats", help="List the formats that are read.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
     save: Annotated[
         tuple[int, Path] | None, typer.Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """List what a reader finds in raw frames: number, size, levels, times, missing frames."""
+    """List the properties of raw frames as read: number, size, levels, times, missing frames."""
     from rgbmidic.frames import known_formats
     from rgbmidic.frames.series import describe, save_frame
     from rgbmidic.settings import FrameSettings
@@ -395,19 +393,19 @@ def frames(
 @app.command()
 @command.frame_options
 def inspect(
-    frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; one per light in succession.")],
+    frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; in succession one per light.")],
     statement: dict[str, Any],
-    test: Annotated[Path | None, typer.Option("--test", help="TEST.toml the frame is meant for.")] = None,
+    test: Annotated[Path | None, typer.Option("--test", help="TEST.toml of the test.")] = None,
     calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
-    region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or the frame.")] = "",
-    element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's or 25.")] = None,
+    region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or all.")] = "",
+    element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's, or 25.")] = None,
     accept: Annotated[
-        list[str] | None, typer.Option("--accept", help="Contradiction to the calibration to accept; else the test's.")
+        list[str] | None, typer.Option("--accept", help="Failing calibration check to accept; else the test's.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Inspect one frame before a test: lights, reflections, speckle, noise, uncertainty to expect."""
+    """Inspect one frame before a test: lights, reflections, speckle, noise, expected uncertainty."""
     from rgbmidic.lab import check_folder
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
 
@@ -489,7 +487,7 @@ def resolution(
 
 
 def _explain_first_run() -> None:
-    """Print why the first use takes longer."""
+    """Print why the first run takes longer."""
     from rgbmidic._kernels import are_compiled
 
     if not are_compiled():
@@ -500,7 +498,7 @@ def _explain_first_run() -> None:
 
 
 def _print_summary(result: Result, seconds: float) -> None:
-    """Print how the deformed frames ended; the reference, matched with itself, is left out."""
+    """Print the status of the deformed frames; the reference, matched with itself, is left out."""
     from rgbmidic.timing import STAGES
 
     deformed = list(result.deformed)

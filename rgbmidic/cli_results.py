@@ -53,33 +53,33 @@ def read_settings(test: Path | None) -> TestSettings | None:
     return None if test is None else read_test(test)
 
 
-Out = Annotated[Path, typer.Option("--out", help="Folder for what is written; made where it does not exist.")]
+Out = Annotated[Path, typer.Option("--out", help="Output folder; created if it does not exist.")]
 
 
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is already there.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 
 
 Reading = Annotated[
     Path | None,
     typer.Option(
-        "--test", help="TEST.toml whose [scale], [setup], [probes] and [channels] count instead of those kept."
+        "--test", help="TEST.toml whose [scale], [setup], [probes] and [channels] replace those of the result."
     ),
 ]
 
 
-Partial = Annotated[bool, typer.Option("--partial", help="Take what an interrupted run has finished.")]
+Partial = Annotated[bool, typer.Option("--partial", help="Use the finished frames of an interrupted run.")]
 
 
 _PLACES = {
-    "points": ("--point", "X,Y", "Displacement there."),
-    "lines": ("--line", "X0,Y0:X1,Y1", "Mean displacement along it."),
-    "circles": ("--circle", "X,Y:R", "Mean displacement over it."),
-    "regions": ("--region", "X0,Y0:X1,Y1", "Mean displacement over it."),
-    "gauges": ("--gauge", "X0,Y0:X1,Y1", "Between two points that move."),
-    "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1", "Along the line as it was."),
+    "points": ("--point", "X,Y", "Displacement of a point."),
+    "lines": ("--line", "X0,Y0:X1,Y1", "Mean displacement along a line."),
+    "circles": ("--circle", "X,Y:R", "Mean displacement over a circle."),
+    "regions": ("--region", "X0,Y0:X1,Y1", "Mean displacement over a rectangle."),
+    "gauges": ("--gauge", "X0,Y0:X1,Y1", "Extensometer between two points, deformed state."),
+    "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1", "Extensometer along the reference line."),
     "strain_gauges": ("--strain-gauge", "X,Y:LENGTH", "Virtual strain gauge."),
-    "cracks": ("--crack", "X0,Y0:X1,Y1", "Jump along a crack of the mesh."),
-    "tips": ("--tip", "X,Y:R0,R1", "Stress intensity at a crack's tip."),
+    "cracks": ("--crack", "X0,Y0:X1,Y1", "Opening and sliding of a crack of the mesh."),
+    "tips": ("--tip", "X,Y:R0,R1", "Stress intensity factors of a crack tip."),
 }
 """Keys of ``[probes]`` with the option, the form of a place and the help."""
 
@@ -91,26 +91,26 @@ _PROBE_OPTIONS: dict[str, Any] = {
     "youngs_modulus": Annotated[float | None, typer.Option("--youngs-modulus", metavar="MPA", help="For --tip.")],
     "poissons_ratio": Annotated[float | None, typer.Option("--poissons-ratio", help="For --tip.")],
     "plane": Annotated[str | None, typer.Option("--plane", help="For --tip: stress or strain.")],
-    "terms": Annotated[int | None, typer.Option("--terms", help="Highest term of Williams' series; 0: by a test.")],
+    "terms": Annotated[int | None, typer.Option("--terms", help="Highest term of Williams' series; 0: automatic.")],
     "fit_tip": Annotated[
-        bool | None, typer.Option("--fit-tip/--mesh-tip", help="Fit the tip's place along the crack.")
+        bool | None, typer.Option("--fit-tip/--mesh-tip", help="Fit the position of the tip along the crack.")
     ],
     "measure": Annotated[str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")],
     "window": Annotated[
-        int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more; 0: no rates.")
+        int | None, typer.Option("--window", help="Frames per parabola for rates, 4 or more; 0: no rates.")
     ],
-    "rigid_motion": Annotated[str | None, typer.Option("--rigid", help="Motion as a whole: none, tell or remove.")],
+    "rigid_motion": Annotated[str | None, typer.Option("--rigid", help="Rigid motion: none, tell (report) or remove.")],
 }
 
 
 _CHANNEL_OPTIONS: dict[str, Any] = {
-    "file": Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then a column each.")],
-    "offset": Annotated[float | None, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")],
-    "trigger": Annotated[str | None, typer.Option("--trigger", help="Channel whose first step is the time 0.")],
+    "file": Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then one column per channel.")],
+    "offset": Annotated[float | None, typer.Option("--offset", metavar="S", help="Time added to the channels, s.")],
+    "trigger": Annotated[str | None, typer.Option("--trigger", help="Channel whose first step is at time 0.")],
     "align": Annotated[
         str | None, typer.Option("--align", metavar="CHANNEL=COLUMN", help="Offset by correlation with a history.")
     ],
-    "area": Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, for a stress.")],
+    "area": Annotated[float | None, typer.Option("--area", metavar="MM2", help="Cross-section, to compute a stress.")],
     "force": Annotated[str | None, typer.Option("--force", help="Channel with the force (_N or _kN).")],
 }
 """Keys of ``[channels]``."""
@@ -151,14 +151,14 @@ def figures(
         typer.Option("--gauge", help="Length of the virtual strain gauge in px; by default the shortest."),
     ] = None,
     measure: Annotated[str | None, typer.Option("--measure", help="Strain measure, such as hencky.")] = None,
-    since: Annotated[int | None, typer.Option("--since", help="Frame that displacement and strain count from.")] = None,
-    rigid: Annotated[bool, typer.Option("--remove-rigid", help="Remove shift and rotation of the whole.")] = False,
-    window: Annotated[int | None, typer.Option("--window", help="Frames that rates are taken over.")] = None,
-    hatch: Annotated[bool, typer.Option("--hatch", help="Hatch what is within 2 standard uncertainties of 0.")] = False,
+    since: Annotated[int | None, typer.Option("--since", help="Frame that the fields are relative to.")] = None,
+    rigid: Annotated[bool, typer.Option("--remove-rigid", help="Remove rigid shift and rotation.")] = False,
+    window: Annotated[int | None, typer.Option("--window", help="Number of frames for rates.")] = None,
+    hatch: Annotated[bool, typer.Option("--hatch", help="Hatch values within 2 standard uncertainties of 0.")] = False,
     test: Reading = None,
     partial: Partial = False,
 ) -> None:
-    """Draw a result: maps, masks and reflections of some frames, and what happened over all of them; or any fields."""
+    """Draw a result: maps, masks and reflections of some frames, curves over all frames, or any fields."""
     from rgbmidic._kernels.threads import threads
     from rgbmidic.report import write_figures, write_maps
     from rgbmidic.results import Maps, Result
@@ -182,7 +182,7 @@ def figures(
 @app.command()
 def export(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder that `rgbmidic run` wrote.")],
-    out: Annotated[Path, typer.Option("--out", help="File to write; of crackpy a folder.")],
+    out: Annotated[Path, typer.Option("--out", help="File to write; for crackpy a folder.")],
     to: Annotated[str, typer.Option("--to", help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
     test: Reading = None,
     overwrite: Overwrite = False,
@@ -201,11 +201,11 @@ def report(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path | None, typer.Option("--out", help="HTML file; by default RESULT/report.html.")] = None,
     test: Reading = None,
-    frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10, of which maps are shown.")] = "",
+    frames: Annotated[str, typer.Option("--frames", help="Indices of frames to show as maps, such as 0,5,10.")] = "",
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
-    """Write the report of a test: one HTML page, to be read in any browser and printed."""
+    """Write the report of a test: one HTML page that can be printed."""
     from rgbmidic.report import REPORT, write_report
     from rgbmidic.results import Result
 
@@ -219,16 +219,14 @@ def report(
 def view(
     path: Annotated[
         Path,
-        typer.Argument(
-            metavar="PATH", help="Result, also one that still grows; TEST.toml; raw frames; folder of tests."
-        ),
+        typer.Argument(metavar="PATH", help="Result, also of a running test; TEST.toml; raw frames; folder of tests."),
     ],
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")] = 0,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0: any free port.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
 ) -> None:
-    """Look at a result, or set a test up, in the browser: the address is printed, only this machine is served.
+    """Look at a result, or set up a test, in the browser. The address is printed; it is valid on this machine only.
 
-    Ctrl-C ends it.
+    Ctrl-C ends the server.
     """
     serve = command.optional("rgbmidic.view", "view").serve
     serve(path, port=port, browser=browser, tell=lambda address: print(address, flush=True))
@@ -239,7 +237,7 @@ def view(
 @command.gather("channels", _CHANNEL_OPTIONS, _read_channels)
 def history(
     folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
-    out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
+    out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture gets the same name.")],
     probes: dict[str, Any],
     channels: dict[str, Any],
     test: Reading = None,
@@ -248,7 +246,7 @@ def history(
 ) -> None:
     """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
 
-    Places are in px on the reference; the option of a place may be given several times.
+    Positions are in px on the reference; an option of a position may be given several times.
     """
     from rgbmidic.report import history_figure, save_figure
     from rgbmidic.results import Result, channels_of, history_rows, probes_of, write_histories
@@ -284,9 +282,9 @@ def history(
 _DERIVED: dict[str, Any] = {
     "gauge": Annotated[float | None, typer.Option("--gauge", metavar="PX", help="Virtual strain gauge length, px.")],
     "measure": _PROBE_OPTIONS["measure"],
-    "since": Annotated[int | None, typer.Option("--since", metavar="N", help="Displacement and strain since frame N.")],
-    "rigid_removed": Annotated[bool, typer.Option("--remove-rigid", help="Remove the motion as a whole.")],
-    "window": Annotated[int | None, typer.Option("--window", help="Frames of a parabola, for rates, 4 or more.")],
+    "since": Annotated[int | None, typer.Option("--since", metavar="N", help="Show the fields relative to frame N.")],
+    "rigid_removed": Annotated[bool, typer.Option("--remove-rigid", help="Remove the rigid motion.")],
+    "window": Annotated[int | None, typer.Option("--window", help="Frames per parabola for rates, 4 or more.")],
 }
 """Options that state how fields are derived, by the keys of `rgbmidic.results.Maps.of`."""
 
@@ -317,19 +315,19 @@ def movie(
     derived: dict[str, Any],
     field: Annotated[str, typer.Option("--field", help="Fields side by side, such as u,exx,velocity.")] = "u",
     range_: Annotated[
-        str, typer.Option("--range", metavar="LOW:HIGH", help="Ends of the colour bars; else those of all frames.")
+        str, typer.Option("--range", metavar="LOW:HIGH", help="Range of the colour bars; else that of all frames.")
     ] = "",
     frames: Annotated[str, typer.Option("--frames", help="Only these, such as 10:200; by default all.")] = "",
     fps: Annotated[float, typer.Option("--fps", help="Frames per second of the movie.")] = 15.0,
-    over: Annotated[str, typer.Option("--over", help="reference, or frame: the raw frames, deformed.")] = "reference",
+    over: Annotated[str, typer.Option("--over", help="reference, or frame (the raw frames, deformed).")] = "reference",
     curve: Annotated[
         Path | None, typer.Option("--curve", help="CSV of `rgbmidic history` or of channels: a curve with a cursor.")
     ] = None,
     column: Annotated[str | None, typer.Option("--column", help="Column of --curve; by default the first.")] = None,
-    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the channels' times, s.")] = 0.0,
-    colours: Annotated[str | None, typer.Option("--colours", help="matplotlib's name of the colours.")] = None,
-    opacity: Annotated[float, typer.Option("--opacity", help="Of the fields over the image, 0 to 1.")] = 1.0,
-    width: Annotated[int, typer.Option("--width", help="Of the movie, px.")] = 1280,
+    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Time added to the channels, s.")] = 0.0,
+    colours: Annotated[str | None, typer.Option("--colours", help="Name of a matplotlib colour map.")] = None,
+    opacity: Annotated[float, typer.Option("--opacity", help="Opacity of the fields over the image, 0 to 1.")] = 1.0,
+    width: Annotated[int, typer.Option("--width", help="Width of the movie, px.")] = 1280,
     workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
     test: Reading = None,
     overwrite: Overwrite = False,
@@ -371,16 +369,14 @@ def movie(
 def profile(
     folder: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     line: Annotated[str, typer.Option("--line", metavar="X0,Y0:X1,Y1", help="Ends of the line on the reference, px.")],
-    out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture of the same name lies beside it.")],
+    out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture gets the same name.")],
     derived: dict[str, Any],
     field: Annotated[str, typer.Option("--field", help="One field, such as exx, u or u_velocity.")] = "u",
     frames: Annotated[str, typer.Option("--frames", help="Only these, such as 10:200; by default all.")] = "",
     curves: Annotated[str, typer.Option("--curves", help="Frames drawn as curves, such as 10,20,30.")] = "",
-    speed: Annotated[
-        str, typer.Option("--speed", metavar="WHAT", help="Fit the speed of the front, or of the peak.")
-    ] = "",
+    speed: Annotated[str, typer.Option("--speed", metavar="WHAT", help="Fit the speed of a wave: front or peak.")] = "",
     level: Annotated[
-        float | None, typer.Option("--level", help="Fraction of the peak at which the front is taken; else 0.5.")
+        float | None, typer.Option("--level", help="Fraction of the peak that defines the front; else 0.5.")
     ] = None,
     test: Reading = None,
     overwrite: Overwrite = False,
@@ -424,19 +420,19 @@ def compare(
         Path, typer.Option("--fe", help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")
     ],
     out: Out,
-    mesh: Annotated[Path | None, typer.Option("--mesh", help="Mesh file of the nodes of a .csv.")] = None,
+    mesh: Annotated[Path | None, typer.Option("--mesh", help="Mesh file with the nodes of a .csv.")] = None,
     points: Annotated[
         list[str] | None,
-        typer.Option("--points", metavar="X_MM,Y_MM:X_PX,Y_PX", help="Where a point of the mesh lies; twice or more."),
+        typer.Option("--points", metavar="X_MM,Y_MM:X_PX,Y_PX", help="Mesh point and its pixel; twice or more."),
     ] = None,
-    unit: Annotated[str, typer.Option("--unit", help="Of length in these files: mm, m, um or inch.")] = "mm",
+    unit: Annotated[str, typer.Option("--unit", help="Unit of length of the files: mm, m, um or inch.")] = "mm",
     field: Annotated[str | None, typer.Option("--field", help="Name of the displacement in the files.")] = None,
     interval: Annotated[
-        float | None, typer.Option("--interval", metavar="S", help="Time between the numbers of a folder's files.")
+        float | None, typer.Option("--interval", metavar="S", help="Time between files with successive numbers.")
     ] = None,
-    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Added to the simulation's times.")] = 0.0,
+    offset: Annotated[float, typer.Option("--offset", metavar="S", help="Time added to the simulation, s.")] = 0.0,
     frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10; by default all.")] = "",
-    rigid: Annotated[str, typer.Option("--rigid", help="Motion as a whole: tell or remove.")] = "tell",
+    rigid: Annotated[str, typer.Option("--rigid", help="Rigid motion: tell (report it) or remove.")] = "tell",
     test: Reading = None,
     overwrite: Overwrite = False,
     partial: Partial = False,
@@ -480,10 +476,10 @@ def compare(
 
 @app.command()
 def scale(
-    points: Annotated[str, typer.Argument(metavar="X0,Y0:X1,Y1", help="Two points of a known distance, px.")],
+    points: Annotated[str, typer.Argument(metavar="X0,Y0:X1,Y1", help="Two points with a known distance, px.")],
     length: Annotated[float, typer.Option("--length", metavar="MM", help="Their distance in mm.")],
     length_std: Annotated[float, typer.Option("--length-std", metavar="MM", help="Its standard uncertainty.")] = 0.0,
-    point_std: Annotated[float, typer.Option("--point-std", metavar="PX", help="Of each point, px.")] = 0.5,
+    point_std: Annotated[float, typer.Option("--point-std", metavar="PX", help="Uncertainty of each point, px.")] = 0.5,
 ) -> None:
     """Millimetres per pixel, with its uncertainty, from two points on an image and their distance."""
     from rgbmidic.fields import Units

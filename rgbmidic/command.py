@@ -45,7 +45,7 @@ REQUIRED = inspect.Parameter.empty
 FRAME_OPTIONS: dict[str, Any] = {
     "kind": Annotated[
         str | None,
-        typer.Option("--kind", help="bayer, rgb (3-CCD) or monochrome; else what the files state, else bayer."),
+        typer.Option("--kind", help="bayer, rgb (3-CCD) or monochrome; else as the files state, else bayer."),
     ],
     "cfa": Annotated[str | None, typer.Option("--cfa", help="Bayer pattern RGGB, BGGR, GRBG or GBRG.")],
     "black_level": Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample, DN.")],

@@ -119,17 +119,17 @@ class FrameSettings(_Checked):
         File patterns or folders, one per light fired in succession (monochrome); a single one otherwise. Empty where a
         script gives the frames (`source` of `rgbmidic.measure`).
     kind
-        None: what the file states, else ``"bayer"``.
+        None: as the file states, else ``"bayer"``.
     cfa, black_level, white_level
-        None: what the file states. A statement that contradicts the file is an error.
+        None: as the file states. A statement that contradicts the file is an error.
     reference
         Indices of the frames whose average is the reference, or a range of them: ``"0:20"`` are the first twenty.
     first, last, step
-        The frames that are measured: from the first to the last (None: there is), every one or every `step`-th. Frames
-        count from 0 over all files; the reference need not be among them.
+        The frames that are measured: every `step`-th from the first to the last (None: of all). Frames are counted from
+        0 over all files; the reference need not be among them.
     lights
-        Number of lights that fire in turn before a monochrome camera which records one series: frame i shows light
-        i mod `lights`, and so many frames make one state, which is what the other keys count.
+        Number of lights that fire in turn while a monochrome camera records one series: frame i shows light
+        i mod `lights`. `lights` frames make one state, and the other keys count states.
     update_reference
         Whether a later frame becomes the reference where the correlation with the present one is low, for paint that
         changes (incremental correlation). Uncertainties add up (`rgbmidic.correlation.reference_update`), and a node
@@ -137,8 +137,8 @@ class FrameSettings(_Checked):
     shape, dtype
         Rows and columns, and sample type, of headerless files.
     crop_origin
-        Column and row of the calibrated frame at which cropped frames begin; None: they are as large as the calibrated
-        ones, or nothing of the calibration depends on the place.
+        Column and row in the calibrated frame of the first pixel of cropped frames; None: they are as large as the
+        calibrated ones, or nothing in the calibration depends on the position.
     """
 
     section = "frames"
@@ -196,7 +196,7 @@ slope of the brightness worse (rendered cracks open by up to 5 px)."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IlluminationSettings(_Checked):
-    """How the frame becomes one image per light (``[illumination]``).
+    """How the frame is separated into one image per light (``[illumination]``).
 
     Attributes
     ----------
@@ -204,9 +204,9 @@ class IlluminationSettings(_Checked):
         Method of `rgbmidic.illumination.separation` for Bayer frames; ``"auto"``: the reflection-aware one, and
         Malvar's for frames too small for it.
     normalise
-        Standard deviation in px of the local mean by which each light's image is divided before the solve; 0 leaves
-        the grey levels as they are. Where the mesh has cracks it is three times as wide, and ``solver.brightness``,
-        which is then ``"mean"`` unless it is ``"local"``, does the rest.
+        Standard deviation in px of the local mean by which each light's image is divided before the solve; 0: grey
+        levels are not changed. Where the mesh has cracks it is three times as wide, and ``solver.brightness``, which is
+        then ``"mean"`` unless it is ``"local"``, corrects the rest.
     """
 
     section = "illumination"
@@ -285,7 +285,7 @@ class WeightSettings(_Checked):
         `rgbmidic.weights.MaskWeights.read`.
     limit_deg
         Light is excluded within this angle of the mirror direction (the paper: 15); None: soft weights, the inverse of
-        the variance that geometry, paint and camera noise let expect.
+        the variance expected from geometry, paint and camera noise.
     """
 
     section = "weights"
@@ -357,7 +357,7 @@ class ScaleSettings(_Checked):
     mm_per_pixel_std
         Its standard uncertainty.
     camera
-        In place of `mm_per_pixel`: file with lens and plane, which ``rgbmidic-calibrate camera`` writes.
+        Instead of `mm_per_pixel`: file with lens and plane, which ``rgbmidic-calibrate camera`` writes.
     frame_rate
         Frames per second, for files that do not state when their frames were taken.
     """
@@ -404,9 +404,9 @@ class ProbeSettings(_Checked):
     circles
         (x, y, radius), for the mean displacement.
     gauges
-        (x0, y0, x1, y1): extensometers between two points, along the line between them as they move.
+        (x0, y0, x1, y1): extensometers between two points, along the line between them in the deformed state.
     straight_gauges
-        The same, along the line as it was on the reference.
+        The same, along the line in the reference.
     strain_gauges
         (x, y, length): virtual strain gauges.
     cracks
@@ -600,7 +600,7 @@ class TestSettings(_Checked):
     mesh_file
         ``file`` in ``[mesh]``: finite-element mesh to measure on (`rgbmidic.read_mesh`).
     mesh_points
-        ``points`` in ``[mesh]``: pairs (x_mm, y_mm, x_px, y_px), two or more, that say where it lies on the image
+        ``points`` in ``[mesh]``: pairs (x_mm, y_mm, x_px, y_px), two or more, that place it on the image
         (`rgbmidic.Placement.fit`).
     mesh_unit
         ``unit`` in ``[mesh]``: unit of length of the file; the points are in mm.

@@ -28,14 +28,14 @@ app = typer.Typer(
 )
 
 Out = Annotated[Path, typer.Option(help="Calibration file to write (JSON).")]
-Region = Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: where the speckled target is.")]
+Region = Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: region of the speckled target.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 CAPTURE_OPTIONS: dict[str, Any] = {
     "light": Annotated[
-        list[str], typer.Option("--light", help="NAME=FILES: captures with this light alone on. Once per light.")
+        list[str], typer.Option("--light", help="NAME=FILES: captures with only this light on. Once per light.")
     ],
     "dark": Annotated[
-        str | None, typer.Option("--dark", help="Captures with every lamp off (and the same ambient light).")
+        str | None, typer.Option("--dark", help="Captures with all lamps off (and the same ambient light).")
     ],
     **command.FRAME_OPTIONS,
 }
@@ -51,7 +51,7 @@ def main() -> None:
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    debug: Annotated[bool, typer.Option("--debug", help="Show where an error comes from.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an error occurs.")] = False,
 ) -> None:
     """Calibrate a colour camera and its lamps for rgbmidic. The laboratory procedure: calibration/README.md."""
     command.help_where_alone(context)
@@ -104,9 +104,9 @@ def _writes(name: str, hint: Any, default: str | None = None) -> Callable[[Comma
 def crosstalk(
     captures: Any,
     out: Path,
-    block: Annotated[int, typer.Option(help="Side of the blocks that are averaged, px.")] = 16,
+    block: Annotated[int, typer.Option(help="Side of the averaged blocks, px.")] = 16,
     field: Annotated[
-        str, typer.Option(help="Degree by which A varies over the field: 0 to 4, or auto: what the data ask for.")
+        str, typer.Option(help="Degree of the variation of A over the field: 0 to 4, or auto (chosen by a test).")
     ] = "auto",
     allow: Annotated[
         list[str] | None, typer.Option(help="Waive a plausibility check by its name. May be repeated.")
@@ -127,11 +127,11 @@ def crosstalk(
 @_writes("out", Out, "noise.json")
 @command.gather("stated", command.FRAME_OPTIONS, _frames)
 def noise(
-    dark: Annotated[str, typer.Option(help="Dark frames, two at least: lens capped, exposure time of the test.")],
+    dark: Annotated[str, typer.Option(help="Dark frames, at least two: lens capped, exposure time of the test.")],
     flat: Annotated[
         list[str],
         typer.Option(
-            help="Lit frames at rest, two at least per exposure: FILES in one folder per exposure, or TIME=FILES for "
+            help="Lit frames at rest, at least two per exposure: FILES in one folder per exposure, or TIME=FILES for "
             "one exposure with its time. May be repeated."
         ),
     ],
@@ -155,7 +155,7 @@ def registration(
     region: Region = None,
     element_size: Annotated[float, typer.Option(help="Side of the elements, px; several speckles.")] = 25.0,
 ) -> None:
-    """Measure lateral colour: where each light shows a point other than where the first light shows it."""
+    """Measure lateral colour: the shift of each light's image relative to that of the first light."""
     from rgbmidic_calibration import display, jobs
 
     calibration, estimate = jobs.calibrate_registration(captures(), region=_region(region), element_size=element_size)
@@ -175,15 +175,15 @@ def camera(
         ),
     ] = None,
     views: Annotated[
-        str | None, typer.Option(help="Photographs of the target under different angles: they calibrate the lens.")
+        str | None, typer.Option(help="Photographs of the target at different angles, to calibrate the lens.")
     ] = None,
     plane: Annotated[
-        str | None, typer.Option(help="Photograph of the target where the specimen's surface will be.")
+        str | None, typer.Option(help="Photograph of the target at the position of the specimen's surface.")
     ] = None,
-    lens: Annotated[Path | None, typer.Option(help="Earlier camera.json whose lens is taken.")] = None,
+    lens: Annotated[Path | None, typer.Option(help="Earlier camera.json whose lens is used.")] = None,
     corners: Annotated[
         str | None,
-        typer.Option(help="In place of --plane: X0,Y0:X1,Y1:X2,Y2:X3,Y3 in px of a rectangle on the specimen."),
+        typer.Option(help="Instead of --plane: corners X0,Y0:X1,Y1:X2,Y2:X3,Y3 in px of a rectangle on the specimen."),
     ] = None,
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHTmm of that rectangle.")] = None,
     corner_std: Annotated[float, typer.Option(help="Standard uncertainty of such a corner, px.")] = 0.5,
@@ -230,7 +230,7 @@ def check(
     ] = None,
     region: Region = None,
 ) -> None:
-    """Check a calibration on captures that were not used to make it; exit status 1 where it does not hold."""
+    """Check a calibration on captures that were not used to make it; exit status 1 if a limit is exceeded."""
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import named_patterns
@@ -258,7 +258,7 @@ def design(
             "colour-science."
         ),
     ],
-    choose: Annotated[int, typer.Option(help="Lamps in a set; of more candidates the best sets are found.")] = 3,
+    choose: Annotated[int, typer.Option(help="Lamps in a set; from more candidates the best sets are selected.")] = 3,
     show_sets: Annotated[int, typer.Option("--sets", help="How many of the best sets to list.")] = 5,
     picture: Path | None = None,
 ) -> None:
@@ -278,7 +278,7 @@ def design(
 @app.command()
 @_writes("out", Out, "calibration.json")
 def merge(
-    files: Annotated[list[Path], typer.Argument(help="Calibration files; every section from one of them.")],
+    files: Annotated[list[Path], typer.Argument(help="Calibration files; common sections must be equal.")],
     out: Path,
 ) -> None:
     """Merge noise, crosstalk and registration from several files into one."""

@@ -98,7 +98,7 @@ def default(entry: Field[Any]) -> str:
         value = MISSING if entry.default_factory is MISSING else entry.default_factory()
     if value is MISSING:
         return "needed"
-    if value is None or is_dataclass(value):
+    if not isinstance(value, (bool, int, float, str, tuple)):
         return "-"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
@@ -192,24 +192,24 @@ def _keys(kind: type, extra: Mapping[str, tuple[str, str, str]], left_out: Itera
 
 _BODY = {"kind": ('`"sphere"`, `"cylinder"`, `"plate"`', '`"sphere"`', "The body's shape.")}
 _LIGHT = {
-    "led_centre": ("number", "-", "Peak of the lamp's spectrum in nm, where the crosstalk follows from spectra."),
+    "led_centre": ("number", "-", "Peak of the lamp's spectrum in nm, if the crosstalk is computed from spectra."),
     "led_width": ("number", "-", "Its full width at half of the peak, nm."),
-    "power": ("number", "-", "1 lights an ideal white that faces the lamp at its nominal distance to the camera's "
-              "`exposure`. Not stated: what gives this at the body's front point."),
+    "power": ("number", "-", "With 1, an ideal white that faces the lamp at its nominal distance reaches the camera's "
+              "`exposure`. Not stated: the power that gives this at the body's front point."),
 }  # fmt: skip
 _CAMERA = {
     "shape": ("[whole number, whole number]", "`[640, 640]`", "Rows and columns of the frame."),
-    "mm_per_pixel": ("number > 0", "`0.055`", "At the body's front point; gives `focal_px` if that is not stated."),
+    "mm_per_pixel": ("number > 0", "`0.055`", "Scale at the body's front point; gives `focal_px` if not stated."),
     "focal_px": ("number", "-", "Focal length in px: distance / (mm per px at that distance)."),
     "crosstalk": ("list of lists of numbers", "-", "A in channels = A · lights: a row for each channel. Not stated: "
-                  "from the spectra, where there are any, else that of the reference camera."),
+                  "from the spectra if there are any, else that of the reference camera."),
     "sensitivities": ("file", "-", "CSV with the spectral sensitivities of the camera."),
-    "model": ("text", "-", "A camera whose spectral sensitivities colour-science holds."),
+    "model": ("text", "-", "A camera with spectral sensitivities in colour-science."),
 }  # fmt: skip
 _STATE = {
-    "displacement_gradient": ("[[number, number], [number, number]]", "-", "Of a plate: displacement gradient."),
-    "displacement_offset": ("[number, number]", "-", "Of a plate: displacement of its middle, mm."),
-    "displacement_file": ("file", "-", "Of a plate: npz with `nodes` (mm), `elements` and `displacement` (mm)."),
+    "displacement_gradient": ("[[number, number], [number, number]]", "-", "Displacement gradient of a plate."),
+    "displacement_offset": ("[number, number]", "-", "Displacement of the middle of a plate, mm."),
+    "displacement_file": ("file", "-", "npz with `nodes` (mm), `elements` and `displacement` (mm) of a plate."),
 }
 
 

@@ -25,7 +25,7 @@ NO_MATCH = "the images do not match anywhere in the region"
 
 
 class Status(IntEnum):
-    """How a frame ended."""
+    """Status of a frame."""
 
     CONVERGED = 0
     NOT_CONVERGED = 1
@@ -33,7 +33,7 @@ class Status(IntEnum):
 
 
 class NodeStatus(IntEnum):
-    """How a node ended."""
+    """Status of a node."""
 
     MEASURED = 0
     NOT_SEEN = 1
@@ -56,26 +56,26 @@ class Solution:
     displacement : ndarray, shape (N, 2), float64
         (u, v) in px at the nodes, recovered from the best linear fit (`recovery`); NaN where not measured.
     displacement_std : ndarray, shape (N, 2), float64
-        Standard uncertainty of the nodal values in px, from the residual (noise, demosaicing, erratic reflections, what
-        no quadratic follows); NaN where not measured.
+        Standard uncertainty of the nodal values in px, from the residual (noise, demosaicing, irregular reflections,
+        deviations from a quadratic); NaN where not measured.
     strain, strain_std : ndarray, shape (N, 3), float64
         Small strain (exx, eyy, exy), tensor shear, and its standard uncertainty: slopes of the quadratic through the
-        nodes around; NaN where the node or a neighbour is not measured.
+        neighbouring nodes; NaN where the node or a neighbour is not measured.
     displacement_error, strain_error : ndarray, shape (N, 2), (N, 3), float64
         What mesh and recovery leave out of both, as standard deviations (`discretisation_error`); NaN where not asked
         for or not known.
     node_status : ndarray, shape (N,), uint8
         See `NodeStatus`.
     light_fraction : ndarray, shape (N, k), float64
-        Fraction of each light in what determines the node.
+        Fraction of each light in the information that determines the node.
     misfit : ndarray, shape (N,), float64
-        Weighted rms residual around the node over its median: 1 is ordinary; well above it the result is suspicious.
+        Weighted rms residual around the node over its median: 1 is typical; a value far above 1 is suspicious.
     status : Status
     reason : str
         Why the frame is not converged; empty otherwise.
     rigid : ndarray, shape (k, m), float64
-        Coefficients beta of the rigid functions of each light (0 for the first, NaN for one that sees nothing): shift
-        in x and y in px, then rotation in rad about the middle of the mesh.
+        Coefficients beta of the rigid functions of each light (0 for the first, NaN for a light that sees nothing):
+        shift in x and y in px, then rotation in rad about the middle of the mesh.
     residual : ndarray, shape (k,), float64
         Weighted rms of ``f - g(x + u)`` of each light, in grey levels of the filtered images; NaN where a light has
         no weight.

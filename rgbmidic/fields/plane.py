@@ -90,14 +90,14 @@ class CameraCalibration:
     lens : ndarray, shape (8,), or None
         `LENS_PARAMETERS`; None: the lens does not distort, and its focal length is not known.
     homography : ndarray, shape (3, 3), or None
-        From the undistorted pixel, counted from the middle of the frame, to mm on the plane; None: not measured.
+        Maps the undistorted pixel, relative to the middle of the frame, to mm on the plane; None: not measured.
     covariance : ndarray, shape (16, 16)
-        Of the lens' parameters, then of the first eight entries of the homography, row by row; 0 where one is not
-        known or held.
+        Covariance of the parameters of the lens and of the first eight entries of the homography, row by row; 0 for a
+        parameter that is not known or was held fixed.
     details : mapping
-        What else the file holds: residuals, views, tilt, provenance.
+        Other content of the file: residuals, views, tilt, provenance.
     name : str
-        The file, for messages.
+        File name, for messages.
     """
 
     shape: tuple[int, int]

@@ -224,17 +224,17 @@ class Statements(TypedDict, total=False):
 def read_frame(path: Path | str, **stated: Unpack[Statements]) -> Mosaic | ChannelFrame:
     """Read one raw frame.
 
-    Camera raws (LibRaw) state everything themselves. TIFF and PNG state size and number of channels; headerless
-    ``.raw`` and ``.bin`` files state nothing. What the caller states and what the file states must agree.
+    Camera raw files (LibRaw) state everything. TIFF and PNG state size and number of channels; headerless ``.raw`` and
+    ``.bin`` files state nothing. The statements of the caller and of the file must agree.
 
     Parameters
     ----------
     path
         Frame file.
     **stated
-        What is stated of it. ``kind``: None is what the file states (three channels: ``"rgb"``), else ``"bayer"``.
+        Properties of the frame. ``kind``: None means as the file states (three channels: ``"rgb"``), else ``"bayer"``.
         ``cfa``: Bayer pattern of the first visible pixels; needed for a mosaic whose file does not state it.
-        ``black_level``, ``white_level``: grey levels (DN); where nobody states them 0 and the largest value of the
+        ``black_level``, ``white_level``: grey levels (DN); if they are not stated, 0 and the largest value of the
         sample type. ``shape``, ``dtype``: rows and columns, and sample type (``"uint8"``, ``"uint16"`` little-endian,
         ``">u2"`` big-endian) of headerless files.
 
@@ -248,7 +248,7 @@ def read_frame(path: Path | str, **stated: Unpack[Statements]) -> Mosaic | Chann
     FrameError
         The file is missing, damaged, truncated, already demosaiced, or contradicts a statement (both are named).
     InputError
-        A statement is not allowed by itself.
+        A stated property is not allowed.
     """
     if odd := stated.keys() - Statements.__annotations__:
         raise TypeError(f"read_frame takes {', '.join(Statements.__annotations__)}, not {', '.join(odd)}")

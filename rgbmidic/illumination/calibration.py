@@ -46,19 +46,19 @@ class Calibration:
     camera_noise
         All figures of the photon transfer measurement, per colour plane; `noise` is its summary.
     registration
-        Lateral registration of the lights; of the same lights, in the same order, as the crosstalk.
+        Lateral registration of the lights, which are those of the crosstalk in the same order.
     kind, cfa, white_level
         The camera settings of the captures, as far as they are known.
     black_level
-        The same; the mean over the positions of the Bayer cell.
+        Mean black level over the positions of the Bayer cell, as far as it is known.
     shape
         Rows and columns of the captures.
     name
-        Name in messages: its file.
+        Name in messages: the file name.
     unevenness
-        Of the grey levels' histogram in the captures (`rgbmidic.illumination.frame_check.unevenness`).
+        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.frame_check.unevenness`).
     provenance
-        Inputs with their hashes, date, software version, by section; kept as written.
+        Inputs with their hashes, date, software version, by section; not changed by reading.
     extra
         Sections of the file that this class does not interpret, kept when the file is written again.
     """

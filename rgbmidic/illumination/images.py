@@ -63,7 +63,7 @@ class Registration:
     parameters : ndarray, shape (k, 5)
         `PARAMETERS` of every light; the first light's are 0.
     centre : tuple of float
-        Point (x, y) in px that rotation, scale and radial term leave where it is.
+        Point (x, y) in px that rotation, scale and radial term do not move.
     radius : float
         R in px: where the radial term is stated.
     covariance : ndarray, shape (k, 5, 5), or None

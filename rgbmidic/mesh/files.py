@@ -54,16 +54,16 @@ class FiniteElementMesh:
     elements : ndarray, shape (E, 3), int32
         Triangles, counter-clockwise in the mesh's axes; a quadrilateral gives two, and only corner nodes are kept.
     element_numbers : ndarray, shape (E,), int64
-        Labels of the elements in the file that the triangles are from.
+        Labels, in the file, of the elements that the triangles come from.
     fields : mapping of str to ndarray, shape (N, ...)
         Nodal data of the file (none of Abaqus and of gmsh in text), in its own unit and components: a vector's
         component along x is ``[:, axes[0]]``.
     axes : tuple of int
         Which coordinates (0, 1, 2) of the file are x and y.
     unit_mm : float
-        Millimetres in a length of 1 of the file, which a displacement in `fields` is multiplied with.
+        Millimetres per unit of length of the file; multiply a displacement in `fields` by it.
     numbering : str
-        Where the numbers are from, in words.
+        Origin of the numbers, in words.
     """
 
     name: str
@@ -134,16 +134,16 @@ class Plane(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Placement:
-    """Where a mesh in mm lies on the image.
+    """Position of a mesh in mm on the image.
 
     Attributes
     ----------
     matrix : ndarray, shape (2, 2)
-        From the mesh's mm to px, or to mm on the camera's plane where there is a `camera`.
+        Maps the mesh's mm to px, or to mm on the camera's plane if there is a `camera`.
     shift : ndarray, shape (2,)
-        Where the mesh's origin lies, in the same unit.
+        Position of the mesh's origin, in the same unit.
     camera
-        Lens and plane; None: the image is a similarity of the mesh.
+        Lens and plane; None: the image is similar to the mesh (rotated, shifted and scaled).
     pairs : ndarray, shape (n, 4)
         The pairs (x_mm, y_mm, x_px, y_px) that it was fitted to.
     """
@@ -392,9 +392,9 @@ _CORNERS = {"triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hex
 def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) -> FiniteElementMesh:
     """Read the planar part of a finite-element mesh.
 
-    Shells and plane elements are taken, or where there are none the free faces of solids. Of several planes across an
-    axis of the file the one with the largest area is measured, and of equal ones that with the largest coordinate; the
-    log states what was left out.
+    Shells and plane elements are used; if there are none, the free faces of solids. Of several planes normal to an axis
+    of the file, the one with the largest area is measured; of equal ones, that with the largest coordinate. The log
+    states what was left out.
 
     Parameters
     ----------

@@ -32,9 +32,9 @@ class Region:
     ----------
     mask : ndarray, shape (H, W), bool
     rectangle : tuple (x0, y0, x1, y1) in px, or None
-        Set where the region is a rectangle with sides along the axes; the pixels whose centres lie on it belong to it.
+        Stated if the region is a rectangle with sides along the axes; it includes the pixels whose centres lie on it.
     origin : tuple of int
-        Column and row at which the mask begins in the frame.
+        Column and row of the first pixel of the mask in the frame.
     """
 
     mask: BoolArray

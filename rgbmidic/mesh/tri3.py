@@ -33,7 +33,7 @@ serves, differ by 1.53 at most (8 to 40 px over rectangles, discs, rings and pol
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tri3Mesh:
-    """Triangles on the reference image. Its arrays are not writable: what is derived from them is kept.
+    """Triangles on the reference image. Its arrays are not writable, because derived quantities are cached.
 
     Attributes
     ----------

@@ -314,23 +314,23 @@ def correlate(
     reference, deformed : array_like, shape (H, W) or (k, H, W)
         Grey levels; NaN marks an invalid pixel.
     region
-        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None takes the whole image.
+        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None: the whole image.
     element_size
         Side of the triangles in px.
     cracks
         Paths, each of corners (x, y) in px, along which the mesh is split, see `Tri3Mesh.from_region`.
     weights : array_like, shape (H, W) or (k, H, W), optional
-        Weight of each light at each pixel of the reference, finite and not negative; 0 excludes.
+        Weight of each light at each pixel of the reference, finite and not negative; 0 excludes the pixel.
     initial : array_like, shape (2,) or (N, 2), optional
-        Initial guess of the displacement (u, v) in px; None searches for it.
+        Initial guess of the displacement (u, v) in px; None: it is found by a search.
     deformed_weights
         Like `weights`, on the deformed images.
     normalise
-        Standard deviation in px of the local mean by which every image is divided first, wider where there are cracks
-        (see `IlluminationSettings`); None leaves grey levels.
+        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; wider if there
+        are cracks (see `IlluminationSettings`). None: grey levels are not changed.
     statistics
-        Weight the lights by what the residual around each pixel shows (`rgbmidic.weights.Statistics`), by a method of
-        one's own, or, if False, by `weights` alone.
+        True: weight the lights by the statistics of the residual around each pixel (`rgbmidic.weights.Statistics`).
+        False: only by `weights`. Or an object with a method of your own.
     mesh_error
         Estimate the discretisation error, too (`rgbmidic.discretisation_error`).
     **options
@@ -346,7 +346,7 @@ def correlate(
     Raises
     ------
     InputError
-        Images of different shapes, a weight or initial guess that does not fit, an unknown setting.
+        The images have different shapes, a weight or initial guess does not fit them, or a setting is unknown.
     RegionError
         The region is empty, too small or outside the image.
 

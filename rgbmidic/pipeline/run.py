@@ -71,59 +71,59 @@ def measure(
     timings: bool = False,
     progress: Progress | None = None,
 ) -> Result:
-    """Measure a test: displacement of every frame against the reference.
+    """Measure a test: displacement of every frame relative to the reference.
 
-    The result is the same, bit for bit, for any number of workers, and whether or not it was interrupted and resumed or
-    measured part by part.
+    The result is identical, bit for bit, for any number of workers, and also if the run is interrupted and resumed or
+    done in parts.
 
     Parameters
     ----------
     settings
-        What `rgbmidic.settings.read_test` reads from TEST.toml.
+        Settings, as `rgbmidic.settings.read_test` reads them from TEST.toml.
     out
-        Result folder; nothing is written to it before settings, calibration, region and reference are found good.
+        Result folder; nothing is written before settings, calibration, region and reference have been checked.
     source
-        The frames, in place of files: whatever has a length and a frame by index (`FrameSequence`), such as a numpy
-        stack (T, H, W); the settings then have ``frames.path = []``.
+        The frames, instead of files: any object with a length and a frame for each index (`FrameSequence`), such as a
+        numpy stack (T, H, W). The settings then have ``frames.path = []``.
     separation
-        From a raw frame to one image per light, in place of the package's (`LightSeparation`).
+        Function from a raw frame to one image per light, instead of the package's (`LightSeparation`).
     weights
-        How much each light counts at each pixel (`rgbmidic.weights.LightWeights`), in place of what ``[weights]``
-        names; with ``weights.method = "statistics"`` they are multiplied by those, with ``"none"`` they count alone.
+        Weights of the lights at each pixel (`rgbmidic.weights.LightWeights`), instead of those of ``[weights]``. With
+        ``weights.method = "statistics"`` they are multiplied by those, with ``"none"`` they are used alone.
     mesh
-        In px of the frame, in place of the one made from region and ``[mesh]``.
+        Mesh in px of the frame, instead of the one made from region and ``[mesh]``.
     overwrite
-        Replace a result that is already there.
+        Replace an existing result.
     resume
-        Go on with a result that is already there: its settings, calibration and frames must be the same, and the
-        objects must describe themselves as then. Frames that are damaged there are measured again; so are those that
-        could not be read and now can, with all that started from them.
+        Continue an existing result: its settings, calibration and frames must be the same, and the descriptions of the
+        objects must not have changed. Damaged frames are measured again, as are frames that could not be read before
+        and now can; the same holds for all frames whose initial guess came from them.
     retry_failed
-        With `resume`, measure again all frames that failed, and all that started from them.
+        With `resume`, measure again all frames that failed, and all whose initial guess came from them.
     frames
-        Only these of the frames that the settings choose, counted as there, into a folder that other processes may fill
-        at the same time; when all are measured, `rgbmidic.results.finish_result` ends the result. None: all.
+        Only these of the frames that the settings choose, with the same numbers; other processes may write to the
+        folder at the same time. When all are measured, `rgbmidic.results.finish_result` finishes the result. None: all.
     workers
-        Number of processes of this machine; with 1 the frames are measured in this one; None: one for each core, but
-        none for fewer than `FRAMES_A_WORKER` frames. A script that asks for more than 1 must be guarded by
+        Number of processes on this machine. 1: the frames are measured in the present process; None: one for each core,
+        but none for fewer than `FRAMES_A_WORKER` frames. A script with more than 1 must be guarded by
         ``if __name__ == "__main__"``.
     scheduler
         Address of the scheduler of a Dask cluster, instead of processes of this machine.
     timings
-        Keep the seconds that each stage of a frame takes (`seconds` of a result): they differ from run to run.
+        Store the time of each stage of a frame in seconds (`seconds` of a result); it differs from run to run.
     progress
         Called after every frame with the number of frames done, their total and a line about the last one.
 
     Returns
     -------
     Result
-        A frame that cannot be read or measured is kept as failed with its reason; the others go on.
+        A frame that cannot be read or measured is stored as failed with the reason; the others are measured.
 
     Raises
     ------
     RgbmidicError
         The settings, the calibration, the region or the reference frames are not usable, the result cannot be written,
-        or what is in `out` is another test's.
+        or `out` contains the result of another test.
     """
     if retry_failed and not resume:
         raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
@@ -272,45 +272,46 @@ def measure_sequence(
     mesh: Tri3Mesh | None = None,
     **options: Any,
 ) -> Iterator[Solution]:
-    """Measure states one after the other, each as soon as it is there: a list, a generator, a camera.
+    """Measure states one by one, each as soon as it is available: from a list, a generator, a camera.
 
-    Every solution is, bit for bit, that which `rgbmidic.measure` writes for the same frames; what is kept between them
-    is the reference and a few starts, whatever the number of states. For a result folder give `rgbmidic.measure` the
-    frames as its `source`.
+    Every solution is identical, bit for bit, to that of `rgbmidic.measure` for the same frames. Only the reference and
+    a few initial guesses are kept between states, whatever their number. To write a result folder, pass the frames to
+    `rgbmidic.measure` as `source`.
 
     Parameters
     ----------
     states
         Without `settings` arrays (H, W) or (k, H, W), one image per light, NaN where not valid, or
         `IlluminationImages`.
-        With `settings` whatever a frame source may give (`rgbmidic.pipeline.FrameSequence`), such as raw frames.
+        With `settings` anything that a frame source may return (`rgbmidic.pipeline.FrameSequence`), such as raw frames.
     settings
-        What TEST.toml says, with ``frames.path = []``; it takes the place of `region`, `element_size`, `normalise`,
+        Settings of a test, with ``frames.path = []``; they replace `region`, `element_size`, `normalise`,
         `statistics`, `update_reference` and the `options`.
     reference
         The reference state; None: the first of the `states`, which is measured like the others.
     region
-        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None takes the whole image.
+        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None: the whole image.
     element_size
         Side of the triangles in px.
     normalise
-        Standard deviation in px of the local mean by which every image is divided first; 0 leaves grey levels.
+        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; 0: grey levels
+        are not changed.
     statistics
         Weight every light by the inverse variance of its own residual around each pixel, robustly.
     update_reference
-        Whether a later state becomes the reference where the match with the one before no longer serves.
+        Whether a later state becomes the reference when the correlation with the present one is low.
     separation, mesh
         As in `rgbmidic.measure`.
     weights
-        As in `rgbmidic.measure`; or an array (k, H, W) from 0 to 1 that holds in every state.
+        As in `rgbmidic.measure`; or an array (k, H, W) from 0 to 1 that applies to every state.
     **options
         Fields of `rgbmidic.settings.SolverSettings` and their defaults.
 
     Yields
     ------
     Solution
-        Of each state on the reference. One that cannot be measured is `Status.FAILED` with its reason; the next states
-        go on.
+        One for each state, relative to the reference. A state that cannot be measured is `Status.FAILED` with its
+        reason; the next states are measured.
 
     Raises
     ------

@@ -107,50 +107,48 @@ _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
 _EXACT: dict[str, Any] = {"dtype": np.float64}
-_NUMBER = "number of the frame: a frame that is missing leaves a gap"
+_NUMBER = "number of the frame; missing frames leave gaps"
 _INPUTS = "path and SHA-256 of each file that the frame was read from"
-_AT_NODE = "against the reference, at the node"
+_AT_NODE = "relative to the reference, at the node"
 _NOT_FIT = "(not the best linear fit's nodal value)"
 _FRACTION = "fraction of each light in the information that determines a node"
-_AROUND = "slope of the quadratic through the nodes around; NaN also beside a node that is not measured"
-_TIME = "time of the frame from the trigger; the smallest 64-bit integer where it is not known"
-_MISFIT = "weighted rms residual around a node over its median: 1 is ordinary, 3 is suspicious"
+_AROUND = "slope of the quadratic through the neighbouring nodes; NaN also next to a node that is not measured"
+_TIME = "time of the frame after the trigger; the smallest 64-bit integer if it is not known"
+_MISFIT = "weighted rms residual around a node over its median: 1 is typical, 3 is suspicious"
 _RESIDUAL = (
-    "weighted rms of `f - g(x + u)`, in the unit of the images that are correlated: none if these are divided by their "
+    "weighted rms of `f - g(x + u)`, in the unit of the correlated images: none if these are divided by their "
     "local mean (the default), else DN"
 )
-_WEIGHT = "mean fraction of each light in the weights; adds up to the part of the region that any light sees"
+_WEIGHT = "mean fraction of each light in the weights; their sum is the part of the region that any light sees"
 _BRIGHTNESS = (
-    "gain and offset (DN) of each light against the reference, from the speckle's contrast and mean, medians over the "
-    "elements; reported, not used"
+    "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle, medians over "
+    "the elements; reported, not used"
 )
 _MATCH = (
-    "median correlation coefficient of the elements with their reference, of the light that matches best; NaN unless "
-    "`frames.update_reference` looks at it"
+    "median correlation coefficient of the elements with their reference, for the light that matches best; NaN without "
+    "`frames.update_reference`"
 )
 _BEST = "largest `match` of the frames compared with the same reference, up to this one"
 _UPDATES = (
-    "places in the result of the frames that became the reference in turn, up to this one: it was itself compared with "
-    "the last before it, or with the test's reference"
+    "indices in the result of the frames that became the reference, up to this one: this frame was compared with the "
+    "last one before it, or with the test's reference"
 )
 _RIGID = (
-    "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for one "
-    "that sees nothing"
+    "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for a "
+    "light that sees nothing"
 )
-_UNREAD = "1 where the frame failed because it could not be read, which `--resume` tries again, else 0"
+_UNREAD = "1 if the frame failed because it could not be read (`--resume` tries again), else 0"
 _TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
-_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty where the separation does not give it"
-_SECONDS = f"time of the stages {', '.join(STAGES)}, one after the other; NaN unless `--timings` asks for it"
-_LEFT_OUT = (
-    "discretisation error of {}: what mesh and recovery leave out, one sigma; empty unless `mesh.error` asks for it"
-)
+_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty if the separation does not give it"
+_SECONDS = f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"
+_LEFT_OUT = "discretisation error of {}, caused by mesh and recovery, one sigma; empty unless `mesh.error` requests it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
     ResultQuantity("number", (), "", "", _NUMBER, dtype=np.int64, blank=-1),
     ResultQuantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
-    ResultQuantity("status", (), "", "status", "how the frame ended, see below", dtype=np.int64, blank=2, codes=_ENDS),
+    ResultQuantity("status", (), "", "status", "status of the frame, see below", dtype=np.int64, blank=2, codes=_ENDS),
     ResultQuantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
     ResultQuantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
     ResultQuantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
@@ -208,7 +206,7 @@ SHARED: dict[str, ResultQuantity] = {
     "node_mm": ResultQuantity("node_mm", ("node", 2), "mm", "", _OWN_AXES, **_EXACT),
     "reference": ResultQuantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
 }
-"""What all frames have in common."""
+"""Quantities that all frames have in common."""
 
 FINITE_ELEMENTS = ("node_number", "element_number", "node_mm")
 """Those of them that only a mesh of ``mesh.file`` has."""

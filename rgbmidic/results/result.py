@@ -32,29 +32,29 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Result:
-    """The result of a test: what a laboratory post-processes.
+    """The result of a test, for post-processing.
 
-    `Result.open` opens a result folder as far as it has come; nothing but the mesh and the table of the frames is read
-    then. The quantities are those of `rgbmidic.results.QUANTITIES` (table in docs: conventions), and there are
-    four ways to read them:
+    `Result.open` opens a result folder, also during a run, and reads only the mesh and the table of the frames. The
+    quantities are those of `rgbmidic.results.QUANTITIES` (table in docs: conventions). There are four ways to read
+    them:
 
     - ``result.u``, ``result.misfit`` and so on: one quantity of all T frames as an array with the frames as first
-      axis, such as (T, N) for N nodes. It is read when it is first used and then kept in memory. Only quantities whose
+      axis, such as (T, N) for N nodes. It is read at its first use and then kept in memory. Only quantities whose
       shape is the same in all frames are attributes.
-    - `each`: any quantity one frame after the other, for results larger than the memory.
-    - `frame`: everything of one frame, a `FrameRecord`.
-    - `to_xarray`: all of it with named dimensions, coordinates and units, read frame by frame when it is used.
+    - `each`: any quantity frame by frame, for results larger than the memory.
+    - `frame`: all quantities of one frame, a `FrameRecord`.
+    - `to_xarray`: all quantities with named dimensions, coordinates and units, read frame by frame when used.
 
     Displacements are in px on the reference image (x to the right, y down), at the nodes; NaN where a node has no data.
-    Millimetres, seconds, finite strain and rates follow from them: `rgbmidic.results.histories.read_histories` for
-    probes, `rgbmidic.fields` for arrays. A frame that is not measured yet is blank, with that as its reason.
+    Use `rgbmidic.results.histories.read_histories` for probes and `rgbmidic.fields` for arrays to obtain millimetres,
+    seconds, finite strain and rates. A frame that is not measured yet is blank, with that reason.
 
     Attributes
     ----------
     path
         The folder.
     table
-        Where each frame lies.
+        Position of each frame in the files.
     nodes : ndarray, shape (N, 2), float64
         Positions (x, y) in px on the reference image.
     elements : ndarray, shape (E, 3), int32
@@ -64,7 +64,7 @@ class Result:
     lights : tuple of str, length k
         The lights' names.
     node_number, element_number, node_mm : ndarray, shape (N,), (E,), (N, 2), or None
-        Of a mesh of ``mesh.file``: numbers of nodes and elements in the file, and positions (x, y) in mm in its axes.
+        For a mesh of ``mesh.file``: numbers of nodes and elements in the file, and positions (x, y) in mm in its axes.
     provenance
         Settings, versions and dates, as in ``provenance.json``.
 

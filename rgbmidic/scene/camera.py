@@ -50,7 +50,7 @@ class Light:
     Attributes
     ----------
     name
-        Of the light and of its image.
+        Name of the light and of its image.
     position
         (x, y, z) in mm: x right, y down, z away from the camera, origin at the camera.
     power
@@ -192,7 +192,7 @@ class Camera:
     sensitivities
         Spectral sensitivities, for a crosstalk that follows from physics.
     exposure
-        Fraction of full scale that an ideal white gives under a light of power 1 at its nominal distance, in the
+        Fraction of full scale of an ideal white under a light of power 1 at its nominal distance, in the
         channel that sees the light best.
     bits
         Depth of the analogue-digital converter; samples saturate at 2**bits - 1.

@@ -269,15 +269,15 @@ class DatasetSettings:
     Attributes
     ----------
     format
-        Of Bayer frames; other cameras give TIFF.
+        Format of Bayer frames; other cameras give TIFF.
     seed
-        Of the camera's noise.
+        Seed of the camera's noise.
     calibration_frames
         Frames per light, and dark frames.
     target
-        Of the calibration frames.
+        Target in the calibration frames.
     region
-        (x0, y0, x1, y1) px for test.toml; None: all that stays in view, less a margin.
+        (x0, y0, x1, y1) px for test.toml; None: everything that stays in view, minus a margin.
     element_size
         px, for test.toml.
     noise_free

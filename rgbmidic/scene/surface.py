@@ -93,7 +93,7 @@ class Surface:
     dome
         Height of a droplet above the white paint (mm); 0: flat.
     seed
-        Another seed gives another spray of the same kind.
+        Seed of the speckle: another one gives another pattern of the same kind.
     """
 
     white: Finish = field(default_factory=lambda: Finish(albedo=0.80))

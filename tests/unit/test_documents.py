@@ -126,11 +126,32 @@ def test_the_identifiers_of_the_glossary_exist():
             assert part in keys or re.search(rf"(class|def) {part}\b|^ *{part}( =|:)", source, re.MULTILINE), name
 
 
+GENERATED = {DOCS / "examples", DOCS / "reference/api"}
+PROSE = [*ROOT.glob("[A-Z]*.md"), ROOT / "calibration/README.md"]
+PROSE += [page for page in DOCS.rglob("*.md") if not GENERATED & set(page.parents)]
+
+
 def test_links_between_the_documents_lead_somewhere():
-    pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "calibration/README.md", *DOCS.rglob("*.md")]
-    for page in pages:
+    for page in PROSE:
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+RULED_OUT = [
+    r"\b(bring\w*|brought) .{0,20}\bback\b",  # warp
+    r"\bshares? of (a|the|its|each|every)\b",  # fraction, relative weight
+    r"\b(spoil|disturb)\w*",  # corrupted, affected by specular reflection
+    r"\brenew(al|ed)\w*",  # reference update
+    r"\bunmeasured\b|\blost nodes\b|\bnodes (are )?lost\b|\blos(es?|ing) nodes\b",  # nodes without data
+    r"\b(told|tells|says)\b",  # reports, states
+]
+"""What the pages do not write, and what they write in its place."""
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_the_pages_have_the_words_of_the_field(page):
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert not [hit[0] for words in RULED_OUT for hit in re.finditer(words, text, re.IGNORECASE)]
 
 
 # ---- what the site generates: the modules of docs/_ext need no Sphinx to make it

@@ -115,32 +115,32 @@ def inspect_frame(
     accept: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Inspection:
-    """Inspect one frame before a test: exposure, lights, reflections, speckle, noise, uncertainty to expect.
+    """Inspect one frame before a test: exposure, lights, reflections, speckle, noise, expected uncertainty.
 
     The uncertainty is predicted in closed form (`rgbmidic.lab.inspection.prediction`) from the speckle, the contrast
-    of the lights and the errors of separating a frame like this one.
+    of the lights and the separation errors of such a frame.
 
     Parameters
     ----------
     frame
-        A raw frame, or one monochrome frame per light of lights fired in succession.
+        A raw frame, or for lights fired in succession one monochrome frame per light.
     calibration
-        Crosstalk, noise and registration as far as they are known. Without crosstalk the channels stand for the lights,
-        without noise it is estimated from the frame.
+        Crosstalk, noise and registration as far as they are known. Without crosstalk the channels are used as lights;
+        unknown noise is estimated from the frame.
     region
-        The region to be measured; None: the whole frame. Of the frame only this and its surroundings are looked at.
+        The region to be measured; None: the whole frame. Only the region and its surroundings are inspected.
     element_size
         Side of the elements in px.
     demosaic, prefilter
         As in TEST.toml.
     name
-        Of the frame, for reports.
+        Name of the frame in reports.
     seed
-        Of the random numbers of the prediction.
+        Seed of the random numbers of the prediction.
     accept
-        Contradictions to the calibration that are accepted, by the names of the checks (`FrameCheck`).
+        Checks against the calibration whose failure is accepted, by name (`FrameCheck`).
     progress
-        Called with the steps done, their number and the next one.
+        Called with the number of steps done, their total and the next step.
 
     Raises
     ------
