@@ -140,7 +140,7 @@ def stated_over_true(pair: Pair, field: Field, size: float) -> Iterator[tuple[st
 @table("star", page="explanation/uncertainty", cost=40, keys=2, own_quick=True)
 def star(quick: bool) -> Iterator[Row]:
     """Star of the DIC Challenge 2.0 (0.5 px, periods of 10 to 150 px, camera noise): measured over true height of waves
-    of 3, 4 and 6 elements; SR, the longest period at which it is 10 % off; scatter at rest; their product MEI; stated
+    of 3, 4 and 6 elements; SR, the longest period with an error of 10 %; scatter at rest; their product MEI; stated
     uncertainty over true error at the nodes (root mean squares) for waves of 2 to 3, 3 to 5 and over 5 elements.
     """
     shared = os.environ.get("RGBMIDIC_SHARED_DATA", ROOT.parent / "shared" / "data")

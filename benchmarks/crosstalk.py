@@ -33,9 +33,9 @@ CASES: dict[str, tuple[str, State, dict[str, float]]] = {
 
 @table("crosstalk", page="explanation/demosaicing", cost=90, keys=2, seed=41, own_quick=True)
 def crosstalk(quick: bool) -> Iterator[Row]:
-    """What crosstalk costs: the largest noise amplification of a light by the unmixing; rms error of the displacement
-    of two spheres turned by 1 and 8 degrees (wrinkles 50 um apart; glossy paint) and of two plates wholly in green's
-    reflection shifted by half a pixel; and error over stated uncertainty of all of them.
+    """Effect of crosstalk: the largest noise amplification of a light by the unmixing; rms error of the displacement of
+    two spheres turned by 1 and 8 degrees (wrinkles 50 um apart; glossy paint) and of two plates completely in green's
+    reflection, shifted by half a pixel; and error over stated uncertainty of all of them.
     """
     seeds, size = ((41,), 256) if quick else ((41, 42), 448)
     for matrix in ("measured",) if quick else CROSSTALKS:

@@ -215,8 +215,8 @@ BIAS = {f"bias of {name} [px]": f"{name} [px]" for name in ("Malvar", "default")
 
 @table("demosaicing", page="explanation/demosaicing", cost=20, seed=41, scatter=BIAS)
 def demosaicing(quick: bool) -> Iterator[dict[str, object]]:
-    """Error over the field of the project's own scenes (scatter of plates, rms of spheres) by the way from the raw
-    frame to the solve; crosstalk as assumed (.10 to .16) or as measured cameras have it (.28 to .33 between green and
+    """Error over the field of the project's own scenes (scatter of plates, rms of spheres) by the method from the raw
+    frame to the solver; crosstalk as assumed (.10 to .16) or as in measured cameras (.28 to .33 between green and
     blue)."""
     cases = [(25, "assumed", name) for name in (*SCENES, *SPHERES)]
     cases += [(25, "measured", name) for name in (*SCENES[3:], *SPHERES[1:])]
@@ -272,8 +272,8 @@ def independent(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("demosaicing_coloured", page="explanation/demosaicing", cost=2, seed=11)
 def coloured_specimen(quick: bool) -> Iterator[dict[str, object]]:
-    """A mat plate of which a fraction of each light's variance is a texture of its own: scatter of the displacement
-    over .25 px, error of the lights' images over their mean, error over stated uncertainty."""
+    """A mat plate, with a fraction of each light's variance in a texture that only this light shows: scatter of the
+    displacement over .25 px, error of the lights' images over their mean, error over stated uncertainty."""
     for fraction in (0.1,) if quick else (0.1, 0.3, 0.6, 1.0):
         case = replace(Case.of("mat plate .25 px", size=256, seed=11), coloured=fraction)
         found = errors(case, [NAMED["Malvar"], NAMED["default"]])

@@ -104,8 +104,9 @@ def predicted(name: str, camera: str, side: float) -> tuple[FloatArray, FloatArr
 
 @table("prediction", page="how-to/inspect", cost=45, seed=41)
 def prediction(quick: bool) -> Iterator[dict[str, object]]:
-    """Rms error at inner nodes, and what `rgbmidic inspect` predicts from the first frame and `rgbmidic plan` from the
-    scene over it: frames of 256 px, plates that shift by .25 px, two paints with two pairs of shots each."""
+    """Rms error at inner nodes, and the predictions of `rgbmidic inspect` from the first frame and of `rgbmidic plan`
+    from the scene, relative to it: frames of 256 px, plates that shift by .25 px, two paints with two pairs of shots
+    each."""
     for name in ("mat plate with speckle 4.2 px",) if quick else SCENES:
         for camera, side in (("Bayer", 25), ("Bayer", 16), ("3-CCD", 25), ("lights in succession", 25))[
             : 1 if quick else 4
@@ -142,7 +143,7 @@ def border(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("geometry_weights", page="how-to/planning", cost=8, seed=41)
 def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
-    """Rms error (px) on the sphere before a 3-CCD camera by the weights of the lights, all else by default."""
+    """Rms error (px) on the sphere before a 3-CCD camera by the weights of the lights, with default settings otherwise."""
     for height, text in ((0.0, "flat"), (0.004, "4 um high")):
         for angle in (1.0,) if quick else (1.0, 4.0, 8.0):
             if quick and height:

@@ -233,7 +233,8 @@ def raw_frame(folder: Path) -> Callable[[], Points]:
 
 
 def compiling(test: Path) -> float:
-    """Processor seconds that a first `rgbmidic run`, whose cache of kernels is empty, takes more than a second one."""
+    """Additional processor seconds of a first `rgbmidic run`, with an empty cache of kernels, compared with a second
+    one."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "NUMBA_CACHE_DIR": f"{folder}/kernels"}
         taken = [0.0]
@@ -365,8 +366,8 @@ def peers_python() -> tuple[str, list[str]]:
 
 @table("speed_peers", page="explanation/speed", cost=130, timing=True)
 def speed_peers(quick: bool) -> Iterator[dict[str, object]]:
-    """Beside other programs in one run, processor seconds on one thread, best of three alternating runs, 1024 x 1024
-    px."""
+    """Comparison with other programs in one run: processor seconds on one thread, best of three alternating runs, 1024
+    x 1024 px."""
     python, names = peers_python()
     if not quick and len(names) < len(CONTENDERS):
         raise RuntimeError(
@@ -407,7 +408,8 @@ def speed_peers(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("speed_compiling", page="explanation/speed", cost=30, timing=True)
 def speed_compiling(quick: bool) -> Iterator[dict[str, object]]:
-    """Processor seconds that a first `rgbmidic run`, whose cache of kernels is empty, takes more than a second one."""
+    """Additional processor seconds of a first `rgbmidic run`, with an empty cache of kernels, compared with a second
+    one."""
     if quick:  # what it takes does not depend on the size
         yield {"command": "rgbmidic run", "time [s]": float("nan")}
         return

@@ -25,7 +25,7 @@ NODAL = ("u", "v", "u_std", "v_std")
 @table("elements", page="explanation/uncertainty", cost=40, keys=3)
 def elements(quick: bool) -> Iterator[Row]:
     """Error over stated uncertainty with elements and regions of any size, and the fraction of the noise's score that
-    the fit leaves in the residual: plain texture at rest, noise of 8 % of its contrast, 12 draws.
+    remains in the residual after the fit: plain texture at rest, noise of 8 % of its contrast, 12 draws.
     """
     image = 100 + 50 * _speckle(160, 3.5)
     cases = [(size, 160, lights) for size in (40, 25, 16, 12, 8, 6, 4) for lights in (1, 3)]
@@ -102,8 +102,8 @@ OVERLAPS = {"whole region": 999, "60 px": 30, "8 px": 4, "none": 0}
 
 @table("overlaps", page="explanation/uncertainty", cost=30, keys=3, seed=7)
 def overlaps(quick: bool) -> Iterator[Row]:
-    """Error over stated uncertainty where each light moves for itself (`solver.rigid`) and neighbouring lights overlap
-    by the width named: plain texture, noise of 8 % of its contrast, 20 draws.
+    """Error over stated uncertainty if each light has its own rigid motion (`solver.rigid`) and neighbouring lights
+    overlap by the stated width: plain texture, noise of 8 % of its contrast, 20 draws.
     """
     cases = [(name, lights, rigid) for name in OVERLAPS for lights, rigid in ((2, "translation"), (3, ROTATING))]
     for name, lights, rigid in cases[-2:-1] if quick else cases:
@@ -148,7 +148,7 @@ BANDS = ((1, 30), (30, 60), (60, 100), (100, 150))
 
 @table("crack", page="explanation/uncertainty", cost=10, keys=2, seed=1)
 def crack(quick: bool) -> Iterator[Row]:
-    """Halves of a plate that move apart by 6 px each, the crack not stated, elements of 25 px: nodes measured at a
+    """Halves of a plate that move apart by 6 px each, without a stated crack, elements of 25 px: nodes measured at a
     distance from the crack, their rms error and rms stated uncertainty, and the error without a crack.
     """
     shape, middle, jump = (400, 400), 200, 6.0

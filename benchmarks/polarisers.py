@@ -207,7 +207,7 @@ ALUMINIUM = 1.373 + 7.618j
 
 @table("polarisers_oblique", page="explanation/polarisers", cost=0, keys=2)
 def polarisers_oblique(quick: bool) -> Iterator[Row]:
-    """What of a single reflection passes ideal crossed polarisers, over what of the diffuse light does."""
+    """Transmission of a single reflection through ideal crossed polarisers, relative to that of diffuse light."""
     for surface, index in (("paint", 1.5), ("aluminium", ALUMINIUM)):
         for apart in (20, 45, 90, 140):
             diagonal, darkest = crossed(index, np.radians(apart / 2))

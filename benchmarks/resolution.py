@@ -141,7 +141,8 @@ def judged(scene: Scene) -> Row:
 
 @table("resolution", page="how-to/resolution", cost=15, keys=3)
 def recommended(quick: bool) -> Iterator[Row]:
-    """Element size that `rgbmidic resolution` recommends, beside the one of the least true error (rms over the pixels).
+    """Element size that `rgbmidic resolution` recommends, and the one with the smallest true error (rms over the
+    pixels).
 
     Sizes of 10 (where three speckles fit), 16, 25, 40 and 63 px, two frames of 256 px, one draw of speckle and noise.
     """

@@ -108,8 +108,8 @@ WAVE, HEIGHT = 120.0, 0.1
 
 @table("gauge", page="how-to/results", cost=1, seed=2)
 def gauge(quick: bool) -> Iterator[dict[str, object]]:
-    """Strain exx of a rendered wave of 120 px (elements of 25 px, noise of 4 % of the contrast, 4 pairs) over gauges
-    of three lengths: height of the wave, what the gauge leaves of the true one, error to that and over stated
+    """Strain exx of a rendered wave of 120 px (elements of 25 px, noise of 4 % of the contrast, 4 pairs) over gauges of
+    three lengths: height of the wave, the true height after the gauge, the error relative to that and over stated
     uncertainty."""
     texture, shape = Texture.random(2), (200, 360)
     y, x = np.mgrid[: shape[0], : shape[1]].astype(float)

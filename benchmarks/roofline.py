@@ -70,7 +70,8 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
 
 @table("speed_kernels", page="explanation/speed", cost=2, timing=True)
 def speed_kernels(quick: bool) -> Iterator[dict[str, object]]:
-    """Time per pixel of the kernels on one thread, and over the time in which the memory moves their arrays once."""
+    """Time per pixel of the kernels on one thread, and relative to the time to move their arrays through the memory
+    once."""
     speed = bandwidth()
     for name, count, size, work in cases(256 if quick else 1024):
         taken, bound = 1e9 * best(work) / count, 1e9 * size / speed

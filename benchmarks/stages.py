@@ -48,8 +48,8 @@ def stages(work: Callable[[], object], repeats: int) -> tuple[dict[str, float], 
 
 @table("speed_stages", page="explanation/speed", cost=30, timing=True)
 def speed_stages(quick: bool) -> Iterator[dict[str, object]]:
-    """Processor time (ms) of the stages of a frame of 1024 x 1024 px on one thread, the fastest of three runs; how
-    much of it threads share, and how many times as fast two of them are at most."""
+    """Processor time (ms) of the stages of a frame of 1024 x 1024 px on one thread, the fastest of three runs; the part
+    that runs in parallel, and the largest possible speed-up by two threads."""
     cases = {"star": "grey pair"} | peers.FRAMES
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -139,10 +139,10 @@ class _Renderer:
 
 @table("standing_glare", page="explanation/uncertainty", cost=100, keys=1, own_quick=True)
 def standing_glare(quick: bool) -> Iterator[Row]:
-    """Plates with a hole, glare of three lights beside it that stands still, 1.5 to 2.5 times the diffuse level and 30
-    to 60 % of it erratic, raw Bayer frames, 12 frames of motion up to 17 px, 2 degrees and 2 % of strain: nodes, how
-    many are wild (off by more than .2 px and 4 times their stated uncertainty), those not measured, rms error, error
-    over stated uncertainty.
+    """Plates with a hole, with reflections of three lights beside it that do not move, 1.5 to 2.5 times the diffuse
+    level and 30 to 60 % of it irregular, raw Bayer frames, 12 frames of motion up to 17 px, 2 degrees and 2 % of
+    strain: nodes, how many are wild (error above .2 px and 4 times their stated uncertainty), those not measured, rms
+    error, error over stated uncertainty.
     """
     crosstalk = Crosstalk(matrix=CROSSTALK, lights=("red", "green", "blue"))
     calibration = Calibration(crosstalk=crosstalk, noise=NoiseModel(gain=GAIN, read_noise=READ_NOISE))

@@ -38,7 +38,8 @@ def _text(words: str) -> str:
 
 @table("study", page="explanation/study", cost=190, own_quick=True)
 def perturbation(quick: bool) -> Iterator[dict[str, object]]:
-    """Perturbation P of the five areas: the paper's methods as in the paper, two of them in our solver, our default."""
+    """Perturbation P of the five areas: the paper's methods as in the paper, two of them in rgbmidic's solver, and
+    rgbmidic's default."""
     for scene in bench_study(quick).scenes:
         for method, settings in METHODS.items():
             for angle, row in zip(scene.angles, scene.perturbation(method), strict=True):
@@ -78,7 +79,7 @@ def ratios(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("study_claims", page="explanation/study", cost=0.5, own_quick=True, keys=3)
 def claims(quick: bool) -> Iterator[dict[str, object]]:
-    """The paper's statements on the virtual bench, judged with the paper's methods as they are."""
+    """The paper's statements on the virtual bench, judged with the paper's methods as published."""
     for claim in judge(bench_study(quick)):
         names = {"scene": claim.scene or "flat specimen", "paper": _text(claim.figure)}
         yield names | {"statement": _text(claim.statement), "verdict": claim.verdict}
@@ -86,8 +87,8 @@ def claims(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("study_causes", page="explanation/study", cost=60, own_quick=True)
 def causes(quick: bool) -> Iterator[dict[str, object]]:
-    """P (1e-3 px) in the reflection and far from it by the paper's DIC and GLC-DIC with one thing changed at a time,
-    one lamp, frames of 512 px."""
+    """P (1e-3 px) in the reflection and far from it by the paper's DIC and GLC-DIC with one parameter changed at a
+    time, one lamp, frames of 512 px."""
     some = {"size": SMALL, "variations": [VARIATIONS[0]]} if quick else {}
     for cause in find_causes((8.0,) if quick else (1.0, 8.0), **some):
         row: dict[str, object] = {"change": _text(cause.title)}

@@ -183,7 +183,7 @@ def sphere(quick: bool) -> Iterator[Row]:
 @table("weights", page="explanation/uncertainty", cost=60, keys=3, seed=11, own_quick=True)
 def weights(quick: bool) -> Iterator[Row]:
     """Turning sphere: rms error of the displacement with the default weights, with none, and with the paper's masks at
-    the best of twelve thresholds, chosen in hindsight by the true error (in grey levels over full scale).
+    the best of twelve thresholds, chosen afterwards by the true error (in grey levels over full scale).
     """
     for paint in ("coarse",) if quick else PAINTS:
         for angle in (4.0,) if quick else (1.0, 8.0):
@@ -249,9 +249,8 @@ VARIANTS: dict[str, dict[str, float]] = {
 
 @table("scenes", page="explanation/uncertainty", cost=100, keys=2, seed=11)
 def scenes(quick: bool) -> Iterator[Row]:
-    """Other bodies, gloss and speckle, everything at its default: rms error of the displacement over the field, error
-    over stated uncertainty of displacement and of strain, and nodes that are not measured, with a 3-CCD and a Bayer
-    camera.
+    """Other bodies, gloss and speckle, with default settings: rms error of the displacement over the field, error over
+    stated uncertainty of displacement and of strain, and nodes that are not measured, with a 3-CCD and a Bayer camera.
     """
     for body, angle in BODIES.items():
         for title, options in VARIANTS.items():
@@ -273,9 +272,9 @@ def scenes(quick: bool) -> Iterator[Row]:
 
 @table("corrupted", page="explanation/uncertainty", cost=30, keys=2, seed=11)
 def corrupted(quick: bool) -> Iterator[Row]:
-    """Sphere turned by 1 degree, the deformed frame corrupted, no initial guess given: error over stated uncertainty 40
-    px and more away from the corrupted zone, nodes lost there, the largest ratio anywhere; nodes within the zone, how
-    many of them are not measured, and error over stated uncertainty of those that are.
+    """Sphere rotated by 1 degree, with a corrupted deformed frame and no initial guess: error over stated uncertainty
+    at least 40 px away from the corrupted zone, nodes without data there, the largest ratio anywhere; nodes within the
+    zone, how many of them are not measured, and error over stated uncertainty of the others.
     """
     for corruption in CORRUPTIONS[:1] if quick else CORRUPTIONS:
         pair = corruption.pair()
@@ -311,8 +310,8 @@ def corrupted(quick: bool) -> Iterator[Row]:
 @table("areas", page="explanation/uncertainty", cost=40, keys=2, own_quick=True)
 def areas(quick: bool) -> Iterator[Row]:
     """The paper's sphere, whose green reflection crosses the areas A4 and A3, in one shot: perturbation P of area A0,
-    which no reflection reaches, P of the others over it (root mean square of both components), and what the stated
-    uncertainty is there over that of A0.
+    which no reflection reaches, P of the other areas over it (root mean square of both components), and their stated
+    uncertainty over that of A0.
     """
     from bench import Bench
 
