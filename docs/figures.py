@@ -166,15 +166,20 @@ class Demo:
 
 def reflection(theme: str, demo: Demo) -> None:
     """Red's image, where it reflects; the error of red alone and of three lights, over the same part."""
+    from rgbmidic import Tri3Mesh
+    from rgbmidic.fields import field_rms
+
     ink = THEMES[theme][0]
     figure, axes = plt.subplots(1, 3, figsize=(7.2, 2.75), gridspec_kw={"wspace": 0.06})
     both = np.stack([demo.result.u[-1], demo.result.v[-1]], axis=1)
-    errors = [demo.error(demo.alone.displacement), demo.error(both)]
+    fields = [demo.alone.displacement, both]
     titles = ["the red lamp's image", "error, this lamp alone", "error, three lamps, one frame"]
     axes[0].imshow(
         demo.after[0][::2, ::2], cmap="gray", extent=(-0.5, 447.5, 447.5, -0.5), vmax=np.quantile(demo.after[0], 0.995)
     )
-    for axis, error in zip(axes[1:], errors, strict=True):
+    mesh = Tri3Mesh(nodes=demo.result.nodes, elements=demo.result.elements)
+    for axis, field in zip(axes[1:], fields, strict=True):
+        error = demo.error(field)
         drawn = axis.tripcolor(
             *demo.result.nodes.T,
             demo.result.elements,
@@ -185,7 +190,7 @@ def reflection(theme: str, demo: Demo) -> None:
             cmap="magma",
             rasterized=True,
         )
-        axis.text(226, 452, f"rms {np.sqrt(np.nanmean(error**2)):.4f} px", ha="center", va="top", color=ink)
+        axis.text(226, 452, f"rms {field_rms(mesh, field, demo.truth):.4f} px", ha="center", va="top", color=ink)
     for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title, color=ink, fontsize=9)
         axis.set(xlim=(20, 427), ylim=(440, 8), aspect="equal")

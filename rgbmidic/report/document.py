@@ -119,7 +119,10 @@ class _Report:
         page.table(("analysis", ""), list(tables.analysis_rows(self.physical, self.floor)))
         page.heading("Methods, for a paper")
         page.text(tables.methods_text(self.physical, self.setup, self.floor))
-        page.text("Please cite the method and the program: rgbmidic, docs/explanation/citing.md and CITATION.cff.")
+        page.text(
+            "Please cite the method (M. Poncelet and H. Leclerc, A Digital Image Correlation algorithm with light "
+            "reflection compensation, Experimental Mechanics, 2015) and the program (rgbmidic, with its version)."
+        )
         self._fields(page)
         self._probes(page)
         self._along(page)

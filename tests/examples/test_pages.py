@@ -42,7 +42,7 @@ PAGES = OUTSIDE + sorted(
     for path in (ROOT / "docs").rglob("*.md")
     if not path.is_relative_to(ROOT / "docs/examples")
 )
-NOT_RUN = 14
+NOT_RUN = 16
 """Blocks that do not run, at most: installation, servers, clusters, MATLAB, others' packages, minutes of work."""
 BLOCK = re.compile(r"(?:^<!-- (.*?) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
