@@ -143,7 +143,7 @@ def border(quick: bool) -> Iterator[dict[str, object]]:
 
 @table("geometry_weights", page="how-to/planning", cost=8, seed=41)
 def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
-    """Rms error (px) on the sphere before a 3-CCD camera by the weights of the lights, other settings by default."""
+    """Rms error (px) on the sphere with a 3-CCD camera by the weights of the lights, otherwise default settings."""
     for height, text in ((0.0, "flat"), (0.004, "4 um high")):
         for angle in (1.0,) if quick else (1.0, 4.0, 8.0):
             if quick and height:
