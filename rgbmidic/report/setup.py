@@ -92,7 +92,9 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         cracked = len(mesh.crack_edges) > 0
         levels = f"divided by their local mean, σ = {normalise * (WIDER_AT_CRACKS if cracked else 1):g} px"
         correction = "mean" if cracked and correction != "local" else correction
-    side, gauge = physical.in_units(size), physical.gauges.length
+    refinement, gauge = result.provenance.get("refinement"), physical.gauges.length  # of mesh.refine
+    ends = (mesh.sizes.min(), mesh.sizes.max()) if mesh.is_graded and refinement else (size,)
+    side = " to ".join(physical.in_units(float(f"{end:.3g}")) for end in ends)
     finest = (("displacement", _FINEST[0] * size), ("strain", _FINEST[1] * gauge))
     rows = (
         ("software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"),
@@ -104,6 +106,7 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         ("elements", f"{len(mesh.elements)} triangles of three nodes, {len(mesh.nodes)} nodes; side {side}"),
         ("data point spacing", f"{side}, at the nodes"),
         ("choice of the elements", None if chosen is None else f"by the run: {chosen['reason']}"),
+        ("refinement of the elements", refinement),
         ("shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"),
         ("matching criterion", "weighted sum of squared differences over all lights at once"),
         ("interpolant", "cubic B-spline"),
