@@ -672,9 +672,7 @@ class TestSettings(_Checked):
             return
         stated = {"element_size": self.element_size, "cracks": self.cracks, "refine": self.mesh_refine is not False}
         for key, value in stated.items():
-            _require(
-                not value, f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out"
-            )
+            _require(not value, f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out")
         pairs = self.mesh_points or ()
         _require(
             len(pairs) >= 2, f"mesh.file needs mesh.points, two or more [x_mm, y_mm, x_px, y_px], not {len(pairs)}"

@@ -367,7 +367,7 @@ def _check_given(
         )
     if settings.mesh_refine is not False:
         raise ConfigurationError(
-            "mesh.refine is done on the frames of a test by rgbmidic.measure, for a mesh that is made there: leave it out"
+            "mesh.refine is done on the frames of a test by rgbmidic.measure, for a mesh made there: leave it out"
         )
     kind = settings.frames.kind
     if kind in ("bayer", "rgb") and separation is None and settings.calibration_file is None:

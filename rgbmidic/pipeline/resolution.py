@@ -30,7 +30,17 @@ from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights import as_weights, precision_method
 
-__all__ = ["SIZES", "SPECKLES", "Choice", "GaugeFigures", "ResolutionStudy", "SizeFigures", "choose", "refine", "study_sizes"]
+__all__ = [
+    "SIZES",
+    "SPECKLES",
+    "Choice",
+    "GaugeFigures",
+    "ResolutionStudy",
+    "SizeFigures",
+    "choose",
+    "refine",
+    "study_sizes",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -382,7 +392,8 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
         nodes = np.round(finer.nodes / _EXACT) * _EXACT
         plan = on_mesh(plan, Tri3Mesh(nodes=nodes, elements=finer.elements))
         counts.append(len(nodes))
-    worth = f"the discretisation error of strain in {plan.series.name(key.index)} is more than {_WORTH:g} times its noise"
+    name = plan.series.name(key.index)
+    worth = f"the discretisation error of strain in {name} is more than {_WORTH:g} times its noise"
     text = f"no element: there is none where {worth} and parts would have legs of {least:.3g} px or more"
     if counts[1:]:
         text = f"from {counts[0]} to {counts[-1]} nodes in {len(counts) - 1} steps, where {worth}; no leg is shorter "
