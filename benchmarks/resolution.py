@@ -173,7 +173,13 @@ def recommended(quick: bool) -> Iterator[Row]:
 
 REFINED = tuple(
     (Scene(kind, width, height, 0.06, seed=50, side=380), start)
-    for kind, width, height in (("bump", 14, 1.5), ("hole", 40, 0.02), ("wave", 90, 0.4), ("affine", 120, 1.0))
+    for kind, width, height in (
+        ("bump", 14, 1.5),
+        ("hole", 20, 0.02),
+        ("hole", 40, 0.02),
+        ("wave", 90, 0.4),
+        ("affine", 120, 1.0),
+    )
     for start in (25.0, 40.0)
 )
 """A bump and a hole that need small elements in one place, a wave that needs them everywhere, a plane nowhere; and the

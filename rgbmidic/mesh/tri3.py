@@ -297,7 +297,9 @@ def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
     edge = edge.reshape(-1, 3)
     start, end = mesh.nodes[np.stack(np.divmod(keys, count))]
     rank = np.empty(len(keys), dtype=np.int64)
-    rank[np.lexsort((keys, np.round(np.hypot(*(end - start).T), 6)))] = np.arange(len(keys))
+    # equal edges in no order along the rows of a regular mesh: cuts of elements beside would go on to its end
+    shuffled = np.random.default_rng(0).permutation(len(keys))
+    rank[np.lexsort((shuffled, np.round(np.hypot(*(end - start).T), 6)))] = np.arange(len(keys))
     turn = (np.argmax(rank[edge], axis=1)[:, None] + np.arange(3)) % 3  # the longest edge first
     corners, edge = (np.take_along_axis(one, turn, axis=1) for one in (corners, edge))
     whole = mesh.areas < least**2
