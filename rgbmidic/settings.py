@@ -919,7 +919,7 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         if value in words:
             return value
         if words and isinstance(value, str):
-            known = ", ".join(map(_quoted, words))
+            known = ", ".join(_quoted(word) if isinstance(word, str) else str(word).lower() for word in words)
             raise ConfigurationError(f"{where} must be {_WORDS[kinds[0]]} or {known}, not {_quoted(value)}")
         return convert_value(value, kinds[0], where, base)
     if origin is tuple:
