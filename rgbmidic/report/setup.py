@@ -93,8 +93,9 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         levels = f"divided by their local mean, σ = {normalise * (WIDER_AT_CRACKS if cracked else 1):g} px"
         correction = "mean" if cracked and correction != "local" else correction
     refinement, gauge = result.provenance.get("refinement"), physical.gauges.length  # of mesh.refine
-    ends = (mesh.sizes.min(), mesh.sizes.max()) if mesh.is_graded and refinement else (size,)
-    side = " to ".join(physical.in_units(float(f"{end:.3g}")) for end in ends)
+    legs = np.sqrt(2 * mesh.areas)
+    ends = (float(f"{end:.3g}") for end in (legs.min(), legs.max())) if refinement else (size,)
+    side = " to ".join(map(physical.in_units, ends))
     finest = (("displacement", _FINEST[0] * size), ("strain", _FINEST[1] * gauge))
     rows = (
         ("software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"),
@@ -151,7 +152,8 @@ def methods_text(physical: Physical, setup: SetupSettings, floor: NoiseFloor | N
         f"{setup.lens or '[lens]'} recorded {columns} x {rows} px at {f'{rate:g}' if rate else '[frame rate]'} frames "
         f"per second, exposure {'[exposure]' if exposure is None else f'{exposure / 1000:g} µs'}, while "
         f"{several if len(lights) > 1 else single} with rgbmidic {result.provenance['versions'].get('rgbmidic', '')} "
-        f"on linear triangles of {physical.in_units(physical.mesh.size if size is None else size)}, against "
+        f"on linear triangles of {physical.in_units(physical.mesh.size if size is None else size)}"
+        f"{', bisected by their discretisation error' if result.provenance.get('refinement') else ''}, against "
         f"{reference_text(physical)}, with cubic B-spline interpolation. Strain is {physical.measure_name} over "
         f"virtual strain gauges of {physical.in_units(physical.gauges.length)}. The noise floor is {noise}. "
         "Uncertainties are standard uncertainties (k = 1)."

@@ -17,6 +17,8 @@ from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, In
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
 from rgbmidic.pipeline.resolution import ResolutionStudy, SizeFigures, study_sizes
+from rgbmidic.report.setup import analysis_rows
+from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
 
 STATES = Scene("bump", width=12, height=1.5, noise=0, side=144).images()[0].astype(np.float32)
@@ -239,6 +241,10 @@ def test_a_run_refines_its_mesh_where_the_bump_is_and_goes_on_with_it(tmp_path, 
     assert np.median(legs[away > 150]) > 23
     assert legs.min() > 3 * 3.4  # speckles
     assert len(mesh.nodes) > 2 * len(coarse.nodes)
+
+    rows = dict(analysis_rows(Physical.of(whole), None))
+    assert rows["data point spacing"].startswith(f"{legs.min():.3g} px to 23.9 px")
+    assert rows["refinement of the elements"] == whole.provenance["refinement"]
 
     others = measure(refining(), tmp_path / "others", source=BUMPS, workers=2)
     np.testing.assert_array_equal(others.u, whole.u)
