@@ -510,6 +510,8 @@ def _print_summary(result: Result, seconds: float) -> None:
         rows["nodes"] += f", {sum(measured) / len(measured):.1%} measured"
     if chosen := result.provenance.get("element_size"):
         rows["mesh"] = f"{chosen['element_size']:g} px: {chosen['reason']}"
+    if refinement := result.provenance.get("refinement"):
+        rows["refined"] = refinement
     if (count := len(result.setting("frames", "reference", [0]))) > 1:
         gain = ((1 + 1 / count) / 2) ** 0.5
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"

@@ -609,6 +609,9 @@ class TestSettings(_Checked):
     mesh_error
         ``error`` in ``[mesh]``: whether the discretisation error is estimated (`rgbmidic.discretisation_error`), in
         every frame, or in key frames (``"key"``): every 16th and the last.
+    mesh_refine
+        ``refine`` in ``[mesh]``: whether elements are bisected where the discretisation error of strain is more than
+        twice its noise (`rgbmidic.pipeline.resolution.refine`), in the frame of this index, or in a key frame (True).
     base
         Folder that relative paths start from.
     """
@@ -630,6 +633,7 @@ class TestSettings(_Checked):
     mesh_unit: Literal["mm", "m", "um", "inch"] | None = field(default=None, metadata={"key": "mesh.unit"})
     mesh_part: str | None = field(default=None, metadata={"key": "mesh.part"})
     mesh_error: bool | Literal["key"] = field(default=False, metadata={"key": "mesh.error"})
+    mesh_refine: int | Literal[True, False] = field(default=False, metadata={"key": "mesh.refine"})
     illumination: IlluminationSettings = field(default_factory=IlluminationSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
@@ -644,10 +648,15 @@ class TestSettings(_Checked):
             not (self.mesh_error and self.frames.update_reference),
             "mesh.error is for one reference, and frames.update_reference makes others: leave one of them out",
         )
+        for key, asked in (("error", self.mesh_error), ("refine", self.mesh_refine is not False)):
+            _require(
+                not asked or self.mesh_file is not None or self.side >= SMALLEST_HALVED,
+                f"mesh.{key} halves the elements: mesh.element_size must be {SMALLEST_HALVED:g} px or more for it, not "
+                f"{self.side:g}",
+            )
         _require(
-            not self.mesh_error or self.mesh_file is not None or self.side >= SMALLEST_HALVED,
-            f"mesh.error halves the elements: mesh.element_size must be {SMALLEST_HALVED:g} px or more for it, not "
-            f"{self.side:g}",
+            self.mesh_refine is False or self.element_size != "auto",
+            'mesh.refine and mesh.element_size = "auto" both choose the elements: state a number, or leave refine out',
         )
         for number, crack in enumerate(self.cracks):
             _require_corners(f"mesh.cracks[{number}]", crack, 2, "two")
@@ -661,10 +670,9 @@ class TestSettings(_Checked):
             if self.element_size is None:
                 object.__setattr__(self, "element_size", ELEMENT_SIZE)
             return
-        for key in ("element_size", "cracks"):
-            _require(
-                not getattr(self, key), f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out"
-            )
+        stated = {"element_size": self.element_size, "cracks": self.cracks, "refine": self.mesh_refine is not False}
+        for key, value in stated.items():
+            _require(not value, f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out")
         pairs = self.mesh_points or ()
         _require(
             len(pairs) >= 2, f"mesh.file needs mesh.points, two or more [x_mm, y_mm, x_px, y_px], not {len(pairs)}"
@@ -911,7 +919,7 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         if value in words:
             return value
         if words and isinstance(value, str):
-            known = ", ".join(map(_quoted, words))
+            known = ", ".join(_quoted(word) if isinstance(word, str) else str(word).lower() for word in words)
             raise ConfigurationError(f"{where} must be {_WORDS[kinds[0]]} or {known}, not {_quoted(value)}")
         return convert_value(value, kinds[0], where, base)
     if origin is tuple:

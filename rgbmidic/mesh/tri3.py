@@ -17,7 +17,7 @@ from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.region import Region, edge_keys, outline_mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Tri3Mesh", "with_data"]
+__all__ = ["Tri3Mesh", "refined", "with_data"]
 
 logger = logging.getLogger(__name__)
 
@@ -263,6 +263,76 @@ def _rectangle_mesh(
     second = np.where(even, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     elements = np.stack([first, second], 1).reshape(-1, 3).astype(np.int32)
     return np.stack([x.ravel(), y.ravel()], 1), elements
+
+
+_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
+"""Corners of the edges of an element."""
+
+
+def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
+    """Bisect elements at their longest edges, and those beside as far as no node then hangs on an edge.
+
+    No angle gets smaller than half the smallest of the mesh (Rosenberg and Stenger, SIAM J. Numer. Anal. 12, 1975;
+    Rivara, Int. J. Numer. Meth. Eng. 20, 1984). Both sides of a crack are bisected alike and stay apart.
+
+    Parameters
+    ----------
+    mesh
+        What is refined; its nodes stay, with their numbers.
+    marked
+        Elements (E,) that are to be bisected.
+    least
+        Smallest leg in px that a part may have, as that of a right isosceles triangle of its area: what would give
+        smaller ones stays whole.
+
+    Returns
+    -------
+    Tri3Mesh
+        The finer mesh; `mesh` itself where nothing can be bisected.
+    """
+    place, corners, count = np.arange(len(mesh.nodes)), mesh.elements.astype(np.int64), len(mesh.nodes)
+    np.minimum.at(place, mesh.copies[:, 1], mesh.copies[:, 0])
+    # edges by place: what is cut on one side of a crack is cut on the other
+    keys, edge = np.unique(edge_keys(place[corners][:, _EDGES].reshape(-1, 2), count), return_inverse=True)
+    edge = edge.reshape(-1, 3)
+    start, end = mesh.nodes[np.stack(np.divmod(keys, count))]
+    rank = np.empty(len(keys), dtype=np.int64)
+    # equal edges in no order along the rows of a regular mesh: cuts of elements beside would go on to its end
+    shuffled = np.random.default_rng(0).permutation(len(keys))
+    rank[np.lexsort((shuffled, np.round(np.hypot(*(end - start).T), 6)))] = np.arange(len(keys))
+    turn = (np.argmax(rank[edge], axis=1)[:, None] + np.arange(3)) % 3  # the longest edge first
+    corners, edge = (np.take_along_axis(one, turn, axis=1) for one in (corners, edge))
+    whole = mesh.areas < least**2
+    while True:
+        free, cut = np.ones(len(keys), dtype=bool), np.zeros(len(keys), dtype=bool)
+        while (held := (whole | ~free[edge[:, 0]]) & free[edge].any(axis=1)).any():
+            free[edge[held]] = False
+        cut[edge[marked & free[edge[:, 0]], 0]] = True
+        while (forced := cut[edge].any(axis=1) & ~cut[edge[:, 0]]).any():
+            cut[edge[forced, 0]] = True
+        number = cut[edge].sum(axis=1)
+        # a part between two edges that are cut is a quarter
+        small = (number > 1) & (mesh.areas / 2 < least**2)
+        if not small.any():
+            break
+        whole |= small
+    return _bisected(mesh, corners, cut[edge]) if cut.any() else mesh
+
+
+def _bisected(mesh: Tri3Mesh, corners: npt.NDArray[np.int64], cut: BoolArray) -> Tri3Mesh:
+    """Cut edges (E, 3) of elements, the first edge of each before the others; edge i joins corners i and i + 1."""
+    count = len(mesh.nodes)
+    keys, middle = np.unique(edge_keys(corners[:, _EDGES][cut], count), return_inverse=True)
+    at = np.full(cut.shape, -1)
+    at[cut] = count + middle
+    a, b, c = corners.T
+    one, ab, bc, ca = cut[:, 0], *at.T
+    halves = [corners[~one]]
+    for side, parts in ((1, ((ab, b, c), (ab, b, bc), (ab, bc, c))), (2, ((ab, c, a), (ab, c, ca), (ab, ca, a)))):
+        also = one & cut[:, side]
+        halves += [np.stack(parts[0], 1)[one & ~also], *(np.stack(part, 1)[also] for part in parts[1:])]
+    nodes = np.concatenate([mesh.nodes, mesh.nodes[np.stack(np.divmod(keys, count))].mean(axis=0)])
+    return Tri3Mesh(nodes=nodes, elements=np.concatenate(halves))
 
 
 Matrix = TypeVar("Matrix", sp.csr_matrix, sp.csc_matrix)

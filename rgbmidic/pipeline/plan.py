@@ -139,6 +139,8 @@ class Plan:
         The mesh of ``mesh.file``, the part that is measured, and where it lies in the frame; None: there is no file.
     choice
         Why the elements have their size, where ``mesh.element_size`` is ``"auto"``; else None.
+    refinement
+        In which frame and how far the mesh was refined (``mesh.refine``), in a sentence; else None.
     timings
         Whether to tell the time that each stage of a frame takes.
     updates
@@ -160,6 +162,7 @@ class Plan:
     finite_elements: FiniteElementMesh | None = None
     placement: Placement | None = None
     choice: Choice | None = None
+    refinement: str | None = None
     timings: bool = False
     updates: UpdatedReferences = field(default_factory=UpdatedReferences, repr=False, compare=False)
 
@@ -361,6 +364,10 @@ def _check_given(
         raise ConfigurationError(
             'mesh.element_size = "auto" is found on the frames of a test by rgbmidic.measure, for a mesh that is made '
             "there: state a number"
+        )
+    if settings.mesh_refine is not False:
+        raise ConfigurationError(
+            "mesh.refine is done on the frames of a test by rgbmidic.measure, for a mesh made there: leave it out"
         )
     kind = settings.frames.kind
     if kind in ("bayer", "rgb") and separation is None and settings.calibration_file is None:

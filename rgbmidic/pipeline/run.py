@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
@@ -27,13 +27,13 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame, solver_settings
 from rgbmidic.pipeline.plan import Choice, Plan
-from rgbmidic.pipeline.resolution import choose
+from rgbmidic.pipeline.resolution import choose, on_mesh, refine
 from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank_of
 from rgbmidic.pipeline.source import FrameSequence, LightSeparation, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.results.files import PROVENANCE, read_provenance
-from rgbmidic.results.store import listed
+from rgbmidic.results.store import listed, read_mesh
 from rgbmidic.settings import (
     ELEMENT_SIZE,
     FrameSettings,
@@ -129,12 +129,17 @@ def measure(
         raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
     choice: Choice | None = None
+    begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
+    kept = read_provenance(Path(out)) if begun else {}
     if settings.element_size == "auto":
-        begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
-        kept = read_provenance(Path(out)).get("element_size") if begun else None
-        choice = choose(settings, **given) if kept is None else Choice(**kept)
+        choice = Choice(**kept["element_size"]) if kept.get("element_size") else choose(settings, **given)
+    if settings.mesh_refine is not False and mesh is not None:
+        raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
     sized = settings if choice is None else replace(settings, element_size=choice.element_size)
-    plan = replace(Plan.from_settings(sized, **given), settings=settings, choice=choice, timings=timings)
+    plan = Plan.from_settings(replace(sized, mesh_refine=False), **given)
+    if settings.mesh_refine is not False:
+        plan = _refined(plan, settings.mesh_refine, Path(out), kept)
+    plan = replace(plan, settings=settings, choice=choice, timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
@@ -158,6 +163,15 @@ def measure(
         if frames is None:
             store.finish()
     return Result.open(out, partial=frames is not None, check=False)
+
+
+def _refined(plan: Plan, frame: int | bool, out: Path, kept: Mapping[str, Any]) -> Plan:
+    """The plan on a mesh refined in a frame, or on that of the result in `out`, with the provenance `kept`."""
+    if "refinement" not in kept:
+        return refine(plan, frame)
+    stored = read_mesh(out, kept)
+    mesh = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
+    return replace(on_mesh(plan, mesh), refinement=kept["refinement"])
 
 
 def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
@@ -231,6 +245,7 @@ def _store(
         notes={
             **getattr(plan.weights, "notes", {}),
             **({} if plan.choice is None else {"element_size": asdict(plan.choice)}),
+            **({} if plan.refinement is None else {"refinement": plan.refinement}),
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
             "lost_frames": series.lost,

@@ -92,7 +92,10 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         cracked = len(mesh.crack_edges) > 0
         levels = f"divided by their local mean, σ = {normalise * (WIDER_AT_CRACKS if cracked else 1):g} px"
         correction = "mean" if cracked and correction != "local" else correction
-    side, gauge = physical.in_units(size), physical.gauges.length
+    refinement, gauge = result.provenance.get("refinement"), physical.gauges.length  # of mesh.refine
+    legs = np.sqrt(2 * mesh.areas)
+    ends = (float(f"{end:.3g}") for end in (legs.min(), legs.max())) if refinement else (size,)
+    side = " to ".join(map(physical.in_units, ends))
     finest = (("displacement", _FINEST[0] * size), ("strain", _FINEST[1] * gauge))
     rows = (
         ("software", f"rgbmidic {result.provenance['versions'].get('rgbmidic', '')}, global finite-element DIC"),
@@ -104,6 +107,7 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         ("elements", f"{len(mesh.elements)} triangles of three nodes, {len(mesh.nodes)} nodes; side {side}"),
         ("data point spacing", f"{side}, at the nodes"),
         ("choice of the elements", None if chosen is None else f"by the run: {chosen['reason']}"),
+        ("refinement of the elements", refinement),
         ("shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"),
         ("matching criterion", "weighted sum of squared differences over all lights at once"),
         ("interpolant", "cubic B-spline"),
@@ -148,7 +152,8 @@ def methods_text(physical: Physical, setup: SetupSettings, floor: NoiseFloor | N
         f"{setup.lens or '[lens]'} recorded {columns} x {rows} px at {f'{rate:g}' if rate else '[frame rate]'} frames "
         f"per second, exposure {'[exposure]' if exposure is None else f'{exposure / 1000:g} µs'}, while "
         f"{several if len(lights) > 1 else single} with rgbmidic {result.provenance['versions'].get('rgbmidic', '')} "
-        f"on linear triangles of {physical.in_units(physical.mesh.size if size is None else size)}, against "
+        f"on linear triangles of {physical.in_units(physical.mesh.size if size is None else size)}"
+        f"{', bisected by their discretisation error' if result.provenance.get('refinement') else ''}, against "
         f"{reference_text(physical)}, with cubic B-spline interpolation. Strain is {physical.measure_name} over "
         f"virtual strain gauges of {physical.in_units(physical.gauges.length)}. The noise floor is {noise}. "
         "Uncertainties are standard uncertainties (k = 1)."

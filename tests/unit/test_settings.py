@@ -394,14 +394,14 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
     value = getattr(built, name)
     inner = np.asarray(value, dtype=object).ravel()[0] if isinstance(value, tuple) else value
     wrong: list[Any] = [3j, {}, object(), [[[[1]]]]]
-    wrong += [1, "true"] if isinstance(inner, bool) else [True]
+    wrong += ["true", *([1] if name != "mesh_refine" else [])] if isinstance(inner, bool) else [True]  # or a frame
     wrong += ["1e-3", float("nan")] if isinstance(inner, int | float) else [3]
     wrong += [1.5] if type(inner) is int else []
     section = next(section.split()[0] for section, settings in BUILT.items() if settings is built)
     prefix = "" if section == "test" else rf"{section}\."
     key = {"calibration_file": r"calibration\.file", "element_size": r"mesh\.element_size", "cracks": r"mesh\.cracks"}
     key |= {"accept": r"calibration\.accept"}
-    key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part", "error")}
+    key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part", "error", "refine")}
     key = key if isinstance(built, TestSettings) else {}
     for instead in wrong:
         with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.mesh.tri3 import refined
 
 SHAPE = (301, 401)
 SIZE = 25
@@ -175,3 +176,55 @@ def test_any_path_gives_a_sound_mesh_or_one_clear_error(ends):
 def test_a_path_that_cannot_be_meshed_is_one_clear_error(cracks, error, message):
     with pytest.raises(error, match=message):
         Tri3Mesh.from_region(REGIONS["rectangle"], SIZE, cracks)
+
+
+def around(mesh, place, distance):
+    return np.hypot(*(mesh.nodes[mesh.elements].mean(axis=1) - place).T) < distance
+
+
+def smallest_angle(mesh):
+    """In degrees."""
+    corners = mesh.nodes[mesh.elements]
+    first, second = (np.roll(corners, -turn, axis=1) - corners for turn in (1, 2))
+    cosine = (first * second).sum(axis=2) / np.linalg.norm(first, axis=2) / np.linalg.norm(second, axis=2)
+    return float(np.degrees(np.arccos(cosine.max())))
+
+
+def outline(mesh):
+    """Length of the edges that belong to one element; a node that hangs on an edge makes it longer."""
+    start, end = mesh.nodes[mesh._boundary_edges()].swapaxes(0, 1)
+    return np.hypot(*(end - start).T).sum()
+
+
+@both_regions
+@pytest.mark.parametrize("crack", [None, *CRACKS])
+def test_bisected_elements_fit_together_and_cracks_stay_split(region, crack):
+    mesh = coarse = Tri3Mesh.from_region(REGIONS[region], SIZE, CRACKS[crack] if crack else ())
+    for _ in range(4):
+        finer = refined(mesh, around(mesh, (150, 110), 40), 5)
+        np.testing.assert_array_equal(finer.nodes[: len(mesh.nodes)], mesh.nodes)
+        mesh = finer
+    assert len(mesh.elements) > len(coarse.elements) + 40
+    assert np.isclose(mesh.areas.sum(), coarse.areas.sum(), rtol=1e-12)
+    assert np.isclose(outline(mesh), outline(coarse), rtol=1e-12)
+    first, second = mesh.nodes[mesh.elements][:, 1:].swapaxes(0, 1) - mesh.nodes[mesh.elements][:, 0]
+    assert (first[:, 0] * second[:, 1] > first[:, 1] * second[:, 0]).all()
+    assert smallest_angle(mesh) > 0.5 * smallest_angle(coarse)
+    assert bodies(mesh) == bodies(coarse)
+    far = ~around(mesh, (150, 110), 150)
+    assert np.isin(np.round(mesh.areas[far], 6), np.round(coarse.areas, 6)).all()
+    ends = (one.nodes[one.crack_edges].swapaxes(0, 1) for one in (mesh, coarse))
+    lengths = [np.hypot(*(end - start).T).sum() for start, end in ends]
+    assert np.isclose(*lengths, rtol=1e-12)
+
+
+def test_no_part_is_shorter_than_the_least_leg():
+    mesh = Tri3Mesh.from_region(REGIONS["ring"], SIZE)
+    small = np.sqrt(2 * mesh.areas).min()
+    for least in (9, 14):
+        finer = mesh
+        for _ in range(5):
+            finer = refined(finer, np.ones(len(finer.elements), dtype=bool), least)
+        assert min(least, small) <= np.sqrt(2 * finer.areas).min() < 1.5 * least
+        assert refined(finer, np.ones(len(finer.elements), dtype=bool), 2 * least) is finer
+    assert refined(mesh, np.zeros(len(mesh.elements), dtype=bool), 4) is mesh

@@ -14,8 +14,11 @@ sys.path.append(str(Path(__file__).resolve().parents[3]))
 from benchmarks.resolution import SIZES, Scene
 from benchmarks.tables import FOLDER, Table
 from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, InputError, RegionError
+from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
 from rgbmidic.pipeline.resolution import ResolutionStudy, SizeFigures, study_sizes
+from rgbmidic.report.setup import analysis_rows
+from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
 
 STATES = Scene("bump", width=12, height=1.5, noise=0, side=144).images()[0].astype(np.float32)
@@ -213,3 +216,92 @@ def test_frames_of_which_none_can_be_measured():
     empty = [FRAMES[0], np.random.default_rng(0).normal(1000, 200, FRAMES[0].shape).astype(np.float32)]
     with pytest.raises(FrameError, match="no deformed frame can be measured: frame 1"):
         study_sizes(settings(), (16,), source=empty)
+
+
+BUMP = Scene("bump", width=12, height=1.5, noise=0, side=280).images()[0].astype(np.float32)
+BUMPS = [
+    (BUMP[int(place == 3)] + noise).astype(np.float32)
+    for place, noise in enumerate(np.random.default_rng(3).normal(scale=10, size=(4, 280, 280)))
+]
+
+
+def refining(refine: object = True, **mesh: object) -> TestSettings:
+    stated = {"element_size": 25, "refine": refine} | mesh
+    return settings(region={"rectangle": [8, 8, 271, 271]}, mesh=stated)
+
+
+def test_a_run_refines_its_mesh_where_the_bump_is_and_goes_on_with_it(tmp_path, monkeypatch):
+    whole = measure(refining(), tmp_path / "whole", source=BUMPS)
+    coarse = Tri3Mesh.from_region(Region.from_rectangle((8, 8, 271, 271), (280, 280)), 25)
+    assert "from 144 to " in whole.provenance["refinement"]
+    assert "in frame 3 is" in whole.provenance["refinement"]
+    mesh = Tri3Mesh(nodes=whole.nodes, elements=whole.elements)
+    legs, away = np.sqrt(2 * mesh.areas), np.hypot(*(mesh.nodes[mesh.elements].mean(axis=1) - (146.8, 135.4)).T)
+    assert legs[away < 60].max() < 13  # the bump, and the window of some elements that its error is averaged over
+    assert np.median(legs[away > 150]) > 23
+    assert legs.min() > 3 * 3.4  # speckles
+    assert len(mesh.nodes) > 2 * len(coarse.nodes)
+
+    rows = dict(analysis_rows(Physical.of(whole), None))
+    assert rows["data point spacing"].startswith(f"{legs.min():.3g} px to 23.9 px")
+    assert rows["refinement of the elements"] == whole.provenance["refinement"]
+
+    others = measure(refining(), tmp_path / "others", source=BUMPS, workers=2)
+    np.testing.assert_array_equal(others.u, whole.u)
+    monkeypatch.setattr("rgbmidic.pipeline.run.refine", lambda *a: pytest.fail("refined again"))
+    measure(refining(), tmp_path / "others", source=BUMPS, resume=True)
+
+
+def test_parts_of_a_test_have_one_refined_mesh(tmp_path):
+    for part in (range(2), range(2, 4)):
+        last = measure(refining(3), tmp_path / "parts", source=BUMPS, frames=part)
+    whole = measure(refining(3), tmp_path / "whole", source=BUMPS)
+    np.testing.assert_array_equal(last.u[3], whole.u[3])
+    np.testing.assert_array_equal(last.elements, whole.elements)
+
+
+def test_an_affine_field_keeps_its_mesh(tmp_path):
+    scene = Scene("affine", width=60, height=0.5, noise=0.05, side=280)
+    found = measure(refining(), tmp_path / "out", source=list(scene.images()[0].astype(np.float32)))
+    assert len(found.nodes) <= 144 + 3
+
+
+@pytest.mark.parametrize(
+    ("refine", "given", "text"),
+    [
+        (9, {}, "mesh.refine: frame 9 is not among 0 to 3"),
+        (0, {}, "mesh.refine: frame 0 is of the reference"),
+        (
+            True,
+            {"mesh": Tri3Mesh(nodes=[[20, 20], [90, 20], [20, 90]], elements=[[0, 1, 2]])},
+            "given: leave",
+        ),
+    ],
+)
+def test_a_refinement_that_cannot_be_made_is_one_line(tmp_path, refine, given, text):
+    with pytest.raises(InputError, match=text):
+        measure(refining(refine), tmp_path / "out", source=BUMPS, **given)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("mesh", "text"),
+    [
+        ({"refine": "x"}, 'mesh.refine must be .*, not "x"'),
+        ({"refine": 2.5}, "mesh.refine must be a whole number, not 2.5"),
+        ({"element_size": "auto"}, "both choose the elements"),
+        ({"element_size": 6}, "mesh.refine halves the elements: .* 8 px or more for it, not 6"),
+        (
+            {"file": "x.inp", "points": [[0, 0, 0, 0], [1, 1, 1, 1]]},
+            "for a mesh made here",
+        ),
+    ],
+)
+def test_settings_that_contradict_refining_are_refused(mesh, text):
+    with pytest.raises(ConfigurationError, match=text):
+        refining(**{"refine": True} | mesh)
+
+
+def test_a_live_sequence_cannot_be_refined():
+    with pytest.raises(ConfigurationError, match=r"mesh\.refine is done on the frames of a test"):
+        list(measure_sequence(BUMPS, refining()))
