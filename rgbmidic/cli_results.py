@@ -216,20 +216,22 @@ def report(
 
 
 @app.command()
+@command.frame_options
 def view(
     path: Annotated[
         Path,
         typer.Argument(metavar="PATH", help="Result, also of a running test; TEST.toml; raw frames; folder of tests."),
     ],
+    statement: dict[str, Any],
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0: any free port.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
 ) -> None:
     """Look at a result, or set up a test, in the browser. The address is printed; it is valid on this machine only.
 
-    Ctrl-C ends the server.
+    Ctrl-C ends the server. Options that state properties of frames are for raw frames only.
     """
     serve = command.optional("rgbmidic.view", "view").serve
-    serve(path, port=port, browser=browser, tell=lambda address: print(address, flush=True))
+    serve(path, port=port, browser=browser, tell=lambda address: print(address, flush=True), statement=statement)
 
 
 @app.command()

@@ -55,7 +55,7 @@ def chromium() -> Iterator[object]:
 
 
 @contextmanager
-def serving(path: Path) -> Iterator[str]:
+def serving(path: Path, **statement: object) -> Iterator[str]:
     """A viewer in a thread of its own; its address."""
     from tornado.ioloop import IOLoop
 
@@ -65,7 +65,7 @@ def serving(path: Path) -> Iterator[str]:
 
     def run() -> None:
         asyncio.set_event_loop(asyncio.new_event_loop())
-        server, address = start(path)
+        server, address = start(path, statement=statement)
         told.put((IOLoop.current(), address))
         IOLoop.current().start()
         server.stop()

@@ -57,13 +57,15 @@ class Draft:
     text: str
 
     @classmethod
-    def of(cls, path: Path) -> Self:
+    def of(cls, path: Path, statement: Mapping[str, Any] | None = None) -> Self:
         """Read a TEST.toml, or begin one in the working directory for frames.
 
         Parameters
         ----------
         path
             A TEST.toml, or the frames: a movie, a folder or a pattern.
+        statement
+            Keys of ``[frames]`` that the files of frames do not state; a TEST.toml states its own.
 
         Returns
         -------
@@ -73,7 +75,7 @@ class Draft:
         Raises
         ------
         ConfigurationError
-            The file is missing, is not TOML, or does not name the frames.
+            The file is missing, is not TOML, or does not name the frames; something stated is not allowed.
         """
         if path.suffix.lower() == ".toml":
             read_toml(path, "settings file")
@@ -84,7 +86,10 @@ class Draft:
                 raise ConfigurationError(f"{path}: {error}") from None
             return draft
         file = Path.cwd() / "TEST.toml"
-        return cls(file=file, text="").changed({"frames": {"path": str(path.resolve())}})
+        stated = {key: list(value) if isinstance(value, tuple) else value for key, value in (statement or {}).items()}
+        draft = cls(file=file, text="").changed({"frames": {"path": str(path.resolve()), **stated}})
+        _ = draft.frames
+        return draft
 
     @classmethod
     def of_result(cls, result: Result, file: Path) -> Self:

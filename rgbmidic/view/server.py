@@ -71,7 +71,14 @@ class _Application(BokehTornado):  # type: ignore[misc]  # see pyproject.toml
         return super().resources(absolute_url).clone(components=["bokeh", "bokeh-widgets"])
 
 
-def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[str], None] = print) -> None:
+def serve(
+    path: Path,
+    *,
+    port: int = 0,
+    browser: bool = True,
+    tell: Callable[[str], None] = print,
+    statement: Mapping[str, Any] | None = None,
+) -> None:
     """Show a result in the browser until the process is interrupted.
 
     Parameters
@@ -84,17 +91,19 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
         Whether to open the browser.
     tell
         Called with the address.
+    statement
+        Keys of ``[frames]`` that the files of frames do not state.
 
     Raises
     ------
     ResultError
         The folder is not a result, or is damaged.
     InputError
-        The port is in use.
+        The port is in use; or `statement` is not empty and `path` is something else than frames.
     """
     for library in ("bokeh", "tornado"):  # their messages on a malformed request are for programmers
         logging.getLogger(library).setLevel(logging.CRITICAL)
-    server, address = start(path, port=port)
+    server, address = start(path, port=port, statement=statement)
     gc.collect()
     gc.freeze()  # what is there now stays: two thirds of what each collection would go through
     tell(address)
@@ -106,9 +115,9 @@ def serve(path: Path, *, port: int = 0, browser: bool = True, tell: Callable[[st
         server.stop()
 
 
-def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
+def start(path: Path, *, port: int = 0, statement: Mapping[str, Any] | None = None) -> tuple[BaseServer, str]:
     """Start a server, which answers once its loop runs; return it and its address. Errors as `serve`."""
-    pages = _pages(path)
+    pages = _pages(path, statement or {})
     token = secrets.token_urlsafe(24)
     try:
         sockets, port = bind_sockets(_HOST, port)
@@ -135,10 +144,10 @@ def start(path: Path, *, port: int = 0) -> tuple[BaseServer, str]:
     return server, f"http://{_HOST}:{port}/{token}/"
 
 
-def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
+def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Document], None]]:
     """Return the pages: a result, a test to set up and the result of its run, or the list of those in a folder.
 
-    Bad input is reported at once.
+    Bad input is reported at once. `statement` holds keys of ``[frames]``; for frames only.
     """
     shared: dict[tuple[Path, str], Progress] = {}
     runs: list[Run] = []
@@ -151,11 +160,11 @@ def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
         from rgbmidic.view.setup import SetupPage
         from rgbmidic.view.setup_panel import DraftFrames
 
-        DraftFrames.of(Draft.of(place))
+        DraftFrames.of(Draft.of(place, statement))
 
         def setup(document: Document) -> None:
             theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
-            page = SetupPage(document, Draft.of(place), runs, dark=theme == "dark")
+            page = SetupPage(document, Draft.of(place, statement), runs, dark=theme == "dark")
             _place(document, page.roots, f"rgbmidic: {place.name}", theme)
 
         return setup
@@ -171,7 +180,12 @@ def _pages(path: Path) -> dict[str, Callable[[Document], None]]:
             raise ResultError("no run was started yet")
         _fill(runs[-1].out, shared, document)
 
-    several = not (path / PROVENANCE).exists() and path.is_dir() and any(_found(path))
+    finished = (path / PROVENANCE).exists()
+    several = not finished and path.is_dir() and any(_found(path))
+    if statement and (finished or several or path.suffix.lower() == ".toml"):
+        kind = "a result" if finished else "a folder of results and tests" if several else "a TEST.toml"
+        options = ", ".join(f"--{key.replace('_', '-')}" for key in statement)
+        raise InputError(f"{options}: for raw frames only, which do not state it; {path} is {kind}")
     pages: dict[str, Callable[[Document], None]]
     pages = {"/": partial(_fill_list, path), "/open": one} if several else {"/": opened(path)}
     return {route: partial(_or_error, page) for route, page in {**pages, "/result": result}.items()}

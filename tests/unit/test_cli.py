@@ -477,7 +477,7 @@ def test_the_frame_options_are_the_same_in_all_commands():
 
     first = None
     calibrations = ("crosstalk", "noise", "registration", "check")
-    for program, names in ((cli.app, ("frames", "inspect")), (calibrate.app, calibrations)):
+    for program, names in ((cli.app, ("frames", "inspect", "view")), (calibrate.app, calibrations)):
         for name in names:
             options = {part.name: part for part in typer.main.get_command(program).commands[name].params}
             found = [(key, options[key].opts, options[key].help, options[key].required) for key in FRAME_OPTIONS]

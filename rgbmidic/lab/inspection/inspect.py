@@ -172,7 +172,8 @@ def inspect_frame(
     separated, errors = _separated(linear, known, demosaic, samples.noise, np.random.default_rng(seed))
     images = align(replace(separated, registration=known.registration))
     report(2, 3, "uncertainty to expect")
-    shown = LocalContrast.of(images, [channel.speckle_px for channel in samples.channels])
+    sizes = [channel.speckle_px for channel in samples.channels]
+    shown = LocalContrast.of(images, sizes, region.mask, samples.noise)
     index = separated.reflection_index()
     if index is None and len(images.names) > 1:  # the contrast that a light lacks to the best one
         best = np.maximum(shown.contrast.max(axis=0), 1e-6)
@@ -194,6 +195,7 @@ def inspect_frame(
         saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
         region=region.mask,
         hidden=shown.hidden(region.mask),
+        background=shown.background(region.mask),
         texture=separated.texture,
         noise=samples.noise,
         noise_known=known.noise is not None,

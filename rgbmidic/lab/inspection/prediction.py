@@ -324,11 +324,17 @@ CONTRAST_WIDTH = (10.0, 40.0)
 """Least and largest standard deviation (px) of the window in which local contrast is taken: 2.5 speckles between."""
 BLIND = 0.5
 """Fraction of the usual contrast that no light reaches where the specimen cannot be seen; chosen."""
+SHADE = 0.25
+"""Fraction of the brightness of the brightest tenth below which an image is dark. Chosen: the background of the DIC
+Challenge's open-hole specimen has 0.1; the parts of a specimen that are lit less keep their contrast."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalContrast:
     """Local statistics of the lights.
+
+    Those of what is lit and of what lies in the dark, such as the background beside a specimen, are taken apart: the
+    edge between them is no texture.
 
     Attributes
     ----------
@@ -336,28 +342,53 @@ class LocalContrast:
         Local mean, DN.
     contrast : ndarray, shape (k, H, W), float32
         Local standard deviation in units of that mean, 0 where the light is dark or unknown.
+    lit : ndarray, shape (k, H, W), bool
+        Where the paint around is as bright as in the rest of the image (`SHADE`).
     """
 
     level: FloatImage
     contrast: FloatImage
+    lit: BoolArray
 
     @classmethod
-    def of(cls, images: IlluminationImages, speckles: Sequence[float]) -> LocalContrast:
-        """Statistics in windows that hold many speckles, of which the sizes (px) are known or NaN."""
+    def of(
+        cls, images: IlluminationImages, speckles: Sequence[float], inside: BoolArray, noise: NoiseModel
+    ) -> LocalContrast:
+        """Statistics in windows that hold many speckles, of which the sizes (px) are known or NaN, for a region.
+
+        In the dark, where it would look like texture, camera noise is subtracted.
+        """
         sizes = [size for size in speckles if np.isfinite(size)]
         window = float(np.clip(2.5 * np.median(sizes) if sizes else 0.0, *CONTRAST_WIDTH))
         level, contrast = np.zeros((2, *images.values.shape), dtype=np.float32)
-        for image, mean, relative in zip(images.values, level, contrast, strict=True):
-            mean[:] = np.nan_to_num(local_mean(image, window))
-            lit = np.isfinite(image) & (mean > DARK * images.full_scale)
-            square = local_mean(image**2, window)
-            relative[lit] = np.sqrt(np.maximum(square[lit] - mean[lit] ** 2, 0)) / mean[lit]
-        return cls(level=level, contrast=contrast)
+        lit = np.zeros(images.values.shape, dtype=bool)
+        closing = np.ones((round(window), round(window)), dtype=np.uint8)  # wider than dark speckle
+        for image, mean, relative, bright in zip(images.values, level, contrast, lit, strict=True):
+            filled = np.nan_to_num(image, nan=images.full_scale)  # what is not known is saturated
+            paint = cv2.morphologyEx(filled, cv2.MORPH_CLOSE, closing)
+            bright[:] = paint >= SHADE * np.quantile(paint[inside], 0.9)
+            core = cv2.erode((~bright).astype(np.uint8), closing) > 0  # without the blurred rim of what is lit
+            for part, sampled in ((bright, bright), (~bright, core)):
+                if not part.any():
+                    continue
+                values = np.where(sampled, image, np.float32(np.nan))
+                mean[part] = np.nan_to_num(local_mean(values, window))[part]
+                square = local_mean(values**2, window)
+                seen = part & np.isfinite(image) & (mean > DARK * images.full_scale)
+                variance = square[seen] - mean[seen] ** 2
+                if sampled is core:
+                    variance -= noise.variance(mean[seen])
+                relative[seen] = np.sqrt(np.maximum(variance, 0)) / mean[seen]
+        return cls(level=level, contrast=contrast, lit=lit)
 
     def hidden(self, inside: BoolArray) -> BoolArray:
-        """Where (H, W) no light has half the contrast that is usual in the region."""
-        best = self.contrast.max(axis=0)
-        return np.asarray(best < BLIND * np.quantile(best[inside], 0.9))
+        """Where (H, W) no light has half the contrast that is usual in the lit part of the region."""
+        best, lit = self.contrast.max(axis=0), inside & self.lit.any(axis=0)
+        return np.asarray(best < BLIND * np.quantile(best[lit if lit.any() else inside], 0.9))
+
+    def background(self, inside: BoolArray) -> BoolArray:
+        """Where (H, W) there is neither texture nor light: nothing can be measured."""
+        return np.asarray(self.hidden(inside) & ~self.lit.any(axis=0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -408,7 +439,7 @@ def predict(
     -------
     Prediction
     """
-    level, contrast = lights.level, lights.contrast
+    level, contrast = lights.level, np.where(lights.background(region.mask), np.float32(0), lights.contrast)
     if texture is None:
         unknown = np.full(len(mesh.nodes), np.nan)
         return Prediction(std=unknown, noise=unknown, mosaic=unknown, alone=(unknown,) * len(contrast))

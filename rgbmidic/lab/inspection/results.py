@@ -141,6 +141,8 @@ class Inspection:
     saturated, region : ndarray, shape (H, W), bool
     hidden : ndarray, shape (H, W), bool
         Where no light reaches half the usual contrast: all of them reflect, or there is no paint.
+    background : ndarray, shape (H, W), bool
+        Part of `hidden` that is dark too.
     texture : TextureModel or None
         The texture that the colours of a mosaic have in common; None for cameras without a mosaic.
     noise : NoiseModel
@@ -170,6 +172,7 @@ class Inspection:
     saturated: BoolArray
     region: BoolArray
     hidden: BoolArray
+    background: BoolArray
     texture: TextureModel | None
     noise: NoiseModel
     noise_known: bool
@@ -202,10 +205,17 @@ def findings(inspection: Inspection) -> Iterator[Finding]:
     yield from _of_set_up(inspection)
     yield from _of_exposure(inspection)
     yield from _of_speckle(inspection)
-    hidden, several = float(inspection.hidden[inspection.region].mean()), len(inspection.lights) > 1
+    hidden, dark = (float(where[inspection.region].mean()) for where in (inspection.hidden, inspection.background))
     if hidden > HIDDEN:
-        what, why = ("no light shows", "all lights reflect or saturate there") if several else _ONE_LIGHT
-        yield Finding("hidden", f"{what} the texture on {hidden:.1%} of the region: {why}, or there is no paint")
+        what, why = (
+            ("no light shows", "all lights reflect or saturate there") if len(inspection.lights) > 1 else _ONE_LIGHT
+        )
+        reasons = []
+        if dark > HIDDEN:
+            reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
+        if hidden - dark > HIDDEN or not reasons:
+            reasons.append(f"{why}, or there is no paint")
+        yield Finding("hidden", f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}")
     if inspection.unmeasured > 0:
         yield Finding("not measured", f"{inspection.unmeasured:.1%} of the nodes will not be measured")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from colour_scenes import CROSSTALK, FULL_SCALE, NOISE, A, mosaic_of, sparkle, speckle
+from real_files import CROPS
 from small_tests import REGION, colour_test, grey_frame
 
 import rgbmidic
@@ -31,6 +33,7 @@ from rgbmidic.lab.inspection.report import inspection_document, write_inspection
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import correlate
 from rgbmidic.scene.forecast import expected_std, node_constant
+from rgbmidic.settings import FrameSettings
 
 Run = Callable[..., tuple[int, str, str]]
 SHAPE = (192, 192)
@@ -278,6 +281,56 @@ def test_troubles_are_told(lights, code):
     seen = inspect_frame(raw(lights()), calibration=CALIBRATION)
     assert code in codes(seen)
     assert all(finding.text for finding in seen.findings)
+
+
+@pytest.mark.parametrize("region", [(26, 250, 285, 800), (60, 450, 280, 640), (100, 250, 280, 450)])
+def test_edges_of_a_specimen_before_a_dark_background_hide_no_texture(real_data, region):
+    """The real specimen with a hole of radius 52 px, between columns 38 and 355."""
+    file = real_data("dic_challenge_sample12") / "oht_cfrp_00.tiff"
+    left, top = crop_origin(file)
+    box = np.array(region) - (left, top, left, top)
+    seen = inspect_files([file], frame=FrameSettings(path=("f",), kind="monochrome"), region=tuple(box))
+    y, x = np.mgrid[: seen.region.shape[0], : seen.region.shape[1]] + np.array(seen.origin[::-1])[:, None, None]
+    x, y = x + left, y + top
+    empty = (np.hypot(x - 192, y - 541) < 52) | (x < 38) | (x > 354)
+    inside = seen.region
+    assert (seen.hidden != empty)[inside].mean() < 0.01
+    np.testing.assert_array_equal(seen.background[inside], seen.hidden[inside])
+    text = next((finding.text for finding in seen.findings if finding.code == "hidden"), None)
+    if empty[inside].any():
+        assert "draw it inside the specimen" in text
+        assert "reflects" not in text
+    else:
+        assert text is None
+    nodes = seen.mesh.nodes + np.array([left, top])
+    hole = np.hypot(*(nodes - (192, 541)).T) < 52 - 25
+    assert np.isnan(seen.prediction.std[hole]).all()
+    specimen = (np.hypot(*(nodes - (192, 541)).T) > 52) & (abs(nodes[:, 0] - 196) < 158)
+    assert np.isfinite(seen.prediction.std[specimen]).all()
+
+
+def crop_origin(file):
+    """Column and row of the full frame at which the real frame begins."""
+    folder = file.parent
+    if folder.parent != CROPS:
+        return 0, 0
+    return tomllib.loads((CROPS / "crops.toml").read_text(encoding="utf-8"))[folder.name]["window"][:2]
+
+
+def test_three_lights_before_a_dark_background_and_with_a_dim_part():
+    lights = mat_lights(level=1200.0).copy()
+    lights[:, :, :48] = 90
+    lights[:, 120:, 120:] *= 0.2
+    lights[:, 40:80, 100:140] = 600
+    seen = inspect_frame(raw(lights), calibration=CALIBRATION)
+    assert seen.background[:, :46].mean() > 0.98
+    assert seen.background[:, 50:].mean() < 0.01
+    assert seen.hidden[120:, 120:].mean() < 0.02
+    assert seen.hidden[55:65, 115:125].all()
+    text = next(finding.text for finding in seen.findings if finding.code == "hidden")
+    assert "draw it inside the specimen" in text
+    assert "reflect" in text
+    assert np.isnan(seen.prediction.std[seen.mesh.nodes[:, 0] < 20]).all()
 
 
 def test_without_calibration_the_channels_stand_for_the_lights():

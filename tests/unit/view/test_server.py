@@ -15,12 +15,15 @@ from urllib.parse import quote, urlsplit
 
 import pytest
 from results import make_result
+from small_tests import grey_frame
 from tornado.httpclient import AsyncHTTPClient
 from viewer import serving
 
 from rgbmidic import cli
 from rgbmidic.command import execute
+from rgbmidic.frames.images import write_tiff
 from rgbmidic.view.address import ViewState
+from rgbmidic.view.draft import Draft
 from rgbmidic.view.server import _found, start
 
 REQUESTS = 300
@@ -148,6 +151,19 @@ def bad_inputs(folder):
         used.listen()
         port = str(used.getsockname()[1])
         yield [str(folder / "good"), "--port", port], f"port {port} of 127.0.0.1 cannot be used"
+        write_tiff(folder / "frame.tif", grey_frame(1, (0.0, 0.0)))
+        yield [str(folder / "frame.tif"), "--port", port], 'state cfa (RGGB, BGGR, GRBG, GBRG), or kind "monochrome"'
+        for options in (["--kind", "monochrome"], ["--cfa", "RGGB", "--black-level", "10"]):  # they are read
+            yield [str(folder / "frame.tif"), *options, "--port", port], f"port {port} of 127.0.0.1 cannot be used"
+    yield [str(folder / "frame.tif"), "--kind", "colour"], "frames.kind"
+    yield [str(folder / "frame.tif"), "--kind", "monochrome", "--shape", "7"], "--shape is ROWSxCOLUMNS"
+    refused = "--kind, --black-level: for raw frames only"
+    for name, kind in (("good", "a result"), ("", "a folder of results and tests"), ("test.toml", "a TEST.toml")):
+        path = str(folder / name)
+        yield (
+            [path, "--kind", "monochrome", "--black-level", "2"],
+            f"{refused}, which do not state it; {path} is {kind}",
+        )
 
 
 def test_bad_input_is_one_line(tmp_path, capsys):
@@ -158,6 +174,22 @@ def test_bad_input_is_one_line(tmp_path, capsys):
         assert told.err.startswith("error: ")
         assert told.err.count("\n") == 1
         assert expected in told.err
+
+
+def test_a_test_is_set_up_from_frames_whose_properties_are_stated(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frame = grey_frame(1, (0.0, 0.0))
+    write_tiff(tmp_path / "frame.tif", frame)
+    with serving(tmp_path / "frame.tif", kind="monochrome", black_level=3.0) as told:
+        status, body = ask(told, "GET", urlsplit(told).path)
+        assert status == 200
+        assert b"<title>rgbmidic: frame.tif</title>" in body
+    (tmp_path / "frame.raw").write_bytes(frame.values.tobytes())
+    stated = {"kind": "monochrome", "shape": frame.values.shape[-2:], "dtype": "uint16"}
+    with serving(tmp_path / "frame.raw", **stated) as told:
+        assert b"<title>rgbmidic: frame.raw</title>" in ask(told, "GET", urlsplit(told).path)[1]
+    draft = Draft.of(tmp_path / "frame.raw", stated)  # what is written, so that the run reads the same
+    assert draft.section("frames") == {**stated, "shape": list(stated["shape"]), "path": str(tmp_path / "frame.raw")}
 
 
 def test_nothing_but_the_viewer_loads_what_the_viewer_needs():
