@@ -30,8 +30,9 @@ GAUGE_GAIN = 0.014
 """Deviation (.0095) of the strain's amplitude from that of the command, seen through the same gauge."""
 GAUGE_RATIO = (0.9, 1.15)
 """rms(error / stated uncertainty) of the strain of a gauge."""
-ALONG = 0.004
-"""Deviation (.0027) of an extensometer's strain from the mean of the strain gauges along it."""
+ALONG, ALONG_CROP = 0.004, 0.0117
+"""Relative deviation of an extensometer's strain from the mean of the strain gauges along it (.0027; on the crop, whose
+line is shorter, so that its ends count more, .0078)."""
 
 
 @pytest.fixture(scope="module")
@@ -161,10 +162,12 @@ def test_the_tension_test_converges_to_a_plausible_strain(grey, real_data, frame
     rows = np.unique(found.nodes[:, 1])
     v = np.array([found.displacement[found.nodes[:, 1] == row, 1].mean() for row in rows])
     assert (np.diff(v) > -0.02).mean() > 0.95 or (np.diff(v) < 0.02).mean() > 0.95
-    check_three_gauges_and_an_extensometer(found, np.array([430 - left, max(400 - top, 105)]), bottom)
+    check_three_gauges_and_an_extensometer(
+        found, np.array([430 - left, max(400 - top, 105)]), bottom, ALONG_CROP if top else ALONG
+    )
 
 
-def check_three_gauges_and_an_extensometer(found, start, bottom):
+def check_three_gauges_and_an_extensometer(found, start, bottom, limit):
     """The mean strain along a line is that of its ends, whatever the gauge; a longer one is more certain."""
     ends, std = np.array([start, [start[0], min(start[1] + 1200, bottom - 105)]]), []
     along = make_probe(covariance(found), "gauge", 1, ends.ravel())
@@ -175,7 +178,7 @@ def check_three_gauges_and_an_extensometer(found, start, bottom):
     for length in (75, 125, 200):
         gauges = StrainGauges.at_points(covariance(found), places, length)
         read_there = gauges.strain(*found.displacement.T, *found.displacement_std.T, measure="biot")
-        assert read_there.components[:, 1].mean() == pytest.approx(strain.values[0], rel=ALONG)
+        assert read_there.components[:, 1].mean() == pytest.approx(strain.values[0], rel=limit)
         std.append(np.median(read_there.components_std[:, 1]))
     assert std[0] > 2 * std[1] > 3 * std[2]
 
