@@ -924,7 +924,8 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         return convert_value(value, kinds[0], where, base)
     if origin is tuple:
         return _convert_list(value, kinds, where, base)
-    if getattr(origin, "__module__", "") == "numpy":  # the class checks the shape of its arrays
+    # ndarray; from numpy 2.5 on the alias NDArray itself. The class checks the shape of its arrays
+    if str(getattr(origin, "__module__", "")).partition(".")[0] == "numpy":
         return value
     if origin is Literal:
         if value in kinds:
