@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
@@ -83,7 +83,6 @@ class FrameSequence(Protocol):
         """
 
 
-@runtime_checkable
 class Series(Protocol):
     """What the pipeline reads frames from: a `SourceSeries`, or a source that can all this itself.
 
@@ -279,8 +278,9 @@ def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera:
     FrameError
         A reference frame, or the first or last frame, does not exist or cannot be read.
     """
-    if isinstance(source, Series):
-        return source
+    # isinstance does not see what `__getattr__` of a wrapper gives, from Python 3.12 on
+    if all(hasattr(source, name) for name in vars(Series) if not name.startswith("_")):
+        return cast(Series, source)
     if not (hasattr(source, "__len__") and hasattr(source, "__getitem__")):
         raise InputError(
             f"a frame source has a length and a frame by index (__len__ and __getitem__); {_class(source)} has not. "
