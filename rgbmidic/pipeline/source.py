@@ -291,7 +291,7 @@ def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera:
         if told is not None and len(told) != len(source):
             raise InputError(f"{name} of {_class(source)} has {len(told)} entries for {len(source)} frames")
     chosen, start = chosen_frames(stated, len(source)), stated.reference[0]
-    series = SourceSeries(source=source, stated=stated, camera=camera, chosen=chosen)
+    series = SourceSeries(source=cast(FrameSequence, source), stated=stated, camera=camera, chosen=chosen)
     state = series.read(start)
     if not isinstance(state, IlluminationImages):
         return replace(series, shape=state[0].values.shape[-2:])
