@@ -13,6 +13,7 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.prediction import Prediction
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.pipeline.resolution import SPECKLES
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 __all__ = ["TOO_FINE", "ChannelSummary", "Finding", "Inspection", "LightSummary", "Spread", "findings"]
@@ -20,8 +21,6 @@ __all__ = ["TOO_FINE", "ChannelSummary", "Finding", "Inspection", "LightSummary"
 
 TOO_FINE = 0.75
 """Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs: inspect)."""
-COARSE = 3.0
-"""Least number of speckles along the side of an element (iDICs Good Practices Guide, for subsets)."""
 SATURATED, DARK, HIDDEN, NEGATIVE, GREENS = 0.01, 0.1, 0.01, 0.01, 0.05
 """Fractions (chosen) from which a warning is given: of saturated samples; of the full scale at the 95 % quantile of a
 channel; of the region that no light shows; of pixels where a light is negative; between the two greens."""
@@ -285,9 +284,9 @@ def _of_speckle(inspection: Inspection) -> Iterator[Finding]:
         )
     if np.isnan(size):
         yield Finding("no texture", "no speckle is seen: its autocorrelation has no width")
-    elif inspection.element_size < COARSE * size:
+    elif inspection.element_size < SPECKLES * size:
         yield Finding(
             "coarse speckle",
             f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px: at least "
-            f"{COARSE:g} per side, so element_size = {np.ceil(COARSE * size):.0f} or finer speckle",
+            f"{SPECKLES:g} per side, so element_size = {np.ceil(SPECKLES * size):.0f} or finer speckle",
         )
